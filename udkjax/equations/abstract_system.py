@@ -61,7 +61,7 @@ class AbstractSystem(eqx.Module):
     @property
     @abstractmethod
     def constrained(self) -> bool:
-        """Whether there are any constraints."""
+        """True if there are any constraints."""
 
     def size(self, dq: Vector) -> Float[Array, ""]:
         """The largest of a change of coordinates, in units of the system's own. By default these are one."""
@@ -99,7 +99,7 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
-        """Whether all terms of the equations are finite."""
+        """Return whether all terms of the equations are finite."""
 
     # For formulations that integrate some coordinates alone. By default all of them are integrated.
 
@@ -113,7 +113,7 @@ class AbstractSystem(eqx.Module):
 
     @property
     def independent(self) -> Bool[Array, "n"] | None:
-        """Which coordinates and velocities are integrated, and so under error control; None: all."""
+        """The coordinates and velocities that are integrated, and so under error control; None: all."""
         return None
 
 
@@ -138,7 +138,7 @@ class MechanismSystem(AbstractSystem):
     @property
     @abstractmethod
     def stabilized(self) -> bool:
-        """Whether Baumgarte's terms are fed back."""
+        """True if Baumgarte's terms are fed back."""
 
     @abstractmethod
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:

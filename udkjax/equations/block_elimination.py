@@ -102,7 +102,7 @@ class BlockElimination:
             yield KernelLoop(self.terms.kernel(("backward", e.size, e.later_sizes), backward), self._front_table(e)[::-1], names)
 
     def safe(self) -> KernelLoop:
-        """Whether all pivots exceed `safe_tol`."""
+        """Write `safe`: one where all pivots exceed `safe_tol`, zero elsewhere."""
 
         def write(w: KernelWriter):
             w.write(w.read("trusted", None), "safe", None)
@@ -118,7 +118,7 @@ class BlockElimination:
         return self.terms.single_round("distance", write)
 
     def rank(self) -> Parts:
-        """How many rows the last factorization did not leave out."""
+        """Count the rows that the last factorization did not leave out."""
         yield Reset("rank", 0, 1)
         for p in sorted(set(self._sizes)):
 

@@ -108,7 +108,7 @@ class DensePosition(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Whether the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
+        """True if the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
         return bool(np.all((self.sigma <= DEPENDENT_TOL * self.sigma[0]) | (self.sigma > CLEAR_TOL * self.sigma[0])))
 
     @property

@@ -30,7 +30,7 @@ UNIQUE_TOL = 1e-6
 
 
 class Uniqueness(NamedTuple):
-    """Which multipliers are unique, how far from it the others are, and the rank that was decided on the way."""
+    """Multipliers that are unique, the distance of the others from it, and the rank that was decided on the way."""
 
     unique: Bool[Array, "m"]
     share: Float[Array, "m"]  # the length of each row of N, 0 (unique) to 1 (any number will do)

@@ -103,7 +103,7 @@ def trace_force(
 
 
 def has_pieces(element: Element) -> bool:
-    """Whether an element is smooth in pieces of the state, with a method `piece` of its own."""
+    """Return whether an element is smooth in pieces of the state, with a method `piece` of its own."""
     return type(element).piece not in (Constraint.piece, ForceElement.piece)
 
 

@@ -56,7 +56,7 @@ def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
 
 
 def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Whether Psi and Psi_dot are within `CLOSED_TOL` of the scene's scales, or rounding."""
+    """Return whether Psi and Psi_dot are within `CLOSED_TOL` of the scene's scales, or rounding."""
     open_by = xp.maximum(CLOSED_TOL, rounding(scales, q, xp))
     rate = xp.maximum(scales.rate, scales.size(v, xp))
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)

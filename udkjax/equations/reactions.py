@@ -176,7 +176,7 @@ def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
 
 
 def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | None:
-    """Where a joint acts on its body k, in ground coordinates; None where it has no points."""
+    """Return the point at which a joint acts on its body k, in ground coordinates; None if it has no points."""
     points = getattr(element, "points", None)
     if points is None or (isinstance(element, Driver) and element.coordinate == "angle"):
         return None
@@ -238,7 +238,7 @@ def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about)
 
 @eqx.filter_jit
 def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
-    """Whether equilibrium determines each component of `_loads`, by Psi_q (T, m, n), and N (T, m, m) of its scaled rows."""
+    """Return whether equilibrium determines each component of `_loads`, by Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
 
     def one(t, q):
         return psi_q(mechanism, t, q), left_null_space(mechanism, t, q, analysis, rank_tol).basis

@@ -43,7 +43,7 @@ class ClosedPosition(Protocol):
 
     @property
     def is_clear(self) -> bool:
-        """Whether the rank is beyond doubt."""
+        """True if the rank is beyond doubt."""
         ...
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:

@@ -80,7 +80,7 @@ class ScenePrograms:
 
     @cached_property
     def is_small(self) -> bool:
-        """Whether the programs are written out, as those of the accelerations take few operations."""
+        """True if the programs are written out, as the accelerations take few operations."""
         loops = [part for part in self.accelerations.parts if isinstance(part, KernelLoop)]
         return sum(len(part.table) * part.kernel.operation_count for part in loops) <= WRITTEN_OUT_OPERATIONS
 
@@ -188,7 +188,7 @@ class ScenePrograms:
 
     @cached_property
     def rows_and_loads(self) -> LoopProgram:
-        """What rank-revealing methods take, of all rows: psi_q, psi, psi_dot, terms; and root, M^(-1/2)."""
+        """Inputs of rank-revealing methods, of all rows: psi_q, psi, psi_dot, terms; and root, M^(-1/2)."""
         psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
         return program(self.equation_terms.parts, self.rows("psi"), psi_dot)
 

@@ -36,7 +36,7 @@ class SceneSolver:
 
     @property
     def safe(self) -> KernelLoop | Reset:
-        """Whether all pivots exceed `safe_tol`, where the policy asks for that."""
+        """The loop of `safe`, which says if all pivots exceed `safe_tol`; it is set where the policy does not ask."""
         return self.elimination.safe() if self.policy.reports else Reset("safe", 0, 1, 1.0)
 
     def position_terms(self, *outputs: str, v: str = "v") -> list[KernelLoop | Reset]:

@@ -53,7 +53,7 @@ class SparsePosition(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Whether the rank is beyond doubt."""
+        """True if the rank is beyond doubt."""
         return bool(np.all(self.pivots[self.independent] > CLEAR_TOL**2))
 
     @property

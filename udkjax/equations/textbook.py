@@ -56,7 +56,7 @@ class TextbookEquations(MechanismSystem):
         return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
-        """Whether all terms of the equation are finite."""
+        """Return whether all terms of the equation are finite."""
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in self.matrices(t, q, v)]))
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:

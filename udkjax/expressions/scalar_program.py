@@ -77,7 +77,7 @@ class ScalarProgram:
         self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
 
     def uses(self, scalar: Scalar) -> bool:
-        """Whether the program uses an input."""
+        """Return whether the program uses an input."""
         return scalar.index in self.last_use
 
     def __call__(self, values: Sequence[Value]) -> list[Value]:

@@ -1,4 +1,4 @@
-"""How far assembly moves the bodies of a scene from where they are written down: a number that is mistyped closes silently."""
+"""Bodies that assembly moves far from the positions written down: a number that is mistyped closes silently."""
 
 import warnings
 from collections.abc import Iterator

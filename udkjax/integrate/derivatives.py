@@ -67,7 +67,7 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _as_run(function: "Run", xs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
-    """What a run left, with the derivatives of the run."""
+    """Return the results of a run, with the derivatives of the run."""
     del function, xs
     return raw
 

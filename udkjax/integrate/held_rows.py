@@ -1,4 +1,4 @@
-"""What has samples as machine code takes it: one row of numbers for each interval between the breakpoints of a run."""
+"""Samples as machine code takes them: one row of numbers for each interval between the breakpoints of a run."""
 
 from collections.abc import Sequence
 from types import ModuleType

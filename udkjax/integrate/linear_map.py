@@ -44,7 +44,7 @@ class Function(eqx.Module):
 
     @abstractmethod
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        """Those of f(x)."""
+        """The shapes of f(x)."""
 
     def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
         """J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""

@@ -53,7 +53,7 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: 
 
 
 def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
-    """As `march`, of known numbers, by NumPy: nothing is traced or compiled for it."""
+    """March with known numbers, by NumPy: nothing is traced or compiled for it."""
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)

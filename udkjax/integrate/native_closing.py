@@ -22,7 +22,7 @@ Closed = tuple[Array, Array, Array, Array, Array]
 
 
 def can_close(mechanism: Mechanism) -> bool:
-    """Whether machine code can close a mechanism."""
+    """Return whether machine code can close a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     return not unsupported(_close(mechanism))
@@ -34,7 +34,7 @@ def close(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q:
 
 
 def close_known(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:
-    """As `close`, of known numbers, without tracing anything."""
+    """Close with known numbers, without tracing anything."""
     return _unpack(call_known(_close(mechanism), _inputs(mechanism, scales, tol, t, q, v, np), 2), len(q))
 
 

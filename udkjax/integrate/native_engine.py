@@ -72,13 +72,13 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
 
 
 def independent_row_count(problem: Any) -> int:
-    """How many rows elimination takes."""
+    """Count the rows that elimination takes."""
     equations = problem.equations
     return len(equations.scales.rows) - len(equations.redundant or ())
 
 
 def serves_derivatives(active: Problem) -> bool:
-    """Whether there is machine code for the derivatives along what is `active`: numbers of the scene, and initial states."""
+    """Return whether there is machine code for derivatives along `active` numbers of the scene and initial states."""
     served = lambda p: (p.equations.mechanism, p.equations.baumgarte, p.q, p.v)  # noqa: E731
     others = eqx.tree_at(served, active, (None,) * 4, is_leaf=lambda x: x is None)
     return not any(x is True for x in jax.tree.leaves(others))
@@ -91,7 +91,7 @@ def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any]:
 
 
 def _marks_of(problem: Any, active: Any) -> tuple[Any, Any]:
-    """Which of these numbers are active."""
+    """Mark the numbers that are active."""
     return _rows_of(problem).stand_in(active.equations.mechanism, marks=True), active.equations.baumgarte
 
 
@@ -169,7 +169,7 @@ def _has_pieces(mechanism: Mechanism) -> bool:
 
 
 def _inputs(problem: Any, operation: Run, xp: ModuleType = jnp) -> list[Any]:
-    """Those of a run, of one member."""
+    """Return the arrays that machine code takes, for one member."""
     equations: TextbookEquations = problem.equations
     method: Any = equations.method
     rank_tol = method.rank_tol

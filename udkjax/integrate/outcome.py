@@ -1,4 +1,4 @@
-"""How a run ended and what it took, from what the solver left behind."""
+"""The end of a run and its cost, from the solver's own statistics."""
 
 from types import ModuleType
 

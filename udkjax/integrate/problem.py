@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Problem(eqx.Module):
-    """What to integrate: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""
+    """An initial value problem: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""
 
     equations: AbstractSystem
     ts: Float[Array, "T"]

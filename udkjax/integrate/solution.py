@@ -1,4 +1,4 @@
-"""What a simulation returns."""
+"""The solution that a simulation returns."""
 
 import json
 import sys
@@ -22,7 +22,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class Result(PrintsWords):
-    """How a simulation ended."""
+    """The ways in which a simulation ends."""
 
     successful = 0
     step_limit = 1
@@ -41,7 +41,7 @@ class Result(PrintsWords):
 
     @property
     def is_success(self) -> bool:
-        """Whether the run went as far as it should: to its last time, or to an event that ends it."""
+        """True if the run went as far as it should: to its last time, or to an event that ends it."""
         return self in (Result.successful, Result.event_stop, Result.at_rest)
 
     def __str__(self) -> str:
@@ -122,7 +122,7 @@ class Solution(PrintsTable):
 
     @property
     def settings(self) -> dict[str, str]:
-        """What was chosen, by name: the method, the solver, the engine and why it was taken, ..."""
+        """The choices that were made, by name: the method, the solver, the engine and why it was taken, ..."""
         return dict(self.choices)
 
     @property
@@ -134,7 +134,7 @@ class Solution(PrintsTable):
 
     @property
     def cause(self) -> str:
-        """How the run ended, in words; why a single run failed is looked for when this is first read, for up to a second."""
+        """The end of the run, in words; the cause of a failure is looked for when this is first read, for up to a second."""
         found = self.found_cause and self.found_cause.text(int(self.code), float(self.time))
         if self.events is not None and (names := self.events.undefined_names):
             found = f"the condition of {names} is not a number; look at what it divides by, or takes the root of"

@@ -60,7 +60,7 @@ class Both:
         return [x for found in parts(xs[: self.start], *ways) for x in found]
 
     def split(self, found: Sequence[Array]) -> tuple[list[Array], ...]:
-        """What was found along one direction, as the two forms return it."""
+        """Split a tangent along one direction into the two forms."""
         return list(found[: self.values]), list(found[self.values :])
 
     @cached_property

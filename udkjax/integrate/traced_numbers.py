@@ -61,7 +61,7 @@ def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
 
 
 def select(xs: Sequence[Any], which: Mask) -> list[Any]:
-    """Those that are marked."""
+    """Select the marked entries."""
     return [x for x, m in zip(xs, which, strict=True) if m]
 
 

@@ -37,17 +37,17 @@ class Reverse(Recorded):
         p, n = self.places, self.n
         for name in ("before", "any"):
             p.add(name)
-        p.add("cbar", self.count)
-        p.add("G c", self.count)
-        for name in ("G q", "G v", "Y q", "Y v"):
+        p.add("total bar constants", self.count)
+        p.add("bar constants", self.count)
+        for name in ("bar state q", "bar state v", "bar result q", "bar result v"):
             p.add(name, n)
         for k in range(POINTS):
             for x in "qva":
-                p.add(f"B{k} {x}", n)
+                p.add(f"bar point{k} {x}", n)
         for j in range(plan.method.stages):
-            p.add(f"S{j}", n)
+            p.add(f"bar stage{j} a", n)
         for k in range(3 * POINTS):
-            p.add(f"M{k}", n)
+            p.add(f"bar difference{k}", n)
 
     def write_derivatives(self):
         for each in self._linearizations:
@@ -66,31 +66,36 @@ class Reverse(Recorded):
     def _accumulate_constants(self, f: Function, mask: Value):
         """The cotangents of the constants that a program has found, to those of lanes in question."""
         with f.each(self.count) as i:
-            total = f.load(f.given["work"], i * f.width + self.start("cbar", "work"), f.width)
-            more = f.load(f.given["work"], i * f.width + self.start("G c", "work"), f.width)
-            f.store(f.select(mask, total + more, total), f.given["work"], i * f.width + self.start("cbar", "work"), f.width)
+            total = f.load(f.given["work"], i * f.width + self.start("total bar constants", "work"), f.width)
+            more = f.load(f.given["work"], i * f.width + self.start("bar constants", "work"), f.width)
+            f.store(
+                f.select(mask, total + more, total),
+                f.given["work"],
+                i * f.width + self.start("total bar constants", "work"),
+                f.width,
+            )
 
     def _pull_projection(self, f: Function, mask: Value):
-        """Y through the projection that led to the state in X: G q and G v."""
+        """Pull `bar result` through the projection that led to the state, to `bar state`."""
         if self.of_projection:
             self._evaluate_end(f)
-            f.call("reverse_projection", f.given["work"], self.address(f, "KP"), f.given["work"])
+            f.call("reverse_projection", f.given["work"], self.address(f, "projection linearization"), f.given["work"])
             self._accumulate_constants(f, mask)
         else:
             with f.each(self.rowcount) as r:
                 for x in "qv":
-                    self.put(f, f"G {x}", r, self.vector(f, f"Y {x}", r))
+                    self.put(f, f"bar state {x}", r, self.vector(f, f"bar result {x}", r))
 
     def _pull_accelerations(self, f: Function, stored: str, bar: str, mask: Value):
-        """The cotangents of accelerations, through the equations at the state in X: G q and G v."""
+        """Pull cotangents of accelerations through the equations at the state, to `bar state`."""
         f.call("reverse", f.given["work"], self.address(f, stored), self.address(f, bar))
         self._accumulate_constants(f, mask)
 
     def _write_transposed_differences(self):
-        """From cotangents of divided differences (M) to those of the points (B): `differences`, transposed; M is cleared."""
+        """Write `differences_back`: from cotangents of divided differences, which are cleared, to those of the points."""
         f, s = self.function("differences_back")
         active = s.at > 0.5
-        times = [getattr(s, f"T{POINTS - 1 - k}") for k in range(POINTS)]
+        times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
         step = times[0] - times[1]
         inverse, used = {}, [None, None]
         for i in range(POINTS):
@@ -109,7 +114,7 @@ class Reverse(Recorded):
             for degree in reversed(range(count)):
                 length = count - degree
                 mask = used[degree // 3]
-                mine = self.vector(f, f"M{degree}", r)
+                mine = self.vector(f, f"bar difference{degree}", r)
                 mine = mine if mask is None else f.select(mask, mine, 0.0)
                 here = [zero] * length
                 for i, bar in enumerate(column):  # of the column after this one
@@ -123,64 +128,64 @@ class Reverse(Recorded):
                         here[i] = here[i] - part
                 here[0] = here[0] + mine
                 column = here
-                self.put(f, f"M{degree}", r, zero)
+                self.put(f, f"bar difference{degree}", r, zero)
             for i, bar in enumerate(column):
                 bars["q"][i // 3] = bars["q"][i // 3] + bar
             for k in range(POINTS):
                 for x in "qva":
-                    name = f"B{POINTS - 1 - k} {x}"
+                    name = f"bar point{POINTS - 1 - k} {x}"
                     old = self.vector(f, name, r)
                     self.put(f, name, r, f.select(active, old + bars[x][k], old))
 
     def _write_step_back(self):
-        """From the cotangents of P3 to those of P2, of lanes that are not yet back (`at`)."""
+        """Write `step_back`: from the cotangents of point 3 to those of point 2, of lanes that are not yet back (`at`)."""
         f, s = self.function("step_back")
         active = s.at > 0.5
-        step = f.select((s.begin > 0.5) | ~active, 0.0, s.T3 - s.T2)
+        step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
         h, last = self.broadcast(f, step), self.last
         stages = range(1, last)
         steps = f.any_of(active & (s.begin < 0.5))  # where runs only begin there are no stages
         with f.if_(steps):
             for i in stages:
-                stage_state(self, f, s, i, "P2", step)
+                stage_state(self, f, s, i, "point2", step)
                 self.evaluate_stage(f, i)
-        setattr(s, "X t", s.T3)
+        setattr(s, "state t", s.point3_t)
         with f.each(self.rowcount) as r:
             for x in "qv":
-                self.put(f, f"X {x}", r, self.vector(f, f"P3 {x}", r))
-        f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{last}"))
-        self._pull_accelerations(f, f"K{last}", "B3 a", active)
+                self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
+        f.call("evaluation", f.given["work"], self.address(f, "corrected q"), self.address(f, f"stage{last} linearization"))
+        self._pull_accelerations(f, f"stage{last} linearization", "bar point3 a", active)
         with f.each(self.rowcount) as r:
             for x in "qv":
-                self.put(f, f"Y {x}", r, self.vector(f, f"B3 {x}", r) + self.vector(f, f"G {x}", r))
+                self.put(f, f"bar result {x}", r, self.vector(f, f"bar point3 {x}", r) + self.vector(f, f"bar state {x}", r))
         self._pull_projection(f, active)
         self._accumulate_stage(f, h, last, range(last), active, first=True)
         with f.if_(steps):
             for i in reversed(stages):
-                stage_state(self, f, s, i, "P2", step)
-                self._pull_accelerations(f, f"K{i}", f"S{i}", active)
+                stage_state(self, f, s, i, "point2", step)
+                self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", active)
                 self._accumulate_stage(f, h, i, range(i), active)
         with f.each(self.rowcount) as r:
-            old = self.vector(f, "B2 a", r)
-            self.put(f, "B2 a", r, f.select(active, old + self.vector(f, "S0", r), old))
+            old = self.vector(f, "bar point2 a", r)
+            self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))
 
     def _accumulate_stage(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
-        """The cotangents G of the state of stage i, to those of the point before and of the stages that it is made of."""
+        """Add `bar state` of stage i to the cotangents of the point before and of the stages that it is made of."""
         method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
-            of_q, of_v = (self.vector(f, f"G {x}", r) for x in "qv")
+            of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
             hq = h * of_q
             for x, more in (("q", of_q), ("v", f.fma(hq, float(method.nodes[i]), of_v))):
-                old = self.vector(f, f"B2 {x}", r)
-                self.put(f, f"B2 {x}", r, f.select(active, old + more, old))
+                old = self.vector(f, f"bar point2 {x}", r)
+                self.put(f, f"bar point2 {x}", r, f.select(active, old + more, old))
             hhq, hv = h * hq, h * of_v
             for j in stages:
                 a2, a = float(method.q[i][j]), float(method.v[i][j])
-                total = zero if first else self.vector(f, f"S{j}", r)
+                total = zero if first else self.vector(f, f"bar stage{j} a", r)
                 total = f.fma(hhq, a2, total) if a2 else total
                 total = f.fma(hv, a, total) if a else total
                 if first or a2 or a:
-                    self.put(f, f"S{j}", r, total)
+                    self.put(f, f"bar stage{j} a", r, total)
 
     def _write_backpropagate(self):
         """Walk back all members that are `ready`, and write the cotangents of what they began with."""
@@ -188,8 +193,8 @@ class Reverse(Recorded):
         n, call, yes = self.n, f.given["call"], f.const(1.0, DOUBLE, f.width)
         times = f.load(call, self.call_fields.index("times"), base=INT)
         s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
-        zeros = [f"B{k} {x}" for k in range(POINTS) for x in "qva"] + [f"M{k}" for k in range(3 * POINTS)]
-        for names, length in ((zeros, n), (["cbar"], self.count)):
+        zeros = [f"bar point{k} {x}" for k in range(POINTS) for x in "qva"] + [f"bar difference{k}" for k in range(3 * POINTS)]
+        for names, length in ((zeros, n), (["total bar constants"], self.count)):
             with f.each(length) as i:
                 for name in names:
                     f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], i * f.width + self.start(name, "work"), f.width)
@@ -208,11 +213,11 @@ class Reverse(Recorded):
                     f.store(total, f.given["work"], place)
 
         for k in self._each_lane(f, s.ready > 0.5):
-            more(k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "B3")
+            more(k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "bar point3")
             with f.if_(self._lane(f, "code", k).is_(float(DONE))):
-                given(k, times - 1, "B3")
+                given(k, times - 1, "bar point3")
             for j in range(POINTS):
-                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"P{j}")
+                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
             self._load_head(f, k)
 
         def due() -> Value:
@@ -237,28 +242,28 @@ class Reverse(Recorded):
                 s.any = yes
                 with f.each(n) as i:
                     for x in "qv":
-                        place = i * f.width + self.start(f"Y {x}", "work")
+                        place = i * f.width + self.start(f"bar result {x}", "work")
                         f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
                 for k in self._each_lane(f, s.due > 0.5):
                     number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
                     self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
-                    given(k, number, "Y")
+                    given(k, number, "bar result")
                     for x in "qv":
                         state = f.at(self.member_address(f, call, f"given {x}s", member), number * n)
                         with f.each(n) as i:
-                            place = i * f.width + k + self.start(f"X {x}", "work")
+                            place = i * f.width + k + self.start(f"state {x}", "work")
                             f.store(f.load(state, i), f.given["work"], place)
-                setattr(s, "X t", s.next)
+                setattr(s, "state t", s.next)
                 mask = s.due > 0.5
                 self._pull_projection(f, mask)
-                ahead = [self.broadcast(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
+                ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
                 with f.each(self.rowcount) as r:
-                    of_q, of_v = (self.vector(f, f"G {x}", r) for x in "qv")
+                    of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
                     # q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the products pi_k of differences of times.
                     one, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
                     for k in range(3 * POINTS):
-                        old = self.vector(f, f"M{k}", r)
-                        self.put(f, f"M{k}", r, f.select(mask, f.fma(one, of_q, f.fma(slope, of_v, old)), old))
+                        old = self.vector(f, f"bar difference{k}", r)
+                        self.put(f, f"bar difference{k}", r, f.select(mask, f.fma(one, of_q, f.fma(slope, of_v, old)), old))
                         slope = f.fma(slope, ahead[k // 3], one)
                         one = one * ahead[k // 3]
                 s.where(mask, written=s.written - 1.0)
@@ -267,25 +272,25 @@ class Reverse(Recorded):
             f.call("step_back", f.given["work"])
             active = s.at > 0.5
             with f.each(self.rowcount) as r:
-                for name in "BP":
+                for name in ("bar point", "point"):
                     for k in reversed(range(POINTS)):
                         for x in "qva":
                             old = self.vector(f, f"{name}{k} {x}", r)
-                            if k or name == "B":
+                            if k or name == "bar point":
                                 zero = f.const(0.0, DOUBLE, self.plan.vector)
                                 new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
                                 self.put(f, f"{name}{k} {x}", r, f.select(active, new, old))
             for k in reversed(range(1, POINTS)):
-                s.where(active, **{f"T{k}": getattr(s, f"T{k - 1}")})
+                s.where(active, **{f"point{k}_t": getattr(s, f"point{k - 1}_t")})
             s.where(active, at=s.at - 1.0)
             for k in self._each_lane(f, active):
-                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "P0")
+                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "point0")
                 self._load_head(f, k)
         # What is left is that of the first state as it was given, which is the first output, too.
         for k in self._each_lane(f, s.ready > 0.5):
-            given(k, f.const(0, INT), "B3")
+            given(k, f.const(0, INT), "bar point3")
             for x in "qv":
-                self.copy_lane(f, self._result(f, call, f"{x}bar", k, n), 0, f"B3 {x}", k)
+                self.copy_lane(f, self._result(f, call, f"{x}bar", k, n), 0, f"bar point3 {x}", k)
             if self.count:
                 f.call("leave_row", f.given["work"], call, k)
             self.free_record(f, k)
@@ -296,7 +301,7 @@ class Reverse(Recorded):
         f, s = self.function("find_rows", ARGUMENTS[:2])
         work, call = f.given["work"], f.given["call"]
         for k in self._each_lane(f, s.at > 0.5):
-            knot = count_breakpoints(self, f, self.to_int(f, self._lane(f, "member", k)), self._lane(f, "T3", k))
+            knot = count_breakpoints(self, f, self.to_int(f, self._lane(f, "member", k)), self._lane(f, "point3_t", k))
             self._put_lane(f, "knot", k, f.like(knot, DOUBLE, 1))
             with f.if_(self._lane(f, "knot", k).is_not(self._lane(f, "row", k))):
                 if self.count:
@@ -311,7 +316,7 @@ class Reverse(Recorded):
         call, k, count = f.given["call"], f.given["lane"], self.code.number_count
         constants, bars, found = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count))
         self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
-        self.copy_lane(f, bars, 0, "cbar", k, count=self.count)
+        self.copy_lane(f, bars, 0, "total bar constants", k, count=self.count)
         member, row = self.to_int(f, self._lane(f, "member", k)), self._lane(f, "row", k)
         sampled = self.plan.sampled
         numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, call, "numbers", member)
@@ -325,9 +330,9 @@ class Reverse(Recorded):
         with f.each(count) as i:
             f.store(f.load(to, i) + f.load(found, i), to, i)
         with f.each(self.count) as i:
-            f.store(0.0, f.given["work"], (i + self.places["cbar"]) * f.width + k)
+            f.store(0.0, f.given["work"], (i + self.places["total bar constants"]) * f.width + k)
 
     def _result(self, f: Function, call: Value, name: str, k: Value, length: Operand) -> Value:
-        """Where an output of the member in lane k begins, that has so many numbers of each."""
+        """Return the address of an output of the member in lane k, of `length` numbers for each member."""
         number = self.to_int(f, self._lane(f, "member", k))
         return f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)

@@ -66,27 +66,27 @@ class Closing(Module):
 
         def moved(scale: Value):
             with f.each(n) as i:
-                q = f.fma(scale, f.load(work, i + p["X dq"]), f.load(work, i + p["C"]))
-                f.store(q, work, i + p["X q"])
+                q = f.fma(scale, f.load(work, i + p["state dq"]), f.load(work, i + p["corrected q"]))
+                f.store(q, work, i + p["state q"])
 
-        setattr(s, "X t", s.start)
+        setattr(s, "state t", s.start)
         with f.each(n) as i:
             for name in "qv":
-                f.store(f.load(work, i + p[f"P3 {name}"]), work, i + p[f"X {name}"])
+                f.store(f.load(work, i + p[f"point3 {name}"]), work, i + p[f"state {name}"])
         better, steps = f.variable(1.0), f.variable(0, INT)
         with f.while_(lambda: (better.value > 0.5) & (steps.value < CLOSURE_ITERATIONS)):
             steps.value = steps.value + 1
             before = size()
             largest, longest = f.variable(1.0), f.variable(0.0)
             with f.each(n) as i:
-                q = f.load(work, i + p["X q"])
+                q = f.load(work, i + p["state q"])
                 largest.value = f.max(f.abs(q) * f.load(work, i + p["inverse unit"]), largest.value)
-                f.store(q, work, i + p["C"])
+                f.store(q, work, i + p["corrected q"])
             better.value = f.select(before > largest.value * (ROUNDING_UNITS * np.finfo(float).eps), f.const(1.0), 0.0)
             with f.if_(better.value > 0.5):
                 self._correct(f, "q")
                 with f.each(n) as i:
-                    step = f.abs(f.load(work, i + p["X dq"])) * f.load(work, i + p["inverse unit"])
+                    step = f.abs(f.load(work, i + p["state dq"])) * f.load(work, i + p["inverse unit"])
                     longest.value = f.max(step, longest.value)
                 scale = f.variable(f.select(longest.value > LONGEST_STEP, LONGEST_STEP / longest.value, f.const(1.0)))
                 halvings, better.value = f.variable(0, INT), 0.0
@@ -106,7 +106,7 @@ class Closing(Module):
             self._record_correction(f, "v", f.const(1.0), f.const(0.0))
             self._correct(f, "v")
             with f.each(n) as i:
-                f.store(f.load(work, i + p["X v"]) + f.load(work, i + p["X dv"]), work, i + p["X v"])
+                f.store(f.load(work, i + p["state v"]) + f.load(work, i + p["state dv"]), work, i + p["state v"])
         self._write_result(f, s)
 
     def _write_result(self, f: Function, s: Lane):
@@ -117,8 +117,8 @@ class Closing(Module):
             return f.at(f.load(f.given["call"], self.call_fields.index(name), base=POINTER), member * length)
 
         state, residuals = address("state", 2 * self.n), address("residuals", 2 * self.m)
-        self.copy_lane(f, state, 0, "X q", f.const(0, INT))
-        self.copy_lane(f, state, self.n, "X v", f.const(0, INT))
+        self.copy_lane(f, state, 0, "state q", f.const(0, INT))
+        self.copy_lane(f, state, self.n, "state v", f.const(0, INT))
         for name, offset in (("psi", 0), ("psi_dot", self.m)):
             self.invoke(f, name)
             with f.each(self.m) as i:
@@ -128,38 +128,38 @@ class Closing(Module):
         self._finish_closing(f, member)
 
     def _evaluate(self, f: Function, x: str):
-        """Evaluate a correction of q or v at the state in X, with what its derivatives know of it."""
+        """Evaluate a correction of q or v at the state, with what its derivatives know of it."""
         f.call(f"evaluation_newton_{x}", f.given["work"], f.given["work"], self.address(f, "correction"))
 
     def change(self, f: Function, x: str, i: Value) -> Value:
         """A coordinate of the whole correction."""
         place = self.places["correction"] + self.corrections[x].place(f"{x}1")
-        return f.load(f.given["work"], i + place) - f.load(f.given["work"], i + self.places[f"X {x}"])
+        return f.load(f.given["work"], i + place) - f.load(f.given["work"], i + self.places[f"state {x}"])
 
     def _correct(self, f: Function, x: str):
-        """The whole correction of q or v, in X dq or X dv."""
+        """Compute the whole correction of q or v, in `state dq` or `state dv`."""
         self._evaluate(f, x)
         with f.each(self.n) as i:
-            f.store(self.change(f, x, i), f.given["work"], i + self.places[f"X d{x}"])
+            f.store(self.change(f, x, i), f.given["work"], i + self.places[f"state d{x}"])
 
     # What closing with derivatives does besides (closing_derivatives.py).
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
-        """What it does with a correction of the state in X: so much of it was taken, less where it was limited."""
+        """Hook: called at the state before each correction with its `scale`, and one if that was `limited`."""
 
     def _finish_closing(self, f: Function, member: Value):
-        """What it does with a member that is closed."""
+        """Hook: called with a member that is closed."""
 
     def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
-        """What is done with the state before a step, in C, instead of that in X."""
+        """Do something at the state before a step, which lies in `corrected q`, in place of the one that it led to."""
         p, work = self.places, f.given["work"]
         with f.each(self.n) as i:
-            here, before = f.load(work, i + p[f"X {x}"]), f.load(work, i + p["C"])
-            f.store(here, work, i + p["C"])
-            f.store(before, work, i + p[f"X {x}"])
+            here, before = f.load(work, i + p[f"state {x}"]), f.load(work, i + p["corrected q"])
+            f.store(here, work, i + p["corrected q"])
+            f.store(before, work, i + p[f"state {x}"])
         do()
         with f.each(self.n) as i:
-            f.store(f.load(work, i + p["C"]), work, i + p[f"X {x}"])
+            f.store(f.load(work, i + p["corrected q"]), work, i + p[f"state {x}"])
 
     def step_all(self, f: Function, s: Lane, fill):
         f.call("close", f.given["work"], f.given["call"])

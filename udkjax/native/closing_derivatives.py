@@ -17,7 +17,7 @@ from udkjax.native.prologue import FORWARD, REVERSE, write_prologue_derivative
 
 
 class ClosingDerivative(Closing):
-    """What both modes have in common."""
+    """Access to arrays, for both modes."""
 
     def _at(self, f: Function, name: str, i: Value | int, pointer: str = "work") -> Value:
         places = self.places if pointer == "work" else self.tangents
@@ -52,7 +52,7 @@ class ClosingForward(ClosingDerivative):
         self.tangents = w = Layout(1, self.plan.vector)
         w.add("numbers", code.number_count)
         w.add("constants", self.constants)
-        for name in ("X q", "X v", "O q", "O v"):
+        for name in ("state q", "state v", "result q", "result v"):
             w.add(name, self.n)
 
     def write_derivatives(self):
@@ -73,13 +73,13 @@ class ClosingForward(ClosingDerivative):
             f.call(f"forward_newton_{x}", f.given["work"], self.address(f, "correction"), f.given["tangent"], f.given["tangent"])
             change = f.variable(0.0)  # of the longest step, over its length
             with f.each(self.n) as i:
-                step = self._at(f, f"O {x}", i, "tangent") - self._at(f, f"X {x}", i, "tangent")
-                self._set(f, f"O {x}", i, step, "tangent")
+                step = self._at(f, f"result {x}", i, "tangent") - self._at(f, f"state {x}", i, "tangent")
+                self._set(f, f"result {x}", i, step, "tangent")
                 change.value = f.select(i.is_(which), step / self.change(f, x, i), change.value)
             share = f.select(limits, change.value, 0.0)
             with f.each(self.n) as i:
-                step = self._at(f, f"O {x}", i, "tangent") - share * self.change(f, x, i)
-                self._increase(f, f"X {x}", i, f.given["scale"] * step, "tangent")
+                step = self._at(f, f"result {x}", i, "tangent") - share * self.change(f, x, i)
+                self._increase(f, f"state {x}", i, f.given["scale"] * step, "tangent")
 
     @contextmanager
     def _each_tangent(self, f: Function) -> Iterator[Value]:
@@ -98,8 +98,8 @@ class ClosingForward(ClosingDerivative):
         with self._each_tangent(f) as p:
             for name, to, count in (
                 ("dnumbers", "numbers", self.code.number_count),
-                ("dq", "X q", self.n),
-                ("dv", "X v", self.n),
+                ("dq", "state q", self.n),
+                ("dv", "state v", self.n),
             ):
                 start = self.member_address(f, call, name, member)
                 with f.each(count) as i:
@@ -114,7 +114,7 @@ class ClosingForward(ClosingDerivative):
             to = f.at(f.load(call, self.call_fields.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
-                    f.store(self._at(f, f"X {x}", i, "tangent"), to, i + k * self.n)
+                    f.store(self._at(f, f"state {x}", i, "tangent"), to, i + k * self.n)
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         size = f.load(call, self.call_fields.index("directions"), base=INT) * self.tangents.size
@@ -137,9 +137,13 @@ class ClosingReverse(ClosingDerivative):
         self.row = 3 + 2 * n  # of the record: what was corrected, scale, whether it was limited, q and v before
         p.add("record", most * self.row)
         p.add("records")
-        for name, count in {"cbar": self.constants, "G c": self.constants, "numbersbar": code.number_count}.items():
+        for name, count in {
+            "total bar constants": self.constants,
+            "bar constants": self.constants,
+            "numbersbar": code.number_count,
+        }.items():
             p.add(name, count)
-        for name in ("B q", "B v", "G q", "G v", "Y q", "Y v"):
+        for name in ("bar iterate q", "bar iterate v", "bar state q", "bar state v", "bar result q", "bar result v"):
             p.add(name, n)
 
     def write_derivatives(self):
@@ -150,49 +154,49 @@ class ClosingReverse(ClosingDerivative):
             self._write_pull(x)
 
     def _write_pull(self, x: str):
-        """Write pull_x(work, scale, limited): from the cotangent B of the state behind a correction to that before it, in X."""
+        """Write pull_x(work, scale, limited): from `bar iterate` behind a correction, made at the state, to that before."""
         f, _ = self.function(f"pull_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
         self.corrections[x].prepare_derivative(f)
         longest, which = self._longest(f, x)
         along = f.variable(0.0)
         with f.each(self.n) as i:
-            bar = f.given["scale"] * self._at(f, f"B {x}", i)
+            bar = f.given["scale"] * self._at(f, f"bar iterate {x}", i)
             along.value = f.fma(bar, self.change(f, x, i), along.value)
-            self._set(f, f"Y {x}", i, bar)
+            self._set(f, f"bar result {x}", i, bar)
         with f.if_((f.given["limited"] > 0.5) & (longest > 0.0)):
-            self._increase(f, f"Y {x}", which, -(along.value / self.change(f, x, which)))
+            self._increase(f, f"bar result {x}", which, -(along.value / self.change(f, x, which)))
         with f.each(self.n) as i:
-            self._increase(f, f"B {x}", i, -self._at(f, f"Y {x}", i))
+            self._increase(f, f"bar iterate {x}", i, -self._at(f, f"bar result {x}", i))
         f.call(f"reverse_newton_{x}", f.given["work"], self.address(f, "correction"), f.given["work"])
         self._accumulate(f)
 
     def _accumulate(self, f: Function):
-        """Add what a correction's derivative has found in G."""
+        """Add the cotangents that a correction's derivative has left in `bar state`."""
         with f.each(self.constants) as i:
-            self._increase(f, "cbar", i, self._at(f, "G c", i))
+            self._increase(f, "total bar constants", i, self._at(f, "bar constants", i))
         with f.each(self.n) as i:
             for x in "qv":
-                self._increase(f, f"B {x}", i, self._at(f, f"G {x}", i))
+                self._increase(f, f"bar iterate {x}", i, self._at(f, f"bar state {x}", i))
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
         number = self.to_int(f, self._at(f, "records", 0))
         row = f.at(f.given["work"], number * self.row + self.places["record"])
         for k, value in enumerate((f.const(float(CORRECTED.index(x))), scale, limited)):
             f.store(value, row, k)
-        self.copy_lane(f, row, 3, "X q", f.const(0, INT))
-        self.copy_lane(f, row, 3 + self.n, "X v", f.const(0, INT))
+        self.copy_lane(f, row, 3, "state q", f.const(0, INT))
+        self.copy_lane(f, row, 3 + self.n, "state v", f.const(0, INT))
         self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
         self._set(f, "records", 0, f.const(0.0))
         with f.each(self.constants) as i:
-            self._set(f, "cbar", i, f.const(0.0))
+            self._set(f, "total bar constants", i, f.const(0.0))
         bars = self.member_address(f, self.call_record(f), "statebar", member)
         for k, x in enumerate("qv"):
             with f.each(self.n) as i:
-                self._set(f, f"B {x}", i, f.load(bars, i + k * self.n))
+                self._set(f, f"bar iterate {x}", i, f.load(bars, i + k * self.n))
 
     def _finish_closing(self, f: Function, member: Value):
         call = self.call_record(f)
@@ -205,18 +209,18 @@ class ClosingReverse(ClosingDerivative):
             row = f.at(f.given["work"], self.to_int(f, self._at(f, "records", 0)) * self.row + self.places["record"])
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
-                    self._set(f, f"X {x}", i, f.load(row, i + (3 + k * self.n)))
+                    self._set(f, f"state {x}", i, f.load(row, i + (3 + k * self.n)))
 
             def pull(name: str) -> Callable[[], None]:
                 return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_v"), pull("pull_q"))
-        constants, bars, to = (self.address(f, x) for x in ("constants", "cbar", "numbersbar"))
+        constants, bars, to = (self.address(f, x) for x in ("constants", "total bar constants", "numbersbar"))
         f.call(REVERSE, self.member_address(f, call, "numbers", member), constants, bars, to)
         for name, place, count in (
             ("numbersbar", "numbersbar", self.code.number_count),
-            ("qbar", "B q", self.n),
-            ("vbar", "B v", self.n),
+            ("qbar", "bar iterate q", self.n),
+            ("vbar", "bar iterate v", self.n),
         ):
             to = f.at(f.load(call, self.call_fields.index(name), base=POINTER), member * count)
             with f.each(count) as i:

@@ -16,7 +16,7 @@ _MAGIC = b"udkjax object 1\n"
 
 
 def cache_folder() -> Path | None:
-    """Where code is stored: in the user's cache folder, or where `UDKJAX_CACHE` says; None where that is 0."""
+    """Return the folder of stored code: the user's cache folder, or `UDKJAX_CACHE`; None if that is 0."""
     choice = os.environ.get("UDKJAX_CACHE", "").strip()
     if choice == "0":
         return None
@@ -24,7 +24,7 @@ def cache_folder() -> Path | None:
 
 
 def cached_files() -> list[tuple[float, int, Path]]:
-    """When each file of code was last used or made, its size in bytes, and where it is."""
+    """List the files of code: the time of their last use, their size in bytes, and their path."""
     folder, found = cache_folder(), []
     try:
         for file in folder.iterdir() if folder else ():

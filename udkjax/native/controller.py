@@ -28,20 +28,20 @@ from udkjax.native.steps import (
 )
 
 
-def write_decide(t: Module):
+def write_decide(module: Module):
     """Accept or reject the step of lanes that are `stepping`, and choose the next one; `until`: outputs up to there are due."""
-    f, s = t.function("decide")
+    f, s = module.function("decide")
     where, yes = f.select, f.const(1.0, DOUBLE, f.width)
     inf = f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error = s.stepping > 0.5, s.fallback > 0.5, s.error
     begin = s.begin > 0.5
     bad = stepping & ~(error < np.inf)
     # --- pivots too small to be trusted, and steps a little shorter instead
-    if t.falls_back:
+    if module.falls_back:
         fallback_due = bad & ~fallback
-        far_from_here = is_clear(t, f, s, s.distance2)
-        beside = stepping & ~fallback & (error < 1.0) & ~is_clear(t, f, s, s.distance) & (s.last < 0.5)
-        left = time_to_singularity(t, f, s)
+        far_from_here = is_clear(module, f, s, s.distance2)
+        beside = stepping & ~fallback & (error < 1.0) & ~is_clear(module, f, s, s.distance) & (s.last < 0.5)
+        left = time_to_singularity(module, f, s)
         past = (left > 0.0) & (left < s.h * SURE) & (s.distance * left > s.distance2 * EXPECTED * (s.h - left))
         beside = beside & ~(past & (s.distance > NEAREST_STAGE))
         dodge = (fallback_due | beside) & far_from_here & (s.retries < float(RETRIES)) & ~begin
@@ -54,14 +54,14 @@ def write_decide(t: Module):
         dodge = f.const(False, BOOL, f.width)
     tried = where(stepping, s.tried + 1.0, s.tried)
     again = f.const(False, BOOL, f.width)
-    if t.pieces:
+    if module.pieces:
         s.again = where(stepping, yes, 0.0)
         f.call("leave", f.given["work"])
         again = s.again > 0.5
     accept = stepping & (error < 1.0) & ~dodge & ~again
     stepped, begun = ~begin, stepping & begin
     # --- the next step
-    order, step = t.method.order, s.t1 - s.T3
+    order, step = module.method.order, s.t1 - s.point3_t
     # An error that lets a step grow as far as it may is not told from a smaller one, which may be rounding and say nothing.
     size = where(f.is_finite(error), f.max(error, GROW ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
@@ -74,11 +74,11 @@ def write_decide(t: Module):
     h = where(stepping, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
     h = where(again, s.h, h)
     failed = stepping & ~accept & stepped & ~again
-    if t.falls_back:
-        h = where(failed, step_around(t, f, s, left, step, h), h)
+    if module.falls_back:
+        h = where(failed, step_around(module, f, s, left, step, h), h)
     s.behind = h
     with f.if_(f.any_of(begun)):
-        s.behind = where(begun, first_step(t, f, s), s.behind)
+        s.behind = where(begun, first_step(module, f, s), s.behind)
     h = s.behind
     code = where(stepping & (h < s.smallest), f.const(STEP_TOO_SMALL, DOUBLE, f.width), s.code)
     code = where(code.is_(float(RUNNING)) & stepping & (tried >= s.max_steps), STEP_LIMIT, code)
@@ -87,55 +87,55 @@ def write_decide(t: Module):
     # --- where it stands
     with f.if_(f.any_of(accept)):
         for k in range(POINTS - 1):
-            t.copy_point(f, accept, f"P{k + 1}", f"P{k}")
-            s.where(accept, **{f"T{k}": getattr(s, f"T{k + 1}")})
-        t.copy_point(f, accept, ("X q", "O v", "O a"), f"P{POINTS - 1}")
-        s.where(accept, T3=s.t1)
+            module.copy_point(f, accept, f"point{k + 1}", f"point{k}")
+            s.where(accept, **{f"point{k}_t": getattr(s, f"point{k + 1}_t")})
+        module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{POINTS - 1}")
+        s.where(accept, point3_t=s.t1)
         s.where(accept, distance0=s.distance1)
         s.where(accept, distance1=s.distance2)
         s.where(accept, distance2=s.distance)
-        if t.m:
-            s.where(accept, tolerance=velocity_tolerance(t, f, s, "P3 v"))
-        t.record_step(f, s, accept)
+        if module.m:
+            s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))
+        module.record_step(f, s, accept)
     s.where(accept & stepped, rate=rate)
-    if t.plan.breaks:
+    if module.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
         h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
-    cost = where(begin, f.const(1.0, DOUBLE, f.width), float(t.method.stages))
+    cost = where(begin, f.const(1.0, DOUBLE, f.width), float(module.method.stages))
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
     # --- outputs
     ready = accept & ((s.accepted > 0.0) | (stepped & (s.last > 0.5)))
     until = where(ready, s.t1, -np.inf)
-    if t.plan.breaks:
+    if module.plan.breaks:
         enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
         until = where(enough, until + where(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
     s.until = until
     s.where(accept, accepted=s.accepted + 1.0)
 
 
-def first_step(t: Module, f: Function, s: Lane) -> Value:
-    """As given, or one over which the state changes by a hundredth of itself, or of its unit.
+def first_step(module: Module, f: Function, s: Lane) -> Value:
+    """Return the first step as given, or one over which the state changes by a hundredth of itself, or of its unit.
 
     It is that of `first_step` of integrate/diffrax_engine.py.
     """
-    rtol, atol, omega = (t.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
+    rtol, atol, omega = (module.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
 
     def relative(of_q: str, of_v: str, least: float) -> Any:
         def both(r: Value) -> list[Value]:
-            per_unit, found = t.vector(f, "inverse unit", r), []
-            for name, y, per in ((of_q, "X q", per_unit), (of_v, "O v", per_unit / omega)):
-                floor = f.select(per > 0.0, f.const(least, DOUBLE, t.plan.vector), 0.0)  # none of what fills up a register
-                x = f.max(f.abs(t.vector(f, name, r)) * per, floor)
-                found.append(x / f.fma(rtol, f.abs(t.vector(f, y, r)) * per, atol))
+            per_unit, found = module.vector(f, "inverse unit", r), []
+            for name, y, per in ((of_q, "state q", per_unit), (of_v, "result v", per_unit / omega)):
+                floor = f.select(per > 0.0, f.const(least, DOUBLE, module.plan.vector), 0.0)  # none of what fills up a register
+                x = f.max(f.abs(module.vector(f, name, r)) * per, floor)
+                found.append(x / f.fma(rtol, f.abs(module.vector(f, y, r)) * per, atol))
             return found
 
         return both
 
-    size, rate = t.largest(f, relative("X q", "O v", 1.0)), t.largest(f, relative("O v", "O a", 0.0))
+    size, rate = module.largest(f, relative("state q", "result v", 1.0)), module.largest(f, relative("result v", "result a", 0.0))
     span = s.end - s.start
     ordinary = f.is_finite(rate) & (rate > 0.0)
     chosen = f.select(ordinary, f.min(size / f.select(ordinary, rate, 1.0) * 0.01, span), span * 1e-4)

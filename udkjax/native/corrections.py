@@ -19,10 +19,10 @@ from collections.abc import Iterator
 
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
 from udkjax.expressions.loop_program import LoopProgram, Reset
-from udkjax.native.ir import INT, POINTER, Function, Value
-from udkjax.native.least_norm import LEAST_NORM, least_norm
+from udkjax.native.ir import POINTER, Function, Value
 from udkjax.native.linearization import Linearization
 from udkjax.native.module import Module
+from udkjax.native.weighted_rows import WeightedRows
 
 
 class EliminationCorrection(Linearization):
@@ -36,18 +36,19 @@ class EliminationCorrection(Linearization):
 
     def find_rank(self, f: Function):
         """Leave the rank of Psi_q in `rank`, after an evaluation."""
-        t = self._in
-        with f.each(t.code.scratch["factors"]) as i:
-            x = f.load(f.given["work"], i + (t.places["correction"] + self.place("factors")))
-            f.store(x, f.given["work"], i + t.places["factors"])
-        t.invoke(f, "rank")
+        module = self._module
+        with f.each(module.code.scratch["factors"]) as i:
+            x = f.load(f.given["work"], i + (module.places["correction"] + self.place("factors")))
+            f.store(x, f.given["work"], i + module.places["factors"])
+        module.invoke(f, "rank")
 
 
 class LeastNormCorrection:
     """A correction by singular values, of one lane. What is stored: x corrected, z, y."""
 
     def __init__(self, module: Module, name: str):
-        self._in, self._name, self._x = module, name, name[-1]
+        self._module, self._name, self._x = module, name, name[-1]
+        self._rows = WeightedRows(module)
         self.stored = 2 * module.n + module.m
         self._parts = module.code.rows("psi" if self._x == "q" else "psi_dot")
         fixed = {"t", "sines"} if module.moving else {"t", "sines", "constants"}
@@ -61,155 +62,133 @@ class LeastNormCorrection:
                 module.places.add(f"change {name}", size)
 
     def place(self, name: str) -> int:
-        """Where an array begins in what is stored."""
-        return {f"{self._x}1": 0, "z": self._in.n, "y": 2 * self._in.n}[name]
+        """Return the place at which an array begins in `stored`."""
+        return {f"{self._x}1": 0, "z": self._module.n, "y": 2 * self._module.n}[name]
 
     def find_rank(self, f: Function):
         """Nothing: an evaluation leaves the rank of Psi_q in `rank`."""
 
     def _changes(self, prefix: str) -> dict[str, tuple[str, int]]:
-        return {prefix + x: ("work", self._in.places[f"change {x}"]) for x in ("psi_q", "psi", "root")}
+        return {prefix + x: ("work", self._module.places[f"change {x}"]) for x in ("psi_q", "psi", "root")}
 
     def _at(self, f: Function, name: str, i: Value) -> Value:
-        return f.load(f.given["work"], i + self._in.places[name])
+        return f.load(f.given["work"], i + self._module.places[name])
 
     def _put(self, f: Function, name: str, i: Value, x: Value):
-        f.store(x, f.given["work"], i + self._in.places[name])
+        f.store(x, f.given["work"], i + self._module.places[name])
 
     def _stored(self, f: Function, name: str, i: Value) -> Value:
         return f.load(f.given["stored"], i + self.place(name))
 
-    def _weight(self, f: Function, row: Value) -> Value:
-        return self._at(f, "length", f.const(0, INT)) / self._at(f, "rows", row)
-
-    def _entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
-        """Of each entry of A: its row, its column, the place of Psi_q, and what that is multiplied by but for M^(-1/2)."""
-        rows, columns, places, factors = self._in.code.psi_q_entries
-        table = f"[{3 * len(rows)} x i64] [" + ", ".join(
-            f"i64 {x}" for entry in zip(rows, columns, places, strict=True) for x in entry
-        )
-        numbers = f"[{len(rows)} x double] [" + ", ".join(f"double {float(x)}" for x in factors)
-        for line in (f"@entries = private constant {table}]", f"@factors = private constant {numbers}]"):
-            if line not in self._in.loops.globals:
-                self._in.loops.globals.append(line)
-        with f.each(len(rows)) as e:
-            row, column, place = (f.load(Value(f, "@entries", POINTER), e * 3 + j, base=INT) for j in range(3))
-            yield row, column, place, f.load(Value(f, "@factors", POINTER), e) * self._weight(f, row)
-
     def _solve(self, f: Function, right: str, x: Value, transposed: bool = False):
         """x = A^+ b, or (A^+)^T b, of an array in `work`, with A in an array of its own."""
-        n, m = self._in.n, self._in.m
+        n, m = self._module.n, self._module.m
         rows, columns = (n, m) if transposed else (m, n)
-        A, b = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (m * n, rows))
+        A, b = self._rows.reserve(f, m * n, rows)
         with f.each(m) as i, f.each(n) as k:
             f.store(self._at(f, "A", i * n + k), A, k * m + i if transposed else i * n + k)
         with f.each(rows) as i:
             f.store(self._at(f, right, i), b, i)
-        tol, rank = self._at(f, "fallback_tol", f.const(0, INT)), f.at(f.given["work"], self._in.places["rank"])
-        f.call(LEAST_NORM, A, b, x, *(f.const(c, INT) for c in (rows, columns, 1)), tol, rank)
+        self._rows.solve(f, A, b, x, (rows, columns, 1))
 
     def _load_rows(self, f: Function):
-        """A, and W r in `psi`, of the state in X."""
-        t = self._in
-        t.invoke(f, f"rows_{self._x}")
-        with f.each(t.m * t.n) as i:
-            self._put(f, "A", i, f.const(0.0))
-        for row, column, place, factor in self._entries(f):
-            self._put(f, "A", row * t.n + column, self._at(f, "psi_q", place) * factor * self._at(f, "root", column))
-        with f.each(t.m) as i:
-            self._put(f, "psi", i, self._at(f, "psi", i) * self._weight(f, i))
+        """Compute A, and W r in `psi`, of the state."""
+        module = self._module
+        module.invoke(f, f"rows_{self._x}")
+        self._rows.write(f, module.address(f, "A"))
+        with f.each(module.m) as i:
+            self._put(f, "psi", i, self._at(f, "psi", i) * self._rows.weight(f, i))
 
     def evaluation(self):
-        t = self._in
-        if all(f.name != LEAST_NORM for f in t.functions):
-            t.functions.append(least_norm())
-        at = t.arrays | {"root": ("work", t.places["root"])}
-        t.loops.write(LoopProgram([t.code.sincos, *self._parts]), f"rows_{self._x}", ("work", "out"), at)
-        f, _ = t.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
+        module = self._module
+        at = module.arrays | {"root": ("work", module.places["root"])}
+        module.loops.write(LoopProgram([module.code.sincos, *self._parts]), f"rows_{self._x}", ("work", "out"), at)
+        f, _ = module.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
         self._load_rows(f)
         z = f.at(f.given["stored"], self.place("z"))
         self._solve(f, "psi", z)
-        with f.each(t.n) as i:
-            f.store(self._at(f, f"X {self._x}", i) - self._at(f, "root", i) * self._stored(f, "z", i), f.given["stored"], i)
+        with f.each(module.n) as i:
+            f.store(self._at(f, f"state {self._x}", i) - self._at(f, "root", i) * self._stored(f, "z", i), f.given["stored"], i)
 
     def write_adjoint(self):
         """`adjoint_...(work, stored)`: y, which derivatives need besides."""
-        t = self._in
-        f, _ = t.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
-        with f.each(t.n) as i:
+        module = self._module
+        f, _ = module.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
+        with f.each(module.n) as i:
             self._put(f, "right", i, self._stored(f, "z", i))
         self._solve(f, "right", f.at(f.given["stored"], self.place("y")), transposed=True)
 
     def prepare_derivative(self, f: Function):
         """Compute what derivatives need besides, behind an evaluation."""
-        f.call(f"adjoint_{self._name}", f.given["work"], self._in.address(f, "correction"))
+        f.call(f"adjoint_{self._name}", f.given["work"], self._module.address(f, "correction"))
 
     def forward(self):
-        t, w = self._in, self._in.tangents
-        at = t.arrays | {"root": ("work", t.places["root"])} | self._changes(TANGENT)
-        places = {"constants": "constants", "q": "X q", "v": "X v"}
+        module, w = self._module, self._module.tangents
+        at = module.arrays | {"root": ("work", module.places["root"])} | self._changes(TANGENT)
+        places = {"constants": "constants", "q": "state q", "v": "state v"}
         at |= {TANGENT + x: ("tangent", w[place]) for x, place in places.items()}
         name = f"row_changes_{self._x}"
-        t.loops.write(self._derivative.forward, name, ("work", "tangent"), at)
+        module.loops.write(self._derivative.forward, name, ("work", "tangent"), at)
         arguments = [(POINTER, "work"), (POINTER, "stored"), (POINTER, "tangent"), (POINTER, "out")]
-        f, _ = t.function(f"forward_{self._name}", arguments)
+        f, _ = module.function(f"forward_{self._name}", arguments)
         f.call(name, f.given["work"], f.given["tangent"])
-        g, dz = (Value(f, f.reserve("double", t.n), POINTER) for _ in range(2))
-        with f.each(t.n) as i:
+        g, dz = self._rows.reserve(f, module.n, module.n)
+        with f.each(module.n) as i:
             f.store(0.0, g, i)
-        with f.each(t.m) as i:
-            self._put(f, "change psi", i, self._at(f, "change psi", i) * self._weight(f, i))
+        with f.each(module.m) as i:
+            self._put(f, "change psi", i, self._at(f, "change psi", i) * self._rows.weight(f, i))
 
         def entries() -> Iterator[tuple[Value, Value, Value]]:
             """The row, the column and the change of each entry of A."""
-            for row, column, place, factor in self._entries(f):
-                moves = self._at(f, "change psi_q", place) * self._at(f, "root", column)
-                moves = moves + self._at(f, "psi_q", place) * self._at(f, "change root", column)
-                yield row, column, moves * factor
+            for row, column, place, factor in self._rows.entries(f):
+                change = self._at(f, "change psi_q", place) * self._at(f, "root", column)
+                change = change + self._at(f, "psi_q", place) * self._at(f, "change root", column)
+                yield row, column, change * (factor * self._rows.weight(f, row))
 
         for row, column, dA in entries():
             f.store(f.load(g, column) + dA * self._stored(f, "y", row), g, column)
             self._put(f, "change psi", row, self._at(f, "change psi", row) - dA * self._stored(f, "z", column))
-        with f.each(t.m) as i, f.each(t.n) as k:
-            self._put(f, "change psi", i, self._at(f, "change psi", i) - self._at(f, "A", i * t.n + k) * f.load(g, k))
+        with f.each(module.m) as i, f.each(module.n) as k:
+            self._put(f, "change psi", i, self._at(f, "change psi", i) - self._at(f, "A", i * module.n + k) * f.load(g, k))
         self._solve(f, "change psi", dz)
-        with f.each(t.n) as i:
-            change = self._at(f, "root", i) * (f.load(dz, i) + f.load(g, i)) + self._at(f, "change root", i) * self._stored(
-                f, "z", i
-            )
-            before = f.load(f.given["tangent"], i + w[f"X {self._x}"])
-            f.store(before - change, f.given["tangent"], i + w[f"O {self._x}"])
+        with f.each(module.n) as i:
+            change = self._at(f, "root", i) * (f.load(dz, i) + f.load(g, i))
+            change = change + self._at(f, "change root", i) * self._stored(f, "z", i)
+            before = f.load(f.given["tangent"], i + w[f"state {self._x}"])
+            f.store(before - change, f.given["tangent"], i + w[f"result {self._x}"])
 
     def reverse(self):
-        t, p = self._in, self._in.places
-        found = {"constants": "G c", "q": "G q", "v": "G v"}
-        at = t.arrays | {"root": ("work", p["root"])} | self._changes(COTANGENT)
+        module, p = self._module, self._module.places
+        found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v"}
+        at = module.arrays | {"root": ("work", p["root"])} | self._changes(COTANGENT)
         at |= {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
-        counts = {"constants": len(t.moving), "q": t.n, "v": t.n}
+        counts = {"constants": len(module.moving), "q": module.n, "v": module.n}
         cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items()]
         name = f"row_cotangents_{self._x}"
-        t.loops.write(LoopProgram([*cleared, *self._derivative.reverse.parts]), name, ("work",), at)
-        f, _ = t.function(f"reverse_{self._name}", [(POINTER, "work"), (POINTER, "stored"), (POINTER, "bar")])
-        u, h = (Value(f, f.reserve("double", max(c, 1)), POINTER) for c in (t.m, t.n))
-        with f.each(t.n) as i:
-            bar = self._at(f, f"Y {self._x}", i)
+        module.loops.write(LoopProgram([*cleared, *self._derivative.reverse.parts]), name, ("work",), at)
+        f, _ = module.function(f"reverse_{self._name}", [(POINTER, "work"), (POINTER, "stored"), (POINTER, "bar")])
+        u, h = self._rows.reserve(f, module.m, module.n)
+        with f.each(module.n) as i:
+            bar = self._at(f, f"bar result {self._x}", i)
             self._put(f, "right", i, -(self._at(f, "root", i) * bar))
             self._put(f, "change root", i, -(self._stored(f, "z", i) * bar))
         self._solve(f, "right", u, transposed=True)
-        with f.each(t.n) as k:
+        with f.each(module.n) as k:
             f.store(self._at(f, "right", k), h, k)
-            with f.each(t.m) as i:
-                f.store(f.load(h, k) - self._at(f, "A", i * t.n + k) * f.load(u, i), h, k)
-        with f.each(t.code.scratch["psi_q"]) as i:
+            with f.each(module.m) as i:
+                f.store(f.load(h, k) - self._at(f, "A", i * module.n + k) * f.load(u, i), h, k)
+        with f.each(module.code.scratch["psi_q"]) as i:
             self._put(f, "change psi_q", i, f.const(0.0))
-        with f.each(t.m) as i:
-            self._put(f, "change psi", i, f.load(u, i) * self._weight(f, i))
-        for row, column, place, factor in self._entries(f):
+        with f.each(module.m) as i:
+            self._put(f, "change psi", i, f.load(u, i) * self._rows.weight(f, i))
+        for row, column, place, factor in self._rows.entries(f):
+            factor = factor * self._rows.weight(f, row)
             of_A = self._stored(f, "y", row) * f.load(h, column) - f.load(u, row) * self._stored(f, "z", column)
             moved = self._at(f, "change psi_q", place) + of_A * factor * self._at(f, "root", column)
             self._put(f, "change psi_q", place, moved)
             moved = self._at(f, "change root", column) + of_A * factor * self._at(f, "psi_q", place)
             self._put(f, "change root", column, moved)
         f.call(name, f.given["work"])
-        with f.each(t.n) as i:
-            self._put(f, f"G {self._x}", i, self._at(f, f"G {self._x}", i) + self._at(f, f"Y {self._x}", i))
+        with f.each(module.n) as i:
+            bar = f"bar state {self._x}"
+            self._put(f, bar, i, self._at(f, bar, i) + self._at(f, f"bar result {self._x}", i))

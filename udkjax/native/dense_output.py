@@ -7,28 +7,28 @@ from udkjax.native.module import Module
 from udkjax.native.steps import POINTS, STRETCH
 
 
-def write_differences(t: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
+def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
     """Newton's divided differences of the last points, the latest first: of their states, or of changes of these."""
     pointer = to[0] if to else "work"
-    f, s = t.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
-    times = [getattr(s, f"T{POINTS - 1 - k}") for k in range(POINTS)]
+    f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
+    times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
     step = times[0] - times[1]
     inverse: dict[tuple[int, int], Value] = {}
     for i in range(POINTS):
         for j in range(i + 1, POINTS):
             d = times[j] - times[i]
-            inverse[i, j] = t.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
+            inverse[i, j] = module.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
     used: list[Value | None] = [None, None]
     sofar: Value | None = None
     for k in range(1, POINTS - 1):
         near = (times[k] - times[k + 1]) * STRETCH >= step
         sofar = near if sofar is None else sofar & near
         used.append(sofar)
-    with f.each(t.registers(pointer)) as r:
-        known = {x: [t.vector(f, f"P{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
+    with f.each(module.registers(pointer)) as r:
+        known = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
         column = [x for x in known["q"] for _ in range(3)]
         given = {1: known["v"], 2: [a * 0.5 for a in known["a"]]}
-        t.put(f, "N0", r, column[0], pointer)
+        module.put(f, "difference0", r, column[0], pointer)
         for degree in range(1, 3 * POINTS):
             following = []
             for i in range(3 * POINTS - degree):
@@ -36,31 +36,31 @@ def write_differences(t: Module, name: str = "differences", to: tuple[str, Layou
                 following.append(given[degree][one] if one == two else (column[i + 1] - column[i]) * inverse[one, two])
             column = following
             mask = used[degree // 3]
-            t.put(f, f"N{degree}", r, column[0] if mask is None else f.select(mask, column[0], 0.0), pointer)
+            module.put(f, f"difference{degree}", r, column[0] if mask is None else f.select(mask, column[0], 0.0), pointer)
 
 
-def write_between(t: Module, name: str = "between", to: tuple[str, Layout] | None = None):
+def write_between(module: Module, name: str = "between", to: tuple[str, Layout] | None = None):
     """The polynomial at the time `next`."""
     pointer = to[0] if to else "work"
-    f, s = t.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
-    ahead = [t.broadcast(f, s.next - getattr(s, f"T{POINTS - 1 - k}")) for k in range(POINTS)]
+    f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
+    ahead = [module.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
     if not to:
-        setattr(s, "X t", s.next)
-    with f.each(t.registers(pointer)) as r:
-        q, v = t.vector(f, f"N{3 * POINTS - 1}", r, pointer), f.const(0.0, DOUBLE, t.plan.vector)
+        setattr(s, "state t", s.next)
+    with f.each(module.registers(pointer)) as r:
+        q, v = module.vector(f, f"difference{3 * POINTS - 1}", r, pointer), f.const(0.0, DOUBLE, module.plan.vector)
         for k in reversed(range(3 * POINTS - 1)):
             d = ahead[k // 3]
             v = f.fma(v, d, q)
-            q = f.fma(q, d, t.vector(f, f"N{k}", r, pointer))
-        t.put(f, "X q", r, q, pointer)
-        t.put(f, "X v", r, v, pointer)
+            q = f.fma(q, d, module.vector(f, f"difference{k}", r, pointer))
+        module.put(f, "state q", r, q, pointer)
+        module.put(f, "state v", r, v, pointer)
 
 
-def write_outputs(t: Module):
+def write_outputs(module: Module):
     """Write the states at output times up to `until`."""
-    f, s = t.function("outputs", [(POINTER, "work"), (POINTER, "call")])
+    f, s = module.function("outputs", [(POINTER, "work"), (POINTER, "call")])
     call = f.given["call"]
-    inner = f.load(call, t.call_fields.index("times"), base=INT) - 1
+    inner = f.load(call, module.call_fields.index("times"), base=INT) - 1
 
     def due() -> Value:
         s.due = f.select((s.next <= s.until) & (s.written + 1.0 < inner), f.const(1.0, DOUBLE, f.width), 0.0)
@@ -70,14 +70,14 @@ def write_outputs(t: Module):
         f.call("differences", f.given["work"])
         with f.while_(due):
             f.call("between", f.given["work"])
-            project_output(t, f, s, "due")
-            t.record_output(f, s)
+            project_output(module, f, s, "due")
+            module.record_output(f, s)
             with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
-                number = t.to_int(f, f.lane(s.written, k)) + 1
-                t.write_state(f, s, call, k, number, "X q", "O v")
+                number = module.to_int(f, f.lane(s.written, k)) + 1
+                module.write_state(f, s, call, k, number, "state q", "result v")
                 f.store(
-                    t.input_number(f, call, "ts", f.lane(s.member, k), number + 1),
+                    module.input_number(f, call, "ts", f.lane(s.member, k), number + 1),
                     f.given["work"],
-                    k + t.places["next"] * f.width,
+                    k + module.places["next"] * f.width,
                 )
             s.where(s.due > 0.5, written=s.written + 1.0)

@@ -103,7 +103,7 @@ def _is_null(f: Function, pointer: Value) -> Value:
 
 
 def _thread_count(f: Function, frame: Value) -> Value:
-    """How many threads XLA's pool has; one where there is none."""
+    """Count the threads of XLA's pool; one if there is none."""
     count = Value(f, f.reserve(INT), POINTER)
     f.store(1, count, base=INT)
     error = _of_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)

@@ -308,7 +308,7 @@ class Function:
 
     @contextmanager
     def if_(self, condition: Value) -> Iterator[None]:
-        """What is done where a condition of all lanes holds."""
+        """Run the block if a condition holds."""
         then, end = self._label("then"), self._label("end")
         self.line(f"br i1 {condition.name}, label %{then}, label %{end}")
         self.line(f"{then}:")
@@ -328,7 +328,7 @@ class Function:
 
     @contextmanager
     def while_(self, condition: Callable[[], Value]) -> Iterator[None]:
-        """What is done again while a condition holds, which is looked at before."""
+        """Run the block while a condition holds, which is tested first."""
         head, body, end = self._label("while"), self._label("do"), self._label("end")
         self.line(f"br label %{head}")
         self.line(f"{head}:")
@@ -340,7 +340,7 @@ class Function:
 
     @contextmanager
     def each(self, end: Operand, start: Operand = 0) -> Iterator[Value]:
-        """What is done for every whole number from `start` to before `end`."""
+        """Run the block for every whole number from `start` to before `end`."""
         k = self.variable(start, INT, 1)
         last = self.like(end, INT, 1)
         with self.while_(lambda: k.value < last):

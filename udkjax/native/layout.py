@@ -1,4 +1,20 @@
-"""What a trajectory's code depends on, what it is called with, and where its numbers lie in memory."""
+"""The plan of a module, the arguments of a run, and the layout of its memory.
+
+Arrays of coordinates in the memory of a run, with q, v, a for positions, velocities and accelerations, d for changes:
+
+    state q ...          the state at which programs evaluate
+    result v, a ...      what they return; `corrected q` is q after a Newton step
+    point0 q ...         accepted states, from the oldest to the latest, point3; their times are `point0_t` ...
+    stage1 a ...         accelerations of the stages of a step
+    difference0 ...      divided differences: the coefficients of the interpolating polynomial
+    fallback a ...       results of fallback steps
+    scale q, v           absolute tolerances; `inverse unit` is one over the scene's unit of each coordinate
+    bar state q ...      cotangents of all these
+
+`constants` and what the scene's programs name are arrays of their own; "stage1 linearization" and the like hold what derivatives
+need to know of a state. `bar constants` are cotangents that one program leaves, `total bar constants` their sums over a run. A
+tangent, the memory of one direction, has arrays of the same names for the changes of what they hold.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +32,7 @@ INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a module's code depends on."""
+    """All that a module's code depends on."""
 
     code: ScenePrograms
     method: Method
@@ -31,7 +47,7 @@ class Plan:
 
 @dataclass
 class Layout:
-    """Where everything lies in the memory of a run, in numbers of W lanes each; arrays of coordinates fill whole registers."""
+    """The places of arrays in the memory of a run, in numbers of W lanes each; arrays of coordinates fill whole registers."""
 
     width: int
     vector: int
@@ -59,7 +75,7 @@ LANE_NUMBERS = {  # numbers of each lane, and what they are
     **dict.fromkeys(SETTINGS, "settings of the member"),
     "start": "first time (s)",
     "end": "last time (s)",
-    **{f"T{k}": "time of an accepted state (s), the last is the latest" for k in range(POINTS)},
+    **{f"point{k}_t": "time of an accepted state (s), the last is the latest" for k in range(POINTS)},
     "h": "step that the controller wants (s)",
     "t1": "end of this attempt (s)",
     "step": "its length (s); 0 where a run begins",

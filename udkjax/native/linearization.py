@@ -3,11 +3,11 @@
 For the accelerations (no suffix), for the projection of a state on the manifold ("_projection") and for the corrections that
 close a mechanism ("_newton_q", "_newton_v") there are
 
-    evaluation(work, out, stored)   what it returns, and what its derivatives know of the state in X
-    forward(work, stored, tangent, out)   the change of what it returns, from those of the constants, of X q and X v of a tangent
-    reverse(work, stored, bar)      the cotangents G of the constants, q and v, from those of what it returns
+    evaluation(work, out, stored)   the results, and what its derivatives need to know of the state
+    forward(work, stored, tangent, out)   the change of the results, from those of the constants and the state in a tangent
+    reverse(work, stored, bar)      `bar constants` and `bar state`, from the cotangents of the results
 
-where all but the accelerations leave their changes in O of a tangent, and find their cotangents in Y.
+where all but the accelerations leave their changes in `result` of a tangent, and find their cotangents in `bar result`.
 """
 
 from udkjax.equations.differentiable_programs import DifferentiableProgram
@@ -24,7 +24,7 @@ class Linearization:
     """The number of values that its derivatives know of a state."""
 
     def __init__(self, module: Module, name: str):
-        self._in, self._name = module, name
+        self._module, self._name = module, name
         self._suffix = "" if name == "accelerations" else f"_{name}"
         self._evaluated: DifferentiableProgram = module.code.differentiable[name]
         self._derivative = self._evaluated.derivative([] if module.moving else ["constants"])
@@ -49,23 +49,23 @@ class Linearization:
     @property
     def _at(self) -> dict[str, Place]:
         results = {x: ("stored", place) for x, place in self._stored.items()}
-        return self._in.arrays | results | {"stored": ("stored", 0)}
+        return self._module.arrays | results | {"stored": ("stored", 0)}
 
     def _along(self, prefix: str) -> dict[str, Place]:
-        start = 0 if self._in.written_out else self._in.places["along"]
+        start = 0 if self._module.written_out else self._module.places["along"]
         return {prefix + x: ("work", start + place) for x, place in self._stored.items()}
 
     def evaluation(self):
         at = self._at | {"a": ("out", 0)}
         pointers, name = ("work", "out", "stored"), f"evaluation{self._suffix}"
-        if self._in.written_out:
-            self._in.write_scalars(self._written_out.evaluation, name, pointers, at)
+        if self._module.written_out:
+            self._module.write_scalars(self._written_out.evaluation, name, pointers, at)
         else:
-            self._in.loops.write(self._evaluated.program, name, pointers, at)
+            self._module.loops.write(self._evaluated.program, name, pointers, at)
 
     def forward(self):
-        w = self._in.tangents
-        changes = {"constants": "constants", "q": "X q", "v": "X v", "q1": "O q", "v1": "O v"}
+        w = self._module.tangents
+        changes = {"constants": "constants", "q": "state q", "v": "state v", "q1": "result q", "v1": "result v"}
         at = self._at | self._along(TANGENT)
         at |= {TANGENT + x: ("tangent", w[place]) for x, place in changes.items()} | {f"{TANGENT}a": ("out", 0)}
         self._write(
@@ -73,16 +73,20 @@ class Linearization:
         )
 
     def reverse(self):
-        t, p = self._in, self._in.places
-        found = {"constants": "G c", "q": "G q", "v": "G v", "q1": "Y q", "v1": "Y v"}
+        module, p = self._module, self._module.places
+        found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v", "q1": "bar result q", "v1": "bar result v"}
         at = self._at | self._along(COTANGENT) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
-        counts = {x: t.code.stored_sizes[x] for x in self._stored} | {"constants": len(t.moving), "q": t.n, "v": t.n}
+        counts = {x: module.code.stored_sizes[x] for x in self._stored} | {
+            "constants": len(module.moving),
+            "q": module.n,
+            "v": module.n,
+        }
         cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items() if x not in ("q1", "v1")]
         program = LoopProgram([*cleared, *self._derivative.reverse.parts])
         self._write(program, f"reverse{self._suffix}", ("work", "stored", "bar"), at | {f"{COTANGENT}a": ("bar", 0)})
 
     def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
-        if self._in.written_out:
-            self._in.write_scalars(self._written_out.derivative, name, pointers, at)
+        if self._module.written_out:
+            self._module.write_scalars(self._written_out.derivative, name, pointers, at)
         else:
-            self._in.loops.write(program, name, pointers, at)
+            self._module.loops.write(program, name, pointers, at)

@@ -47,7 +47,7 @@ def _features() -> str:
 
 @cache
 def lanes() -> int:
-    """How many float64 numbers a vector register holds."""
+    """Return the number of float64 that a vector register holds."""
     features = _llvm().get_host_cpu_features()
     if features.get("avx512f") and features.get("avx512dq") and features.get("avx512vl"):
         return 8
@@ -55,7 +55,7 @@ def lanes() -> int:
 
 
 def digest(text: str) -> str:
-    """What tells one program from another, on this processor, with this compiler."""
+    """Return the key of a program, on this processor, with this compiler."""
     import llvmlite
 
     llvm = _llvm()
@@ -65,7 +65,7 @@ def digest(text: str) -> str:
 
 @cache
 def _linker() -> Any:
-    """What loads object code: JITLink lays code and constants side by side, wherever in a process there is room for both."""
+    """The loader of object code: JITLink lays code and constants side by side, wherever in a process there is room for both."""
     llvm = _llvm()
     machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
     return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")

@@ -8,37 +8,37 @@ from udkjax.native.module import Module
 from udkjax.native.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
 
 
-def newton(t: Module, f: Function, s: Lane):
+def newton(module: Module, f: Function, s: Lane):
     """Newton's method to Psi = 0 of lanes that are `stepping`, until it moves nothing but rounding errors."""
 
     def closer(active: Value):
-        t.invoke(f, "newton_q")
+        module.invoke(f, "newton_q")
         s.where(active & (s.safe < 0.5), ok=0.0)
 
-    iterate_newton(t, f, s, s.stepping > 0.5, closer)
+    iterate_newton(module, f, s, s.stepping > 0.5, closer)
 
 
-def iterate_newton(t: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
-    """Newton's method of some lanes: `closer` leaves X q nearer to the manifold in C."""
+def iterate_newton(module: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
+    """Newton's method of some lanes: `closer` leaves `corrected q`, nearer to the manifold than `state q`."""
     s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
         active = s.iterating > 0.5
         closer(active)
-        change = take_newton_step(t, f, active)
+        change = take_newton_step(module, f, active)
         s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
         k.value = k.value + 1
 
 
-def take_newton_step(t: Module, f: Function, active: Value) -> Value:
-    """Take X q from C in lanes that move; return the largest change, in the scene's own units."""
+def take_newton_step(module: Module, f: Function, active: Value) -> Value:
+    """Take `state q` from `corrected q` in lanes that move; return the largest change, in the scene's own units."""
 
     def change(r: Value) -> list[Value]:
-        old, new = t.vector(f, "X q", r), t.vector(f, "C", r)
-        t.put(f, "X q", r, f.select(active, new, old))
-        return [f.abs(new - old) * t.vector(f, "inverse unit", r)]
+        old, new = module.vector(f, "state q", r), module.vector(f, "corrected q", r)
+        module.put(f, "state q", r, f.select(active, new, old))
+        return [f.abs(new - old) * module.vector(f, "inverse unit", r)]
 
-    return t.largest(f, change)
+    return module.largest(f, change)
 
 
 def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
@@ -52,52 +52,52 @@ def with_threshold(f: Function, place: int | None, threshold: Value, do: Callabl
     f.store(before, f.given["work"], place * f.width, f.width)
 
 
-def velocity_tolerance(t: Module, f: Function, s: Lane, name: str) -> Value:
-    """What the fastest velocity may err, in its unit."""
-    fastest = t.largest(f, lambda r: [f.abs(t.vector(f, name, r)) * t.vector(f, "inverse unit", r)])
+def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value:
+    """Return the tolerance of the fastest velocity, in its unit."""
+    fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])
     return f.fma(s.rtol, fastest / s.omega, s.atol)
 
 
-def project_output(t: Module, f: Function, s: Lane, which: str):
-    """Return X q and X v to the manifold, as X q and O v; `violated` is how far they are from it."""
+def project_output(module: Module, f: Function, s: Lane, which: str):
+    """Project the state, as `state q` and `result v`; `violated` is its distance from the manifold before."""
     mask = getattr(s, which) > 0.5
 
     def iterate(lanes: Value):
-        iterate_newton(t, f, s, lanes, lambda _: t.invoke(f, "newton_q"), OUTPUT_STEPS)
-        t.invoke(f, "newton_v_and_psi")
+        iterate_newton(module, f, s, lanes, lambda _: module.invoke(f, "newton_q"), OUTPUT_STEPS)
+        module.invoke(f, "newton_v_and_psi")
 
     def project():
-        t.invoke(f, "project")
-        s.violated = largest_violation(t, f)
-        far = mask & ~(take_newton_step(t, f, mask) <= SINGLE_STEP_TOL)
+        module.invoke(f, "project")
+        s.violated = largest_violation(module, f)
+        far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
         with f.if_(f.any_of(far)):
-            with f.each(t.rowcount) as r:  # no lane depends on its neighbours: others keep what they have
-                t.put(f, "O dv", r, t.vector(f, "O v", r))
+            with f.each(module.rowcount) as r:  # no lane depends on its neighbours: others keep what they have
+                module.put(f, "result dv", r, module.vector(f, "result v", r))
             iterate(far)
-            with f.each(t.rowcount) as r:
-                t.put(f, "O v", r, f.select(far, t.vector(f, "O v", r), t.vector(f, "O dv", r)))
-            s.where(far, violated=largest_violation(t, f))
-        if t.falls_back:  # a row that was left out, and a pivot that is small: nothing holds what they do
+            with f.each(module.rowcount) as r:
+                module.put(f, "result v", r, f.select(far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
+            s.where(far, violated=largest_violation(module, f))
+        if module.falls_back:  # a row that was left out, and a pivot that is small: nothing holds what they do
             s.open = f.select(mask & (s.violated > OPEN_OUTPUT), f.const(1.0, DOUBLE, f.width), 0.0)
             with f.if_(f.any_of(s.open > 0.5)):
                 f.call("close_output", f.given["work"])
-                s.where(s.open > 0.5, violated=largest_violation(t, f))
+                s.where(s.open > 0.5, violated=largest_violation(module, f))
 
-    if t.plan.projected:
+    if module.plan.projected:
         threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
-        with_threshold(f, t.drop_tol_place if t.falls_back else None, threshold, project)
+        with_threshold(f, module.drop_tol_place if module.falls_back else None, threshold, project)
         return
-    t.invoke(f, "psi")
-    with f.each(t.rowcount) as r:
-        t.put(f, "O v", r, t.vector(f, "X v", r))
-    s.violated = largest_violation(t, f)
+    module.invoke(f, "psi")
+    with f.each(module.rowcount) as r:
+        module.put(f, "result v", r, module.vector(f, "state v", r))
+    s.violated = largest_violation(module, f)
 
 
-def largest_violation(t: Module, f: Function) -> Value:
+def largest_violation(module: Module, f: Function) -> Value:
     """The largest of Psi, each row over its scale; not a number where a row is none."""
     worst = f.variable(0.0)
-    with f.each(t.m) as i:
-        psi = f.load(f.given["work"], i * f.width + t.places["psi"] * f.width, f.width)
-        x = f.abs(psi) / f.load(f.given["work"], i * f.width + t.places["rows"] * f.width, f.width)
+    with f.each(module.m) as i:
+        psi = f.load(f.given["work"], i * f.width + module.places["psi"] * f.width, f.width)
+        x = f.abs(psi) / f.load(f.given["work"], i * f.width + module.places["rows"] * f.width, f.width)
         worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)
     return worst.value

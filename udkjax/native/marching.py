@@ -33,7 +33,7 @@ class Marching(Module):
             code, EULER, projected=False, breaks=False, width=width, vector=vector, written_out=code.is_small, steps=False
         )
         super().__init__(plan)
-        for name in ("M dq0", "M ddq0", "M dddq", "M p"):
+        for name in ("previous dq", "previous ddq", "third derivative", "prediction"):
             self.places.add(name, self.n)
 
     def text(self) -> str:
@@ -65,38 +65,38 @@ class Marching(Module):
         times = f.load(call, self.call_fields.index("times"), base=INT)
         trusted, good, before = f.variable(0.0), f.variable(1.0), f.variable(s.start)
         with f.each(self.n) as i:
-            put("X q", i, get("P3 q", i))
-            for name in ("O dq", "O dv", "M dddq"):
+            put("state q", i, get("point3 q", i))
+            for name in ("result dq", "result dv", "third derivative"):
                 put(name, i, wide(0.0))
         with f.each(times) as k:
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
-                f.store(self.input_number(f, call, "ts", f.lane(s.member, lane), k), work, lane + self.places["X t"] * width)
-            now = get("X t", f.const(0, INT))
+                f.store(self.input_number(f, call, "ts", f.lane(s.member, lane), k), work, lane + self.places["state t"] * width)
+            now = get("state t", f.const(0, INT))
             h = now - before.value
             with f.each(self.n) as i:
-                first, second = get("O dq", i), get("O dv", i)
-                bend = f.fma(h * (1 / 6), get("M dddq", i), second * 0.5)
-                ahead = f.fma(f.fma(bend, h, first), h, get("X q", i))
-                for name, x in (("M dq0", first), ("M ddq0", second), ("X q", ahead), ("M p", ahead)):
+                first, second = get("result dq", i), get("result dv", i)
+                bend = f.fma(h * (1 / 6), get("third derivative", i), second * 0.5)
+                ahead = f.fma(f.fma(bend, h, first), h, get("state q", i))
+                for name, x in (("previous dq", first), ("previous ddq", second), ("state q", ahead), ("prediction", ahead)):
                     put(name, i, x)
             for _ in range(CORRECTIONS):
                 self.invoke(f, "newton_q")
                 with f.each(self.n) as i:
-                    put("X q", i, get("C", i))
+                    put("state q", i, get("corrected q", i))
             self.invoke(f, "value_derivatives")
             off, largest = f.variable(0.0), f.variable(1.0)
             along, one, other = f.variable(0.0), f.variable(0.0), f.variable(0.0)
             moves_on = h.is_not(0.0)
             per_h = f.select(moves_on, wide(1.0) / f.select(moves_on, h, wide(1.0)), wide(0.0))
             with f.each(self.n) as i:
-                unit, q = get("inverse unit", i), get("X q", i)
+                unit, q = get("inverse unit", i), get("state q", i)
                 largest.value = f.max(f.abs(q) * unit, largest.value)
-                off.value = f.max(f.abs(q - get("M p", i)) * unit, off.value)
-                old, new = get("M dq0", i) * unit, get("O dq", i) * unit
+                off.value = f.max(f.abs(q - get("prediction", i)) * unit, off.value)
+                old, new = get("previous dq", i) * unit, get("result dq", i) * unit
                 along.value = f.fma(old, new, along.value)
                 one.value = f.fma(old, old, one.value)
                 other.value = f.fma(new, new, other.value)
-                put("M dddq", i, (get("O dv", i) - get("M ddq0", i)) * per_h)
+                put("third derivative", i, (get("result dv", i) - get("previous ddq", i)) * per_h)
             violated = f.variable(0.0)
             with f.each(self.m) as i:
                 x = f.abs(get("psi", i)) / get("rows", i)
@@ -112,11 +112,11 @@ class Marching(Module):
             good.value = f.select(fine, good.value, wide(0.0))
             trusted.value = trusted.value + good.value
             with f.if_(begins), f.each(self.n) as i:  # there was no step: nothing is known of the third derivative
-                put("M dddq", i, wide(0.0))
+                put("third derivative", i, wide(0.0))
             before.value = now
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
                 row = self.to_int(f, f.lane(s.member, lane)) * times + k
-                for name, x in (("qs", "X q"), ("dqs", "O dq"), ("ddqs", "O dv")):
+                for name, x in (("qs", "state q"), ("dqs", "result dq"), ("ddqs", "result dv")):
                     self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, lane)
         with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
             to = f.load(call, self.call_fields.index("trusted"), base=POINTER)

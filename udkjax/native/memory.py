@@ -1,4 +1,4 @@
-"""How the code of a run reads and writes its memory, its inputs and its outputs."""
+"""Access of a run's code to its memory, its inputs and its outputs."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -39,16 +39,16 @@ class Memory:
         return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, *lengths, "next"
 
     def layout(self, pointer: str) -> Layout:
-        """How the memory at a pointer is laid out."""
+        """Return the layout of the memory at a pointer."""
         return self.places if pointer == "work" else self.tangents
 
     def start(self, name: str, pointer: str) -> int:
-        """Where an array is, in numbers from a pointer."""
+        """Return the place of an array, in numbers from a pointer."""
         layout = self.layout(pointer)
         return layout[name] * layout.width
 
     def registers(self, pointer: str) -> int:
-        """How many registers the coordinates take."""
+        """Count the registers that the coordinates take."""
         return -(-self.n * self.layout(pointer).width // self.plan.vector)
 
     def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
@@ -121,7 +121,7 @@ class Memory:
         return f.op(f"fptosi double {x.name} to i64", INT)
 
     def call_record(self, f: Function) -> Value:
-        """What `run` was told."""
+        """Return the pointer to the call record of `run`."""
         return f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
 
     def input_number(self, f: Function, call: Value, name: str, member: Value, k: Value) -> Value:

@@ -53,16 +53,29 @@ class Module(Memory):
         for name in LANE_NUMBERS:
             p.add(name)
         p.add("constants", self.constants)
-        p.add("X t")
-        for name in ("X q", "X v", "X dq", "X dv", "O v", "O a", "O dq", "O dv", "C", "scale q", "scale v", "inverse unit"):
+        p.add("state t")
+        for name in (
+            "state q",
+            "state v",
+            "state dq",
+            "state dv",
+            "result v",
+            "result a",
+            "result dq",
+            "result dv",
+            "corrected q",
+            "scale q",
+            "scale v",
+            "inverse unit",
+        ):
             p.add(name, n)
         for k in range(POINTS):
             for x in "qva":
-                p.add(f"P{k} {x}", n)
+                p.add(f"point{k} {x}", n)
         for i in range(1, plan.method.stages):
-            p.add(f"A{i}", n)
+            p.add(f"stage{i} a", n)
         for k in range(3 * POINTS):
-            p.add(f"N{k}", n)
+            p.add(f"difference{k}", n)
         p.add("rows", m)
         p.add("psi", m)
         p.add("terms", code.term_count)
@@ -81,12 +94,12 @@ class Module(Memory):
         self.tangents = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
         self.loops = LoopWriter(plan.width, cold=plan.written_out)
-        self.stage_accelerations = ["P3 a", *(f"A{i}" for i in range(1, plan.method.stages))]
+        self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
 
     @property
     def drop_tol_place(self) -> int | None:
-        """Where the threshold of pivots lies, if one is looked at."""
+        """The place of the threshold of pivots; None if no pivot is compared with it."""
         place = (self.written_out or self.code).drop_tol_index
         return None if place is None else self.places["constants"] + place
 
@@ -115,9 +128,18 @@ class Module(Memory):
 
     @property
     def arrays(self) -> dict[str, Place]:
-        """Where the arrays of the scene's programs lie."""
-        named = {"t": "X t", "q": "X q", "v": "X v", "dq": "X dq", "dv": "X dv", "q1": "C", "v1": "O v", "a": "O a"}
-        named |= {"dq1": "O dq", "dv1": "O dv"} | {
+        """The places of the arrays of the scene's programs."""
+        named = {
+            "t": "state t",
+            "q": "state q",
+            "v": "state v",
+            "dq": "state dq",
+            "dv": "state dv",
+            "q1": "corrected q",
+            "v1": "result v",
+            "a": "result a",
+        }
+        named |= {"dq1": "result dq", "dv1": "result dv"} | {
             x: x for x in ("constants", "psi", "terms", "pieces", "safe", "distance", "rank")
         }
         if not self.written_out:
@@ -171,16 +193,16 @@ class Module(Memory):
         return f, Lane(f, self.places)
 
     def write_derivatives(self):
-        """Its functions."""
+        """Hook: writes the functions of derivatives; none by default."""
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """What it does with stage i of a step, whose state is in X."""
+        """Hook: called after stage i of a step, at its state."""
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        """What it does with a step once its end is in P3."""
+        """Hook: called after a step, once its end is point 3 in lanes that `accept`."""
 
     def record_output(self, f: Function, s: Lane):
-        """What it does with a state between steps, in X t, X q and O v, of lanes that are `due`."""
+        """Hook: called with a state between steps (`state t`, `state q`, `result v`) of lanes that are `due`."""
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         """Hook: called with a member that is taken into a lane; does nothing by default."""
@@ -189,10 +211,10 @@ class Module(Memory):
         """Hook: called with the addresses of the numbers and constants that a lane goes on with; does nothing by default."""
 
     def end_members(self, f: Function, s: Lane):
-        """What it does with members that are done, in lanes that are `due`."""
+        """Hook: called with members that are done, in lanes that are `due`."""
 
     def goes_on(self, f: Function, s: Lane) -> Value:
-        """Whether there is something to do in the lanes."""
+        """Return whether there is something to do in the lanes."""
         return f.any_of(s.active > 0.5)
 
     def text(self) -> str:
@@ -204,7 +226,7 @@ class Module(Memory):
         raise NotImplementedError
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Which members come next, into lanes whose members are done."""
+        """Fill the lanes whose members are done with the next ones."""
         fill()
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
@@ -213,5 +235,5 @@ class Module(Memory):
         return []
 
     def accelerate_stage(self, f: Function, i: int):
-        """The accelerations of stage i, of the state in X."""
-        self.invoke(f, "accelerations", f"A{i}")
+        """Compute the accelerations of stage i, of its state."""
+        self.invoke(f, "accelerations", f"stage{i} a")

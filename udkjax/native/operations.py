@@ -1,4 +1,4 @@
-"""What machine code does: one class for each operation, with the module that it is made of and the shapes of what it returns.
+"""The operations of machine code: a class for each, with its module and the shapes of its outputs.
 
 An operation is all that its code depends on but the number of lanes. Inputs and outputs have the members first; an input that
 all members share has only one.
@@ -43,7 +43,7 @@ class Tableau:
 
 @dataclass(frozen=True)
 class Operation(ABC):
-    """What code does with members of a scene."""
+    """An operation on members of a scene."""
 
     code: ScenePrograms
 

@@ -1,4 +1,4 @@
-"""Where a step leaves the piece of the state in which the motion is smooth (a cubic of a cam's profile)."""
+"""Steps that leave the piece of the state in which the motion is smooth (a cubic of a cam's profile)."""
 
 from collections.abc import Callable
 
@@ -9,54 +9,56 @@ from udkjax.native.module import Module
 from udkjax.native.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
 
 
-def write_leave(t: Module):
-    """What becomes of a step that ends in another piece of the motion, of lanes in `again`: whether it lands there, or not.
+def write_leave(module: Module):
+    """Write `leave`: for lanes in `again`, whether a step that ends in another piece of the motion lands there.
 
     Else it is taken `again`, to end just before the piece does. The next step is a tiny one across,
     behind which the run starts anew: so also what is known of accelerations at the ends of steps belongs to one piece.
     """
-    f, s = t.function("leave")
+    f, s = module.function("leave")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
 
     def find_pieces(time: Value, state: Callable[[Value], tuple[Value, Value]]):
-        setattr(s, "X t", time)
-        with f.each(t.rowcount) as r:
+        setattr(s, "state t", time)
+        with f.each(module.rowcount) as r:
             for x, value in zip("qv", state(r), strict=True):
-                t.put(f, f"X {x}", r, value)
-        t.invoke(f, "pieces")
+                module.put(f, f"state {x}", r, value)
+        module.invoke(f, "pieces")
 
     def moved() -> Value:
         found = f.variable(f.const(False, BOOL, f.width), BOOL)
-        with f.each(t.pieces) as k:
-            one, other = (f.load(f.given["work"], k * f.width + t.start(x, "work"), f.width) for x in ("pieces", "pieces before"))
+        with f.each(module.pieces) as k:
+            one, other = (
+                f.load(f.given["work"], k * f.width + module.start(x, "work"), f.width) for x in ("pieces", "pieces before")
+            )
             found.value = found.value | one.is_not(other)
         return found.value
 
-    with f.each(t.rowcount) as r:
-        t.put(f, "C", r, t.vector(f, "X q", r))
-    find_pieces(s.T3, lambda r: (t.vector(f, "P3 q", r), t.vector(f, "P3 v", r)))
-    with f.each(t.pieces) as k:
+    with f.each(module.rowcount) as r:
+        module.put(f, "corrected q", r, module.vector(f, "state q", r))
+    find_pieces(s.point3_t, lambda r: (module.vector(f, "point3 q", r), module.vector(f, "point3 v", r)))
+    with f.each(module.pieces) as k:
         f.store(
-            f.load(f.given["work"], k * f.width + t.start("pieces", "work"), f.width),
+            f.load(f.given["work"], k * f.width + module.start("pieces", "work"), f.width),
             f.given["work"],
-            k * f.width + t.start("pieces before", "work"),
+            k * f.width + module.start("pieces before", "work"),
             f.width,
         )
-    find_pieces(s.t1, lambda r: (t.vector(f, "C", r), t.vector(f, "O v", r)))
-    stepping, step = s.again > 0.5, s.t1 - s.T3
+    find_pieces(s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
+    stepping, step = s.again > 0.5, s.t1 - s.point3_t
     leaves = stepping & (s.begin < 0.5) & moved() & f.is_finite(s.error)
     s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(leaves)), f.each(HALVINGS):
         middle = (s.low + s.share) * 0.5
         s.behind = middle
-        find_pieces(f.fma(middle, step, s.T3), lambda r: interpolate_step(t, f, s.behind, step, r))
+        find_pieces(f.fma(middle, step, s.point3_t), lambda r: interpolate_step(module, f, s.behind, step, r))
         other = moved()
         s.where(leaves & other, share=s.behind)
         s.where(leaves & ~other, low=s.behind)
-    setattr(s, "X t", s.t1)
-    with f.each(t.rowcount) as r:
-        t.put(f, "X q", r, t.vector(f, "C", r))
-        t.put(f, "X v", r, t.vector(f, "O v", r))
+    setattr(s, "state t", s.t1)
+    with f.each(module.rowcount) as r:
+        module.put(f, "state q", r, module.vector(f, "corrected q", r))
+        module.put(f, "state v", r, module.vector(f, "result v", r))
     share, aim, good = s.share, s.aim, s.error < 1.0
     again = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
     exact = f.min(share, yes - share) <= NEAR_END
@@ -66,25 +68,25 @@ def write_leave(t: Module):
     across = reached | (again & (share <= EDGE))
     before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
     aim = where(again, where(exact, before, beyond), where(short, aim, beyond))
-    expected = f.fma(where(exact, share - EDGE / 2, share + NEAR_END / 2), step, s.T3)
+    expected = f.fma(where(exact, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
     crossing = where(again, expected, where(short, s.crossing, inf))
-    crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.T3)), crossing)
+    crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
     tries = where(again, s.tries + 1.0, where(good, 0.0, s.tries))
     s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
     s.again = where(again, yes, 0.0)
 
 
-def interpolate_step(t: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
+def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
     """q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
-    x, h = t.broadcast(f, share), t.broadcast(f, step)
+    x, h = module.broadcast(f, share), module.broadcast(f, step)
 
     def along(*coefficients: float) -> Value:
-        total = f.const(coefficients[-1], DOUBLE, t.plan.vector)
+        total = f.const(coefficients[-1], DOUBLE, module.plan.vector)
         for c in reversed(coefficients[:-1]):
             total = f.fma(total, x, c)
         return total
 
-    ends = [t.vector(f, name, r) for name in ("P3 q", "C", "P3 v", "O v", "P3 a", "O a")]
+    ends = [module.vector(f, name, r) for name in ("point3 q", "corrected q", "point3 v", "result v", "point3 a", "result a")]
     weights = [
         (1.0, 0.0, 0.0, -10.0, 15.0, -6.0),
         (0.0, 0.0, 0.0, 10.0, -15.0, 6.0),
@@ -94,7 +96,7 @@ def interpolate_step(t: Module, f: Function, share: Value, step: Value, r: Value
         (0.0, 0.0, 0.0, 0.5, -1.0, 0.5),
     ]
     scales = (None, None, h, h, h * h, h * h)
-    q = v = f.const(0.0, DOUBLE, t.plan.vector)
+    q = v = f.const(0.0, DOUBLE, module.plan.vector)
     for end, c, scale in zip(ends, weights, scales, strict=True):
         scaled = end if scale is None else end * scale
         q = f.fma(along(*c), scaled, q)

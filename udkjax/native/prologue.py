@@ -15,18 +15,20 @@ from udkjax.native.module import Module
 FORWARD, REVERSE = "prologue_forward", "prologue_reverse"
 
 
-def write_prologue_derivative(t: Module, active: Sequence[bool], reverse: bool):
+def write_prologue_derivative(module: Module, active: Sequence[bool], reverse: bool):
     """Write `prologue_forward` or `prologue_reverse`, along the numbers that are active."""
     name, prefix = (REVERSE, COTANGENT) if reverse else (FORWARD, TANGENT)
     further = ("constants_bar", "numbers_bar") if reverse else ("dnumbers", "dconstants")
     pointers, changes = ("numbers", "constants", *further), ("constants", "numbers") if reverse else ("numbers", "constants")
     at = {x: (x, 0) for x in ("numbers", "constants")}
     at |= {prefix + x: (pointer, 0) for x, pointer in zip(changes, further, strict=True)}
-    if t.written_out:
-        t.write_scalars(t.written_out.prologue_derivative(active, reverse), name, pointers, at, 1)
+    if module.written_out:
+        module.write_scalars(module.written_out.prologue_derivative(active, reverse), name, pointers, at, 1)
         return
-    derivative = LoopDerivative(t.code.prologue.parts, ())
+    derivative = LoopDerivative(module.code.prologue.parts, ())
     parts = (
-        [Reset(f"{COTANGENT}numbers", 0, t.code.number_count), *derivative.reverse.parts] if reverse else derivative.forward.parts
+        [Reset(f"{COTANGENT}numbers", 0, module.code.number_count), *derivative.reverse.parts]
+        if reverse
+        else derivative.forward.parts
     )
-    t.loops.write(LoopProgram(parts), name, pointers, at, width=1)
+    module.loops.write(LoopProgram(parts), name, pointers, at, width=1)

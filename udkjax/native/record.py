@@ -18,7 +18,7 @@ HEAD = 3  # numbers of a point before its state: its time, how many outputs were
 
 
 def record_length(n: int, points: int) -> int:
-    """How many numbers the record of a member has, of n coordinates and so many points."""
+    """Return the length of the record of a member, of n coordinates and so many points."""
     return TITLE + points * (HEAD + 3 * n)
 
 
@@ -34,7 +34,7 @@ class Recorded(Differentiated):
         self.row = HEAD + 3 * self.n
 
     def walks_back(self, f: Function) -> Value:
-        """Whether there are cotangents."""
+        """Return whether there are cotangents."""
         return f.load(self.call_record(f), self.call_fields.index("directions"), base=INT) > 0
 
     def _leaves_record(self, f: Function) -> Value:
@@ -120,7 +120,7 @@ class Recorded(Differentiated):
         return f.load(f.given["work"], k + self.places[name] * f.width, base=base)
 
     def _store_point(self, f: Function, s: Lane, k: Value):
-        """One more point, that of P3."""
+        """Append point 3 to the record of lane k."""
         points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
         with f.if_(points >= capacity):
             self._put_lane(f, "capacity", k, capacity * 2.0)
@@ -130,23 +130,23 @@ class Recorded(Differentiated):
             f.declared.add("declare ptr @realloc(ptr, i64)")
             self._put_lane(f, "record", k, new, POINTER)
         row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, points) * self.row)
-        for j, name in enumerate(("T3", "written", "begin")):
+        for j, name in enumerate(("point3_t", "written", "begin")):
             f.store(self._lane(f, name, k), row, j)
         for j, x in enumerate("qva"):
-            self.copy_lane(f, row, HEAD + j * self.n, f"P3 {x}", k)
+            self.copy_lane(f, row, HEAD + j * self.n, f"point3 {x}", k)
         self._put_lane(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
         """A point of lane k from its record; before the first one there is the first."""
         row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, f.max(number, 0.0)) * self.row)
-        self._put_lane(f, f"T{point[1:]}", k, f.load(row, 0))
+        self._put_lane(f, f"{point}_t", k, f.load(row, 0))
         for j, x in enumerate("qva"):
             with f.each(self.n) as i:
                 place = i * f.width + k + self.start(f"{point} {x}", "work")
                 f.store(f.load(row, i + (HEAD + j * self.n)), f.given["work"], place)
 
     def _load_head(self, f: Function, k: Value):
-        """What is noted of the step that led to the point where lane k is."""
+        """Load the head of lane k's point: outputs written `before` its step, and `begin`."""
         row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, self._lane(f, "at", k)) * self.row)
         self._put_lane(f, "before", k, f.load(row, 1))
         self._put_lane(f, "begin", k, f.load(row, 2))

@@ -10,11 +10,11 @@ from udkjax.native.module import Module
 ARGUMENTS = ((POINTER, "work"), (POINTER, "call"), (INT, "lane"))
 
 
-def count_breakpoints(t: Module, f: Function, member: Value, time: Value) -> Value:
-    """How many breakpoints of a member lie before a time, by bisection."""
+def count_breakpoints(module: Module, f: Function, member: Value, time: Value) -> Value:
+    """Count the breakpoints of a member before a time, by bisection."""
     call = f.given["call"]
-    breaks = t.member_address(f, call, "breaks", member)
-    low, high = f.variable(0, INT, 1), f.variable(f.load(call, t.call_fields.index("knots"), base=INT), INT, 1)
+    breaks = module.member_address(f, call, "breaks", member)
+    low, high = f.variable(0, INT, 1), f.variable(f.load(call, module.call_fields.index("knots"), base=INT), INT, 1)
     with f.while_(lambda: low.value < high.value):
         middle = f.arithmetic("div", low.value + high.value, 2)
         before = f.load(breaks, middle) < time
@@ -22,64 +22,66 @@ def count_breakpoints(t: Module, f: Function, member: Value, time: Value) -> Val
     return low.value
 
 
-def enter_first_row(t: Module, f: Function, lane: Value, member: Value):
+def enter_first_row(module: Module, f: Function, lane: Value, member: Value):
     """Give a lane the constants with which its member begins."""
     work, call = f.given["work"], f.given["call"]
-    start, smallest = (f.load(work, lane + t.places[name] * f.width) for name in ("start", "smallest"))
-    f.store(count_breakpoints(t, f, member, start - smallest), work, lane + t.places["knot"] * f.width)
+    start, smallest = (f.load(work, lane + module.places[name] * f.width) for name in ("start", "smallest"))
+    f.store(count_breakpoints(module, f, member, start - smallest), work, lane + module.places["knot"] * f.width)
     f.call("enter", work, call, lane)
 
 
-def write_next_breakpoint(t: Module):
+def write_next_breakpoint(module: Module):
     """`next_breakpoint(work, call)`: `due` is the first breakpoint that a lane has not passed; infinite where there is none."""
-    f, s = t.function("next_breakpoint", ARGUMENTS[:2])
+    f, s = module.function("next_breakpoint", ARGUMENTS[:2])
     call = f.given["call"]
-    knots = f.load(call, t.call_fields.index("knots"), base=INT)
+    knots = f.load(call, module.call_fields.index("knots"), base=INT)
     with f.each(f.width) as k:
-        knot, at = t.to_int(f, f.lane(s.knot, k)), f.variable(float("inf"), width=1)
+        knot, at = module.to_int(f, f.lane(s.knot, k)), f.variable(float("inf"), width=1)
         with f.if_(knot < knots):
-            at.value = t.input_number(f, call, "breaks", f.lane(s.member, k), knot)
-        f.store(at.value, f.given["work"], k + t.places["due"] * f.width)
+            at.value = module.input_number(f, call, "breaks", f.lane(s.member, k), knot)
+        f.store(at.value, f.given["work"], k + module.places["due"] * f.width)
 
 
-def write_enter(t: Module):
+def write_enter(module: Module):
     """`enter(work, call, lane)`: the constants of a lane, of the samples that hold behind the breakpoints that it has passed."""
-    f, _ = t.function("enter", ARGUMENTS)
+    f, _ = module.function("enter", ARGUMENTS)
     work, call, lane = (f.given[name] for _, name in ARGUMENTS)
 
     def place(name: str) -> Value:
-        return lane + t.places[name] * f.width
+        return lane + module.places[name] * f.width
 
-    knot, member = f.load(work, place("knot")), t.to_int(f, f.load(work, place("member")))
+    knot, member = f.load(work, place("knot")), module.to_int(f, f.load(work, place("member")))
     f.store(knot, work, place("row"))
-    numbers = numbers_of_row(t, f, member, knot) if t.plan.sampled else t.member_address(f, call, "numbers", member)
-    constants = Value(f, f.reserve(DOUBLE, max(t.constants, 1)), POINTER)
+    numbers = (
+        numbers_of_row(module, f, member, knot) if module.plan.sampled else module.member_address(f, call, "numbers", member)
+    )
+    constants = Value(f, f.reserve(DOUBLE, max(module.constants, 1)), POINTER)
     f.call("prologue", numbers, constants)
-    with f.each(t.constants) as i:
+    with f.each(module.constants) as i:
         f.store(f.load(constants, i), work, i * f.width + place("constants"))
-    if t.falls_back and not t.written_out:
-        count = len(t.code.constants)
+    if module.falls_back and not module.written_out:
+        count = len(module.code.constants)
         all_constants, tol = Value(f, f.reserve(DOUBLE, count), POINTER), f.load(work, place("fallback_tol"))
         f.call("fallback_prologue", numbers, all_constants)
-        f.store(tol * tol, all_constants, t.code.drop_tol_index)
+        f.store(tol * tol, all_constants, module.code.drop_tol_index)
         with f.each(count) as i:
             f.store(f.load(all_constants, i), work, i * f.width + place("fallback constants"))
-    t.begin_row(f, lane, member, numbers, constants)
+    module.begin_row(f, lane, member, numbers, constants)
 
 
-def numbers_of_row(t: Module, f: Function, member: Value, row: Value) -> Value:
+def numbers_of_row(module: Module, f: Function, member: Value, row: Value) -> Value:
     """The address of a copy of a member's numbers, with a row of samples in."""
-    given = t.member_address(f, f.given["call"], "numbers", member)
-    copy = f.at(f.given["work"], t.places["numbers"] * f.width)
-    with f.each(t.code.number_count) as i:
+    given = module.member_address(f, f.given["call"], "numbers", member)
+    copy = f.at(f.given["work"], module.places["numbers"] * f.width)
+    with f.each(module.code.number_count) as i:
         f.store(f.load(given, i), copy, i)
-    samples = row_address(t, f, "samples", member, row)
-    for k, place in enumerate(t.plan.sampled):
+    samples = row_address(module, f, "samples", member, row)
+    for k, place in enumerate(module.plan.sampled):
         f.store(f.load(samples, k), copy, place)
     return copy
 
 
-def row_address(t: Module, f: Function, name: str, member: Value, row: Value) -> Value:
+def row_address(module: Module, f: Function, name: str, member: Value, row: Value) -> Value:
     """The address of a row of the samples of a member."""
-    start = t.member_address(f, f.given["call"], name, member)
-    return f.at(start, t.to_int(f, row) * len(t.plan.sampled))
+    start = module.member_address(f, f.given["call"], name, member)
+    return f.at(start, module.to_int(f, row) * len(module.plan.sampled))

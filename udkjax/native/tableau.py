@@ -1,4 +1,4 @@
-"""What an explicit Runge-Kutta method needs of its tableau for q'' = a(t, q, v); and that of the default."""
+"""Tableaus of explicit Runge-Kutta methods for q'' = a(t, q, v), among them that of the default."""
 
 from collections.abc import Sequence
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""Derivatives of a trajectory in forward mode: along P directions, in the same code, step by step.
+"""Derivatives of a trajectory in forward mode: along directions, in the same code, step by step.
 
 Where a run goes is a function of the constants of a scene and of the initial state. Steps are taken as they are: no derivative is
 taken of their sizes. Along a direction, the states of the stages change by the same sums that they are made of,
@@ -23,7 +23,7 @@ from udkjax.native.trajectory import Trajectory
 
 
 class Differentiated(Trajectory):
-    """What both modes have in common: programs of derivatives, and memory for what they know of a state.
+    """The base of both modes: programs of derivatives, and memory for what they know of a state.
 
     `active` says which numbers of the scene have derivatives; positions and velocities do.
     """
@@ -39,13 +39,13 @@ class Differentiated(Trajectory):
         self.of_accelerations = Linearization(self, "accelerations")
         self.of_projection = Linearization(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last: of the end
-            self.places.add(f"K{i}", self.of_accelerations.stored)
+            self.places.add(f"stage{i} linearization", self.of_accelerations.stored)
         if self.of_projection:
-            self.places.add("KP", self.of_projection.stored)
+            self.places.add("projection linearization", self.of_projection.stored)
 
     def evaluate_stage(self, f: Function, i: int):
-        """The accelerations of stage i at the state in X, with what their derivatives need to know of it."""
-        f.call("evaluation", f.given["work"], self.address(f, f"A{i}"), self.address(f, f"K{i}"))
+        """Compute the accelerations of stage i at its state, with what their derivatives need to know of it."""
+        f.call("evaluation", f.given["work"], self.address(f, f"stage{i} a"), self.address(f, f"stage{i} linearization"))
 
     def write_programs(self):
         super().write_programs()
@@ -54,13 +54,13 @@ class Differentiated(Trajectory):
 
     @property
     def _linearizations(self) -> list[Linearization]:
-        """What has derivatives."""
+        """The differentiable programs of the module."""
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
     def _evaluate_end(self, f: Function):
-        """What is known of the state in X, that of a projection."""
+        """Evaluate a projection at the state, which lies on the manifold, for its derivatives."""
         if self.of_projection:
-            f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "KP"))
+            f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "projection linearization"))
 
 
 class Forward(Differentiated):
@@ -82,15 +82,15 @@ class Forward(Differentiated):
         self.tangents = w = Layout(lanes, plan.vector)
         self.group = lanes // plan.width  # directions of a tangent
         w.add("constants", self.count)
-        for name in ("X q", "X v", "O q", "O v"):
+        for name in ("state q", "state v", "result q", "result v"):
             w.add(name, self.n)
         for k in range(POINTS):
             for x in "qva":
-                w.add(f"P{k} {x}", self.n)
+                w.add(f"point{k} {x}", self.n)
         for i in range(1, plan.method.stages):
-            w.add(f"A{i}", self.n)
+            w.add(f"stage{i} a", self.n)
         for k in range(3 * POINTS):
-            w.add(f"N{k}", self.n)
+            w.add(f"difference{k}", self.n)
 
     def write_derivatives(self):
         for each in self._linearizations:
@@ -103,7 +103,7 @@ class Forward(Differentiated):
 
     @contextmanager
     def _each_tangent(self, f: Function) -> Iterator[Value]:
-        """What is done for every group of directions, with `tangent` where its memory is."""
+        """Run the block for every group of directions, with `tangent` where its memory is."""
         first = f.load(f.given["work"], self.places["tangents"] * f.width, base=POINTER)
         with f.each(self._groups(f, self.call_record(f))) as p:
             f.given["tangent"] = f.at(first, p * (self.tangents.size * self.tangents.width))
@@ -111,7 +111,7 @@ class Forward(Differentiated):
 
     @contextmanager
     def _each_direction(self, f: Function, p: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
-        """What is done for every direction of a group, of the member in a lane: its number, and its lane in a tangent."""
+        """Run the block for every direction of a group, of the member in a lane: its number, and its lane in a tangent."""
         with f.each(self.group) as j:
             direction = p * self.group + j
             with f.if_(direction < self._directions(f, self.call_record(f))):
@@ -128,75 +128,75 @@ class Forward(Differentiated):
         f.call(name, f.given["work"], self.address(f, stored), tangent, out or tangent)
 
     def _project_tangent(self, f: Function):
-        """O q and O v of a tangent: X q and X v once projected, at the state in X, which is on the manifold."""
+        """Compute `result` of a tangent: its `state` once projected, at the state, which is on the manifold."""
         if self.of_projection:
-            self._along(f, "forward_projection", "KP")
+            self._along(f, "forward_projection", "projection linearization")
         else:
             with f.each(self.registers("tangent")) as r:
                 for x in "qv":
-                    self.put(f, f"O {x}", r, self.vector(f, f"X {x}", r, "tangent"), "tangent")
+                    self.put(f, f"result {x}", r, self.vector(f, f"state {x}", r, "tangent"), "tangent")
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """The changes of the stage's accelerations."""
+        """Compute the changes of the stage's accelerations."""
         h = self.broadcast(f, s.step)
         with self._each_tangent(f):
-            self._change_stage(f, i, h, "P3")
-            self._along(f, "forward", f"K{i}", self._tangent_address(f, f"A{i}"))
+            self._change_stage(f, i, h, "point3")
+            self._along(f, "forward", f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        """The changes of the state in P3, from those in P2, where the step began."""
-        step = f.select(s.begin > 0.5, 0.0, s.t1 - s.T2)
+        """Compute the changes of point 3, from those of point 2, where the step began."""
+        step = f.select(s.begin > 0.5, 0.0, s.t1 - s.point2_t)
         h, begin = self.broadcast(f, step), s.begin > 0.5
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for k in range(POINTS - 1):
                 for x in "qva":
-                    mine, other = (self.vector(f, f"P{j} {x}", r, "tangent") for j in (k, k + 1))
-                    self.put(f, f"P{k} {x}", r, f.select(accept, other, mine), "tangent")
-        setattr(s, "X t", s.T3)
+                    mine, other = (self.vector(f, f"point{j} {x}", r, "tangent") for j in (k, k + 1))
+                    self.put(f, f"point{k} {x}", r, f.select(accept, other, mine), "tangent")
+        setattr(s, "state t", s.point3_t)
         with f.each(self.rowcount) as r:
             for x in "qv":
-                self.put(f, f"X {x}", r, self.vector(f, f"P3 {x}", r))
+                self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
-        f.call("evaluation", f.given["work"], self.address(f, "C"), self.address(f, f"K{self.last}"))
+        f.call("evaluation", f.given["work"], self.address(f, "corrected q"), self.address(f, f"stage{self.last} linearization"))
         with self._each_tangent(f):
-            self._change_stage(f, self.last, h, "P2")
+            self._change_stage(f, self.last, h, "point2")
             with f.each(self.registers("tangent")) as r:
                 for x in "qv":
-                    new = f.select(begin, self.vector(f, f"P2 {x}", r, "tangent"), self.vector(f, f"X {x}", r, "tangent"))
-                    self.put(f, f"X {x}", r, new, "tangent")
+                    new = f.select(begin, self.vector(f, f"point2 {x}", r, "tangent"), self.vector(f, f"state {x}", r, "tangent"))
+                    self.put(f, f"state {x}", r, new, "tangent")
             self._project_tangent(f)
             with f.each(self.registers("tangent")) as r:
                 for x in "qv":
-                    self.put(f, f"X {x}", r, self.vector(f, f"O {x}", r, "tangent"), "tangent")
-            self._along(f, "forward", f"K{self.last}", self._tangent_address(f, "N0"))
+                    self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
+            self._along(f, "forward", f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
             with f.each(self.registers("tangent")) as r:
-                for name, x in (("O q", "q"), ("O v", "v"), ("N0", "a")):
-                    old, new = self.vector(f, f"P3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
-                    self.put(f, f"P3 {x}", r, f.select(accept, new, old), "tangent")
+                for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
+                    old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
+                    self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
 
     def _change_stage(self, f: Function, i: int, h: Value, start: str):
-        """The change of the state of stage i, in X of a tangent, of the step from a point."""
+        """Compute the change of the state of stage i in a tangent, of the step from a point."""
         node, names = float(self.method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
         with f.each(self.registers("tangent")) as r:
             q, v = self.vector(f, f"{start} q", r, "tangent"), self.vector(f, f"{start} v", r, "tangent")
             sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "tangent") for row in (self.method.q, self.method.v))
             slope = v * node if sum_q is None else f.fma(h, sum_q, v * node)
-            self.put(f, "X q", r, f.fma(h, slope, q), "tangent")
-            self.put(f, "X v", r, v if sum_v is None else f.fma(h, sum_v, v), "tangent")
+            self.put(f, "state q", r, f.fma(h, slope, q), "tangent")
+            self.put(f, "state v", r, v if sum_v is None else f.fma(h, sum_v, v), "tangent")
 
     def _tangent_address(self, f: Function, name: str) -> Value:
         return f.at(f.given["tangent"], self.start(name, "tangent"))
 
     def record_output(self, f: Function, s: Lane):
         with f.each(self.rowcount) as r:
-            self.put(f, "X v", r, self.vector(f, "O v", r))  # the programs look for states there
+            self.put(f, "state v", r, self.vector(f, "result v", r))  # the programs look for states there
         self._evaluate_end(f)
         with self._each_tangent(f) as p:
             f.call("tangent_differences", f.given["work"], f.given["tangent"])
             f.call("tangent_between", f.given["work"], f.given["tangent"])
             self._project_tangent(f)
             with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
-                self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "O q", "O v")
+                self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "result q", "result v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
         """The changes of a state of the member in lane k along the directions of group p."""
@@ -238,9 +238,9 @@ class Forward(Differentiated):
     def begin_member(self, f: Function, lane: Value, member: Value):
         with self._each_tangent(f) as p, self._each_direction(f, p, lane) as (direction, place):
             for x in "qv":
-                self._read_state(f, f"d{x}", member, direction, place, [f"P{k} {x}" for k in range(POINTS)])
+                self._read_state(f, f"d{x}", member, direction, place, [f"point{k} {x}" for k in range(POINTS)])
             with f.each(self.n) as i:
-                for name in (*(f"P{k} a" for k in range(POINTS)), *(f"A{j}" for j in range(1, self.last))):
+                for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.last))):
                     f.store(0.0, f.given["tangent"], (i + self.tangents[name]) * self.tangents.width + place)
 
     def _read_state(self, f: Function, name: str, member: Value, direction: Value, place: Value, to: Sequence[str]):
@@ -259,13 +259,13 @@ class Forward(Differentiated):
             member = self.to_int(f, f.lane(s.member, k))
             with self._each_direction(f, p, k) as (direction, lane):
                 for x in "qv":
-                    self._read_state(f, f"d{x}", member, direction, lane, [f"X {x}"])
+                    self._read_state(f, f"d{x}", member, direction, lane, [f"state {x}"])
                 row = (member * self._directions(f, call) + direction) * (2 * self.n)
                 to = f.at(f.load(call, self.call_fields.index("dend"), base=POINTER), row)
-                self.copy_lane(f, to, 0, "P3 q", lane, "tangent")
-                self.copy_lane(f, to, self.n, "P3 v", lane, "tangent")
-            self._write_change(f, s, k, p, f.const(0, INT), "X q", "X v")
-            self._write_change(f, s, k, p, times - 1, "P3 q", "P3 v")
+                self.copy_lane(f, to, 0, "point3 q", lane, "tangent")
+                self.copy_lane(f, to, self.n, "point3 v", lane, "tangent")
+            self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
+            self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         """Memory for all directions."""

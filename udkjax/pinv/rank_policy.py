@@ -29,10 +29,10 @@ class RankPolicy(Enum):
 
     @property
     def drops(self) -> bool:
-        """Whether dependent rows are left out."""
+        """True if dependent rows are left out."""
         return self is not RankPolicy.REFUSE
 
     @property
     def reports(self) -> bool:
-        """Whether a result says that it is not safe."""
+        """True if a result says that it is not safe."""
         return self is not RankPolicy.DROP

@@ -173,7 +173,7 @@ class Dense(Pseudoinverse):
 
 
 def exceeds(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
-    """Whether a size counts. NaN counts, so that an invalid matrix gives NaN and not a rank of zero and a plausible answer."""
+    """Return whether a size counts. NaN counts: an invalid matrix gives NaN, not a rank of zero and a plausible answer."""
     return ~(size <= threshold)
 
 

@@ -72,7 +72,7 @@ def value_at(x: Float[Array, "..."] | Held, t: Number) -> Any:
 
 
 class SplinePiece(Motion):
-    """What stands for a spline between two of its knots: c0 + c1 s + c2 s^2 + c3 s^3, with s = t - start.
+    """A spline between two of its knots: c0 + c1 s + c2 s^2 + c3 s^3, with s = t - start.
 
     Args:
         row: start (s), c0, c1, c2 and c3.

@@ -201,7 +201,7 @@ class Mechanism(PrintsTable):
 
     @property
     def samples(self) -> dict[tuple[str, int, str], Any]:
-        """What has samples, a `Held` or a `Spline`, by the place of its element and its field."""
+        """The numbers that have samples, each a `Held` or a `Spline`, by the place of its element and its field."""
         sections = {"_drivers": self._drivers, "_forces": self._forces}
         places = [(section, *place) for section, elements in sections.items() for place in sampled_fields(elements)]
         return {place: getattr(sections[place[0]][place[1]], place[2]) for place in places}

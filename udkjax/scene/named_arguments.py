@@ -125,12 +125,12 @@ _require_mapping = _of_kind(
 
 
 def _is_coordinate(x: Any) -> bool:
-    """Whether something is the name of a driver or a coordinate, or a `Coordinate`."""
+    """Return whether something is the name of a driver or a coordinate, or a `Coordinate`."""
     return bool(x) if isinstance(x, str) else hasattr(x, "bodies")
 
 
 def _is_parameter(x: Any) -> bool:
-    """Whether something is the name of a parameter, a `Parameter`, or names that are tied."""
+    """Return whether something is the name of a parameter, a `Parameter`, or names that are tied."""
     return isinstance(x, str | list | tuple) or callable(x) or dataclasses.is_dataclass(x)
 
 

@@ -139,7 +139,7 @@ def _matrices(
 
 
 class _Operator(eqx.Module):
-    """What the numbers change, as a linear map with its transpose."""
+    """The effect of the numbers, as a linear map with its transpose."""
 
     matrix: Float[Array, "K 3 n P"]
     residue: Float[Array, "K P n"]

@@ -1,4 +1,4 @@
-"""What single force elements exert at a state: which of them is not a number, grows without bound, jumps, or is stiff."""
+"""Loads of single force elements at a state: one that is not a number, grows without bound, jumps, or is stiff."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

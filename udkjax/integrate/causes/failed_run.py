@@ -15,7 +15,7 @@ from udkjax.scene.mechanism import Mechanism
 
 @dataclass(frozen=True, eq=False)
 class FailedRun:
-    """What is known of a single run of a mechanism of known numbers that failed."""
+    """A single run, of a mechanism of known numbers, that failed."""
 
     mechanism: Mechanism
     analysis: Analysis
@@ -41,7 +41,7 @@ class FailedRun:
 
     @property
     def row_scales(self) -> np.ndarray:
-        """What Psi is measured by, row by row."""
+        """The scale of each row of Psi."""
         return np.asarray(self.rows.scales.rows, float)
 
     @cached_property

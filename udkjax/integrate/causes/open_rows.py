@@ -1,4 +1,4 @@
-"""Which constraints are open in a state, and what keeps a mechanism from being closed."""
+"""Constraints that are open in a state, and the cause that keeps a mechanism from being closed."""
 
 from collections.abc import Sequence
 

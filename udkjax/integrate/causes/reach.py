@@ -1,4 +1,4 @@
-"""How far drivers can lead a mechanism: where its constraints cannot be closed any more, and why.
+"""The reach of drivers: the value from which on constraints cannot be closed any more, and the cause.
 
 The position is followed in small steps of time from the last good state until a step cannot be closed, and the time between is
 halved. Rows that then ask for what no displacement gives are in the left null space of D: of a dead point they are new there; of
@@ -108,7 +108,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
 
 
 def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
-    """Whether the rows of drivers depend on the others in an ordinary position, too."""
+    """Return whether the rows of drivers depend on the others in an ordinary position, too."""
     q = ordinary_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
     if q is None:
         return False

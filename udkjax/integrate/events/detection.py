@@ -48,7 +48,7 @@ class Nodes(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """What the conditions do in a window."""
+    """The first crossing of conditions in a window."""
 
     sides: Int[Array, "G C"]  # of zero, at the nodes
     place: Int[Array, ""]  # the interval of the first crossing

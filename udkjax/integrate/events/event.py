@@ -40,7 +40,7 @@ from udkjax.scene.requirements import describe
 
 
 class Event(PrintsLine):
-    """Where `condition(t, frames)`, a scalar, crosses zero, `action` happens.
+    """An `action` that happens when `condition(t, frames)`, a scalar, crosses zero.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
     `direction` is 1 for rising, -1 for falling, 0 for either; of an `Impact`, before whose zero the condition is positive, 0 or

@@ -36,7 +36,7 @@ Condition = Callable[[Float[Array, ""], Float[Array, "n"], Float[Array, "n"]], F
 
 
 class RunState(NamedTuple):
-    """Where a run is: time, coordinates, velocities, phase."""
+    """The state of a run: time, coordinates, velocities, phase."""
 
     t: Float[Array, ""]
     q: Float[Array, "n"]
@@ -93,7 +93,7 @@ class Hybrid(eqx.Module):
 
     @property
     def has_usable_numbers(self) -> Bool[Array, ""]:
-        """Whether the scene's numbers are what they must be, restitutions from 0 to 1, limits in order, contacts finite.
+        """True if the scene's numbers are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
 
         Those that are known were checked before; those that were traced then are looked at here.
         """
@@ -116,7 +116,7 @@ class Hybrid(eqx.Module):
 
     @property
     def impacts(self) -> Bool[np.ndarray, "E"]:
-        """Which events are impacts."""
+        """True for each event that is an impact."""
         return self.mask(Impact)
 
     def rests(self, at_rest: str) -> Bool[np.ndarray, "E"]:
@@ -125,7 +125,7 @@ class Hybrid(eqx.Module):
 
     @property
     def by_velocity(self) -> Bool[np.ndarray, "E"]:
-        """Which conditions depend on velocities."""
+        """True for each condition that depends on velocities."""
         return np.array([sees_velocity(e, self.phases.mechanisms[0]) for e in self.events])
 
     @property

@@ -69,7 +69,7 @@ class ContactRows(NamedTuple):
 
 
 class Impulses(NamedTuple):
-    """What an impact does."""
+    """The results of an impact."""
 
     impulse: Float[Array, "E"]  # in the unit of M v over that of the condition's derivative by q: N s of a gap
     rate: Float[Array, "E"]  # g_dot+

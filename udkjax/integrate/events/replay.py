@@ -58,7 +58,7 @@ def run_events(hybrid: Hybrid, given: RunInput, max_events: int) -> EventRun:
 
 
 class FixedPart(eqx.Module):
-    """What a run depends on besides its numbers."""
+    """The choices that a run depends on besides its numbers."""
 
     rest: PyTree
     tree: TreeDef = eqx.field(static=True)
@@ -125,7 +125,7 @@ def _(primals, tangents):
 
 
 class PieceStart(NamedTuple):
-    """Where a piece of a run begins."""
+    """The state in which a piece of a run begins."""
 
     state: RunState
     written: Int[Array, ""]  # outputs so far

@@ -54,7 +54,7 @@ class Window(NamedTuple):
 
 
 class WindowResult(NamedTuple):
-    """What a run of the integrator over a window has found."""
+    """The result of the integrator over a window."""
 
     reached: RunState  # as far as nothing happens
     sides: Int[Array, "2E"]  # of zero, there

@@ -37,7 +37,7 @@ def solver_named(name: str) -> "diffrax.AbstractSolver":
 
 
 def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
-    """Whether a solver is an explicit Runge-Kutta method with one tableau; None is the default, which is."""
+    """Return whether a solver is an explicit Runge-Kutta method with one tableau; None is the default, which is."""
     if solver is None:
         return True
     import diffrax

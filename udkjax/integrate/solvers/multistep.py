@@ -1,4 +1,4 @@
-"""What the multistep methods of variable order share: how they steer the step, and how they count.
+"""Control of step and order, and counting, which the multistep methods of variable order share.
 
 A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an
 error estimate of one fixed order. So the methods here say what they want in the language of that controller: `steer_error` gives
