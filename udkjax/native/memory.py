@@ -29,7 +29,7 @@ class Memory:
     outputs: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()  # inputs and outputs of which it must know how many numbers they have of each member
     directions_in = 0  # which dimension of the last input says how many directions there are
-    module = ""  # the text, once it is written
+    written_text = ""  # the whole module, once it is written
 
     @property
     def call_fields(self) -> tuple[str, ...]:

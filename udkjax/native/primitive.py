@@ -36,7 +36,7 @@ def generate(operation: Operation, width: int, several: bool) -> Module:
     module = operation.module(width, several)
     handlers = handler(module, "call_frame")
     declared = sorted(set().union(*(f.declared for f in handlers)))
-    module.module = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])
+    module.written_text = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])
     return module
 
 
@@ -54,7 +54,7 @@ class Compiled:
 
     def __init__(self, operation: Operation, width: int, several: bool):
         self._module, self._in_passes = generate(operation, width, several), operation.is_reverse
-        self.name, self._run = load(self._module.module)
+        self.name, self._run = load(self._module.written_text)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Outputs of these shapes, on as many threads as there are cores."""
