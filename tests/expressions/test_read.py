@@ -33,6 +33,8 @@ FUNCTIONS = {
     "shapes": lambda x, y: jnp.concatenate([x[None], y.reshape(1, 3)], 0).T[::-1, 1:].ravel() * jnp.repeat(x[1:2], 3),
     "broadcasting": lambda x, y: x[:, None] * y[None, :] + jnp.ones((3, 1)),
     "constant indices": lambda x, y: x[jnp.array([2, 0, 0])] * y[np.array([1, 1, 2])],
+    "known places": lambda x, y: x.at[1].set(y[0]).at[jnp.array([2, 0])].set(y[1:]),
+    "a known slice": lambda x, y: lax.dynamic_update_slice(jnp.outer(x, x), y[None, 1:], (1, 0)),
     "dot": lambda x, y: jnp.dot(x, y),
     "matmul": lambda x, y: jnp.outer(x, y) @ jnp.outer(y, x),
     "einsum": lambda x, y: jnp.einsum("ij,ik->ijk", jnp.outer(x[:2], x[:2]), y[:2, None]),

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
-from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, SceneLayout, abstract_mechanism
+from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import SceneTerms, compliance
@@ -26,7 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 WRITTEN_OUT_OPERATIONS = 2800
 
 # The arrays that programs return; all others are scratch.
-RESULTS = ("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root")
+RESULTS = ("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy")
 
 
 class ScenePrograms:
@@ -186,6 +186,15 @@ class ScenePrograms:
         """The entries of Psi_q: their rows, columns, places in the array `psi_q`, and factors."""
         return self._layout.psi_q_entries
 
+    @property
+    def eliminated_rows(self) -> dict[int, int]:
+        """The places of the rows of Psi in the linear systems, of those that are not left out."""
+        found = {}
+        for group in self._layout.eliminated:
+            for start, right in zip(group.table[:, ROW].tolist(), group.table[:, RIGHT].tolist(), strict=True):
+                found |= {start + row: right + k for k, row in enumerate(group.rows)}
+        return found
+
     @cached_property
     def rows_and_loads(self) -> LoopProgram:
         """Inputs of rank-revealing methods, of all rows: psi_q, psi, psi_dot, terms; and root, M^(-1/2)."""
@@ -211,6 +220,11 @@ class ScenePrograms:
     def pieces(self) -> LoopProgram:
         """pieces: the number of the smooth piece of each element that has several."""
         return program([self._terms.sincos()], self._terms.pieces())
+
+    @cached_property
+    def energy(self) -> LoopProgram:
+        """energy: kinetic and potential energy (J); that of gravity is zero at the origin."""
+        return program([self._terms.sincos()], self._terms.energy())
 
     @cached_property
     def rank(self) -> LoopProgram:

@@ -162,6 +162,27 @@ class SceneTerms:
 
             yield self.over_group((name, start), group, write, to=array, **names)
 
+    def energy(self) -> Parts:
+        """v^T M v / 2, and the potential energy of gravity and of the force elements."""
+        yield Reset("energy", 0, 2)
+
+        def write(w: KernelWriter):
+            kinetic = potential = w.graph.constant(0.0)
+            for k in range(3):
+                v, mass = w.read("v", BODY_COORDINATES, k), 1.0 / compliance(w, k)
+                kinetic = kinetic + mass * (v * v) * 0.5
+                potential = potential - mass * self._gravity(w, k) * w.read("q", BODY_COORDINATES, k)
+            for place, x in enumerate((kinetic, potential)):
+                w.write(x, "energy", None, place, ADD)
+
+        yield self.over_bodies("energy", write)
+        for group in self.layout.forces:
+
+            def write_potential(w: KernelWriter, group: ElementGroup = group):
+                w.write(group.programs.outputs["potential"][0], "energy", None, 1, ADD)
+
+            yield self.over_group("potential", group, write_potential)
+
     def pieces(self) -> Parts:
         """The number of the smooth piece of each element that has several."""
         for group, places in self.layout.pieces:

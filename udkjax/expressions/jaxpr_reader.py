@@ -34,6 +34,11 @@ _INLINED = (
     "checkpoint",
 )
 UNROLLED_OPERATIONS = 20_000  # operations of a loop of known length, of all rounds together: beyond it takes too long to compile
+# Primitives that put elements into an array: which of their inputs these are, and which are the indices.
+_REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.ndarray]]]] = {
+    "scatter": lambda inputs: (inputs[2], [inputs[1]]),
+    "dynamic_update_slice": lambda inputs: (inputs[1], inputs[2:]),
+}
 _ELEMENTWISE = frozenset(
     """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
     erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not one_minus_square or
@@ -120,6 +125,8 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [_dot(graph, inputs[0], inputs[1], parameters["dimension_numbers"], shape)]
     if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
         return [np.asarray(_select(equation, inputs), object)]
+    if name in _REPLACING and all(s.constant is not None for i in _REPLACING[name](inputs)[1] for s in i.flat):
+        return [np.asarray(_replace(equation, inputs), object)]
     if name == "unstack":
         return [np.asarray(x, object) for x in np.moveaxis(inputs[0], parameters["axis"], 0)]
     if name == "split":
@@ -185,6 +192,17 @@ def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarra
 def _values(array: np.ndarray) -> np.ndarray:
     dtype = array.flat[0].node.dtype if array.size else float
     return np.array([s.constant for s in array.flat], dtype).reshape(array.shape)
+
+
+def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
+    """Put elements of one array into another at known indices: JAX does so with their places, as numbers of the same type."""
+    updates, indices = _REPLACING[equation.primitive.name](inputs)
+    elements = np.concatenate([inputs[0].ravel(), updates.ravel()])
+    places = np.arange(elements.size, dtype=equation.outvars[0].aval.dtype)
+    numbered = iter(np.split(places, [inputs[0].size]))
+    values = [_values(i) if any(i is x for x in indices) else next(numbered).reshape(i.shape) for i in inputs]
+    taken = _fold(equation.primitive, equation.params, values)
+    return elements[np.asarray(taken, int)]
 
 
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:

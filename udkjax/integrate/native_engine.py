@@ -51,10 +51,16 @@ def reason_for_diffrax(problem: Problem, adjoint: Any = None, meter: Any = None)
     return f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
 
 
+def packed(problem: Problem) -> tuple[Run, list[np.ndarray]]:
+    """Return the operation of a problem whose numbers are all known, and its inputs."""
+    operation = _run(problem)
+    return operation, _inputs(problem, operation, np)
+
+
 def integrate_known(problem: Problem) -> IntegratorOutput:
     """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
-    operation = _run(problem)
-    return _output(call_known(operation, _inputs(problem, operation, np), len(problem.ts)))
+    operation, inputs = packed(problem)
+    return _output(call_known(operation, inputs, len(problem.ts)))
 
 
 def integrate(problem: Problem) -> IntegratorOutput:

@@ -16,4 +16,5 @@ How the code of a run is made, and where to look:
 6. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules
    and shapes there are; `primitive` makes them a primitive of JAX with its batching rule. `udkjax.integrate` calls that and knows
    the rules of differentiation.
+7. `wasm` compiles the same text for pages, where `evaluation` finds accelerations and energies at single states.
 """

@@ -221,7 +221,7 @@ class Function:
         return self.op(f"select {mask.type} {mask.name}, {a.type} {a.name}, {b.type} {b.name}", base, width)
 
     def intrinsic(self, name: str, *arguments: Operand) -> Value:
-        """An intrinsic function of LLVM on numbers, lane by lane: fma, sqrt, fabs, maximum, minimum, floor, exp, log, pow, ..."""
+        """An intrinsic function of LLVM on numbers, lane by lane: fmuladd, sqrt, fabs, maximum, floor, exp, log, pow, ..."""
         width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
         values = [self.like(x, DOUBLE, width) for x in arguments]
         kind = llvm_type(DOUBLE, width)
@@ -230,7 +230,8 @@ class Function:
         return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
 
     def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
-        return self.intrinsic("fma", a, b, c)
+        """a b + c, rounded once where the processor has an instruction for it; a call of a library nowhere."""
+        return self.intrinsic("fmuladd", a, b, c)
 
     def abs(self, a: Value) -> Value:
         return self.intrinsic("fabs", a)
@@ -248,8 +249,20 @@ class Function:
     def is_finite(self, a: Value) -> Value:
         return self.abs(a) < float("inf")
 
+    def largest_of(self, x: Value) -> Value:
+        """The largest of all lanes, none of which may be not a number."""
+        while x.width > 1:
+            half, lanes = x.width // 2, range(x.width)
+            take = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
+            parts = [", ".join(f"i32 {k}" for k in some) for some in (lanes[:half], lanes[half:])]
+            halves = [f"{take} <{part}>" for part in parts]
+            if half == 1:
+                halves = [f"extractelement {x.type} {x.name}, i64 {k}" for k in lanes]
+            x = self.max(*(self.op(text, x.base, half) for text in halves))
+        return x
+
     def reduce(self, name: str, x: Value) -> Value:
-        """All lanes together: `or` and `and` of conditions, `fmax` of numbers."""
+        """All lanes together: `or` and `and` of conditions."""
         if x.width == 1:
             return x
         full = f"llvm.vector.reduce.{name}.v{x.width}{'f64' if x.base == DOUBLE else x.base}"
@@ -278,10 +291,10 @@ class Function:
     # --- memory
 
     def at(self, pointer: Value | str, k: Operand, base: str = DOUBLE) -> Value:
-        """The address of the k-th number from a pointer."""
+        """The address of the k-th number from a pointer. Of pointers as well each takes 8 bytes, whatever size it has."""
         name = pointer.name if isinstance(pointer, Value) else pointer
-        index = self.like(k, INT, 1)
-        return self.op(f"getelementptr {base}, ptr {name}, i64 {index.name}", POINTER)
+        index, stored = self.like(k, INT, 1), INT if base == POINTER else base
+        return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
 
     def load(self, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
         place = self.at(pointer, k, base)

@@ -121,10 +121,14 @@ def split_module(text: str) -> list[str]:
 
 def compile_module(text: str) -> bytes:
     """Object code of a module."""
+    return object_code(text, _target_machine(), _llvm().get_default_triple())
+
+
+def object_code(text: str, machine: Any, triple: str) -> bytes:
+    """Object code of a module by a compiler of its own, as is the context: several threads compile at once."""
     llvm = _llvm()
-    machine = _target_machine()  # of its own, as is the context: several threads compile at once
     with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
-        module.triple = llvm.get_default_triple()
+        module.triple = triple
         module.data_layout = str(machine.target_data)
         passes = llvm.create_new_module_pass_manager()
         for name in PASSES:

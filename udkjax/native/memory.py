@@ -69,7 +69,7 @@ class Memory:
             for x in values(r):
                 worst.value = f.max(x, worst.value)
         found = worst.value
-        return found if self.plan.width > 1 else f.reduce("fmax", found)
+        return found if self.plan.width > 1 else f.largest_of(found)
 
     def total(self, f: Function, x: Value) -> Value:
         name = f"llvm.vector.reduce.fadd.v{x.width}f64"

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native import machine
 from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
@@ -58,8 +57,14 @@ class Operation(ABC):
         return 0
 
     @abstractmethod
-    def module(self, width: int, several: bool) -> Module:
-        """Return the module in so many lanes; `several` directions of a single member may be side by side."""
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        """Return the module in so many lanes.
+
+        Args:
+            width: The number of lanes.
+            several: Whether several directions of a single member may be side by side.
+            vector: How many float64 numbers a register holds.
+        """
 
     @abstractmethod
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -84,7 +89,7 @@ class Run(Operation):
     breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
     sampled: tuple[int, ...] = ()  # places of the numbers that have samples
 
-    def plan(self, width: int) -> Plan:
+    def plan(self, width: int, vector: int) -> Plan:
         """Return what the module's code depends on."""
         return Plan(
             code=self.code,
@@ -92,13 +97,13 @@ class Run(Operation):
             projected=self.projected,
             breaks=self.breaks,
             width=width,
-            vector=machine.lanes(),
+            vector=vector,
             written_out=self.code.is_small,
             sampled=self.sampled,
         )
 
-    def module(self, width: int, several: bool) -> Module:
-        return Trajectory(self.plan(width))
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return Trajectory(self.plan(width, vector))
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         n = self.coordinates
@@ -115,8 +120,8 @@ class RunTangents(Run):
     def tangents(self) -> int:
         return 4 if self.sampled else 3
 
-    def module(self, width: int, several: bool) -> Module:
-        return Forward(self.plan(width), self.active, machine.lanes() if several else width)
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return Forward(self.plan(width, vector), self.active, vector if several else width)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         directions, n = inputs[-1].shape[1], self.coordinates
@@ -132,8 +137,8 @@ class RunCotangents(Run):
     points: int = STORED  # that the record of a run has room for
     is_reverse: ClassVar[bool] = True
 
-    def module(self, width: int, several: bool) -> Module:
-        return Reverse(self.plan(width), self.active)
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return Reverse(self.plan(width, vector), self.active)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         n, is_first = self.coordinates, not inputs[-1].shape[0]  # without cotangents
@@ -152,8 +157,8 @@ class Close(Operation):
     in_lanes: ClassVar[bool] = False
     results: ClassVar[int] = len(Closing.results)
 
-    def module(self, width: int, several: bool) -> Module:
-        return Closing(self.code, machine.lanes())
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return Closing(self.code, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         return [(members, 2 * self.coordinates), (members, 2 * self.code.row_count), (members, 1)]
@@ -169,8 +174,8 @@ class CloseTangents(Close):
     def tangents(self) -> int:
         return 3
 
-    def module(self, width: int, several: bool) -> Module:
-        return ClosingForward(self.code, machine.lanes(), self.active)
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return ClosingForward(self.code, vector, self.active)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         return [*super().outputs(inputs, members, times), (members, inputs[-1].shape[1], 2 * self.coordinates)]
@@ -182,8 +187,8 @@ class CloseCotangents(Close):
 
     active: tuple[bool, ...] = ()
 
-    def module(self, width: int, several: bool) -> Module:
-        return ClosingReverse(self.code, machine.lanes(), self.active)
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return ClosingReverse(self.code, vector, self.active)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         n = self.coordinates
@@ -196,8 +201,8 @@ class March(Operation):
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 
-    def module(self, width: int, several: bool) -> Module:
-        return Marching(self.code, width, machine.lanes())
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return Marching(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         return [*[(members, times, self.coordinates)] * 3, (members, 1)]

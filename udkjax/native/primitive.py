@@ -33,7 +33,7 @@ def generate(operation: Operation, width: int, several: bool) -> Module:
 
     `several`: whether there may be more than one direction of a single member, which then are side by side.
     """
-    module = operation.module(width, several)
+    module = operation.module(width, several, machine.lanes())
     handlers = handler(module, "call_frame")
     declared = sorted(set().union(*(f.declared for f in handlers)))
     module.written_text = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])

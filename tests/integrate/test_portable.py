@@ -1,0 +1,124 @@
+"""The portable engine: its numbers are those of the scene with other parameters, and what it computes is what Python does."""
+
+import base64
+import zlib
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import udkjax as udk
+from udkjax.integrate.portable import portable_engine, scalar_parameters
+from udkjax.scene.checks import SceneError
+
+
+SLOW = ("parallelogram", "scissor_lift", "door_closer")
+
+
+def test_parameters_are_named_one_number_at_a_time():
+    mechanism = udk.library.slider_crank()
+    every = scalar_parameters(mechanism)
+    assert every["pin.P[0]"] == pytest.approx(0.5)
+    assert scalar_parameters(mechanism, ["pin.P", "gravity[1]"]) == {k: every[k] for k in ("pin.P[0]", "pin.P[1]", "gravity[1]")}
+
+
+@pytest.mark.parametrize("name", ["pin.Q", "pin.P[2]", "pin.P[0][0]", "body.crank.mas"])
+def test_an_unknown_parameter_is_named(name):
+    with pytest.raises(SceneError, match=name.partition("[")[0]):
+        portable_engine(udk.library.slider_crank(), [name])
+
+
+@pytest.mark.parametrize(
+    "scene", ["slider_crank", *(pytest.param(n, marks=pytest.mark.slow) for n in ("planetary_gear", "scissor_lift"))]
+)
+def test_numbers_follow_from_parameters(scene):
+    mechanism = getattr(udk.library, scene)()
+    engine = portable_engine(mechanism, list(scalar_parameters(mechanism)), pull=False)
+    values = np.array([p["value"] for p in engine.data["parameters"]])
+    names = [p["name"] for p in engine.data["parameters"]]
+    same = np.concatenate([np.ravel(x) for x in mechanism.numbers])
+    assert_allclose(engine.numbers(values.tolist())[: engine.numbers.count], same)
+    for k in (0, len(values) // 3, len(values) // 2, len(values) - 1):
+        other = values.copy()
+        other[k] += 0.01 * max(abs(other[k]), 0.1)
+        expected = mechanism.with_parameters({names[k]: other[k]})
+        assert_allclose(
+            engine.numbers(other.tolist())[: engine.numbers.count],
+            np.concatenate([np.ravel(x) for x in expected.numbers]),
+            rtol=1e-13,
+            atol=1e-13,
+            err_msg=names[k],
+        )
+
+
+@pytest.fixture(scope="module")
+def evaluated():
+    """Evaluate a mechanism by the module of evaluations, at a state: a function of both that returns arrays by name."""
+    from tests.wasm_host import Host
+
+    def evaluate(mechanism, t, q, v):
+        engine = portable_engine(mechanism, ["gravity"])
+        module = engine.data["modules"]["evaluate"]
+        host = Host(zlib.decompress(base64.b64decode(module["code"])), module["data_end"])
+        host.begin()
+        to = host.put(np.append(engine.numbers.base[: engine.numbers.count], engine.data["thresholds"]))
+        host.call("numbers", host.put([p["value"] for p in engine.data["parameters"]]), to)
+        work = host.put(np.zeros(module["size"]))
+        host.call("prologue", to, work)
+        for name, x in (("t", [t]), ("q", q), ("v", v)):
+            host.memory.write(host.store, np.asarray(x, float).tobytes(), work + 8 * module["places"][name])
+        host.call("accelerations", work, work)
+        host.call("energy", work, work)
+        sizes = {"a": np.size(q), "energy": 2, "x0": len(engine.data["rows"])}
+        found = {name: host.numbers(work + 8 * module["places"][name], size) for name, size in sizes.items()}
+        return found | {"places": [effort["place"] for effort in engine.data["efforts"]]}
+
+    return evaluate
+
+
+@pytest.mark.parametrize("scene", ["slider_crank", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
+def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated, scene):
+    if scene == "door_closer":  # springs with dampers, a friction and a torque
+        mechanism = udk.Mechanism(
+            {"door": udk.Body(mass=20.0, inertia=4.0, position=(0.4, 0.0), angular_velocity=0.3)},
+            {"hinge": udk.Revolute(bodies=("ground", "door"), points=((0.0, 0.0), (-0.4, 0.0)))},
+            {},
+            [
+                udk.Spring(bodies=("ground", "door"), points=((0.2, -0.3), (0.1, 0.0)), stiffness=300.0, length=0.2, damping=9.0),
+                udk.TorsionSpring(bodies=("ground", "door"), stiffness=5.0, angle=0.3, damping=1.0),
+                udk.Friction(joint="hinge", torque=0.5, velocity=0.1),
+                udk.Torque(bodies=("ground", "door"), value=2.0),
+            ],
+        )
+    else:
+        mechanism = getattr(udk.library, scene)()
+    run = udk.simulate(mechanism, [0.0, 0.3])
+    t, q, v = 0.3, np.asarray(run.q[1]), np.asarray(run.v[1])
+    found = evaluated(mechanism, t, q, v)
+    assert_allclose(found["a"], np.asarray(udk.accelerations(mechanism, t, q, v)).ravel(), rtol=1e-9, atol=1e-9)
+    energy = udk.energy(mechanism, run)
+    assert_allclose(found["energy"], [energy.kinetic[1], energy.potential[1]], rtol=1e-12)
+    for place, effort in zip(found["places"], udk.efforts(mechanism, run).values(), strict=True):
+        assert found["x0"][place] == pytest.approx(float(effort[1]), rel=1e-9)
+
+
+def test_a_mechanism_that_cannot_be_moved_has_no_run_and_says_why():
+    bars = {"bar": udk.Body(mass=1.0, inertia=1.0, position=(0.5, 0.0))}
+    points = ((0.0, 0.0), (-0.5, 0.0)), ((3.0, 0.0), (0.5, 0.0))
+    joints = {name: udk.Revolute(bodies=("ground", "bar"), points=p) for name, p in zip("AB", points, strict=True)}
+    data = portable_engine(udk.Mechanism(bars, joints)).data
+    assert "run" not in data["modules"] and "cannot be closed" in data["why"]
+
+
+def test_a_pull_is_a_spring_to_a_place_and_a_damper():
+    from udkjax.integrate.portable.pull import PREFIX, with_pulls
+
+    mechanism = udk.Mechanism({"ball": udk.Body(mass=2.0, inertia=1.0)}, gravity=(0.0, 0.0))
+    held = with_pulls(mechanism).with_parameters(
+        {f"force.{PREFIX}ball.{k}": x for k, x in {"stiffness": 8.0, "damping": 1.0, "target": [1.0, 0.0]}.items()}
+    )
+    ts = np.linspace(0.0, 3.0, 7)
+    rate, decay = np.sqrt(8.0 / 2.0 - (1.0 / 4.0) ** 2), 1.0 / 4.0  # of x'' + x'/2 + 4 (x - 1) = 0
+    expected = 1.0 - np.exp(-decay * ts) * (np.cos(rate * ts) + decay / rate * np.sin(rate * ts))
+    assert_allclose(udk.simulate(held, ts, rtol=1e-10, atol=1e-10).q[:, 0, 0], expected, atol=1e-8)
+    assert_array_equal(udk.simulate(with_pulls(mechanism), ts).q, udk.simulate(mechanism, ts).q)

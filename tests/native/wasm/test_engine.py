@@ -1,0 +1,98 @@
+"""The engine's modules as WebAssembly do what they do as code of this processor without fused multiply-add, to the bit."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import udkjax as udk
+from tests.wasm_host import Host, run_without_contraction
+from udkjax.equations import analyse
+from udkjax.equations.scales import rank_tolerance
+from udkjax.integrate import march, native_closing, native_engine
+from udkjax.native import operations, primitive
+from udkjax.native.wasm import wasm_module
+
+SCENES = sorted(udk.library.__all__)
+FAST = ("parallelogram", "slider_crank", "planetary_gear")
+every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
+TIMES = np.linspace(0.0, 2.0, 41)
+
+
+def both(operation, inputs, times):
+    """What an operation returns as WebAssembly, and by this processor without fused multiply-add."""
+    made, inputs = wasm_module(operation), [np.ascontiguousarray(x, float) for x in inputs]
+    shapes = operation.shapes(inputs, times)
+    host = Host(made.linked.code, made.linked.data_end)
+    return host.run(made.module, inputs, shapes), run_without_contraction(made.module, inputs, shapes)
+
+
+def known_call(monkeypatch, module, do):
+    """The operation and the inputs with which `do()` calls machine code, by way of a module of the package."""
+    seen = []
+
+    def call(operation, inputs, times):
+        seen.append((operation, inputs, times))
+        return primitive.call_known(operation, inputs, times)
+
+    monkeypatch.setattr(module, "call_known", call)
+    do()
+    return seen[0]
+
+
+@every_scene
+def test_a_run(monkeypatch, name):
+    mechanism = getattr(udk.library, name)()
+    found = []
+    operation, inputs, times = known_call(
+        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, TIMES, engine="native"))
+    )
+    wasm, native = both(operation, inputs, times)
+    for x, y in zip(wasm, native, strict=True):
+        assert_array_equal(x, y)
+    # And the motion itself is that of the engine on this processor, within what the tolerance leaves open.
+    length = float(analyse(mechanism).length)
+    assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(TIMES), -1)[1:-1], rtol=0, atol=1e-6 * max(length, 1.0))
+
+
+@every_scene
+def test_closing(name):
+    mechanism = getattr(udk.library, name)()
+    analysis, tol = analyse(mechanism), float(rank_tolerance(mechanism))
+    rng = np.random.default_rng(0)
+    q = np.asarray(mechanism.q0).ravel() + 0.02 * float(analysis.length) * rng.standard_normal(3 * len(mechanism.bodies))
+    inputs = native_closing._inputs(mechanism.at(0.0), analysis.scales, tol, 0.0, q, np.asarray(mechanism.v0).ravel(), np)
+    (state, residuals, rank), native = both(native_closing._close(mechanism), inputs, 2)
+    for x, y in zip((state, residuals, rank), native, strict=True):
+        assert_array_equal(x, y)
+    assert rank[0, 0] == analysis.rank
+    assert np.all(np.abs(residuals[0, : residuals.shape[1] // 2]) <= 1e-9 * np.asarray(analysis.scales.rows))
+
+
+def test_marching(monkeypatch):
+    mechanism = udk.library.slider_crank()
+    operation, inputs, times = known_call(
+        monkeypatch, march, lambda: udk.kinematics(mechanism, "motor", np.linspace(0.0, 1.0, 21))
+    )
+    assert isinstance(operation, operations.March)
+    wasm, native = both(operation, inputs, times)
+    for x, y in zip(wasm, native, strict=True):
+        assert_array_equal(x, y)
+    assert np.all(np.isfinite(wasm[0]))
+
+
+def test_forward_tangents(monkeypatch):
+    mechanism = udk.library.parallelogram()
+    run, inputs, times = known_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))
+    n, count = run.coordinates, run.code.number_count
+    settings = run.method, run.projected, run.breaks, run.sampled
+    operation = operations.RunTangents(run.code.for_derivatives, *settings, active=(True,) * count)
+    along = np.zeros((1, 1, count))
+    along[0, 0, 1] = 1.0  # of gravity, along y
+    wasm, native = both(operation, [*inputs, along, np.zeros((1, 1, n)), np.zeros((1, 1, n))], times)
+    for x, y in zip(wasm, native, strict=True):
+        assert_array_equal(x, y)
+    # The derivative of the motion by gravity against a difference of runs.
+    h = 1e-4
+    values = [mechanism.with_parameters({"gravity[1]": -9.81 + s * h}) for s in (1, -1)]
+    one, two = (np.asarray(udk.simulate(m, TIMES, rtol=1e-11, atol=1e-11).q).reshape(times, -1) for m in values)
+    assert_allclose(wasm[4][0, 0, 1:-1, :n], ((one - two) / (2 * h))[1:-1], rtol=0, atol=1e-6)

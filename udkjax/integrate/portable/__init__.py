@@ -1,0 +1,33 @@
+"""The engine of one mechanism as data that a page runs by itself: WebAssembly, and what its numbers mean.
+
+`portable_engine` makes it. What is in it, and what a page does with it:
+
+format       1
+bodies       names; a state is q and v, x, y (m), angle (rad) of each body in turn, and their rates
+parameters   a list of {name, unit, value}: numbers of the scene that may change, in the order in which they are given
+numbers      base64 of float64: all numbers of the scene, `count` of them, and then the times (s) where its motion is not smooth
+thresholds   of pivots, which a run takes behind the numbers; of closing, those in `closing`
+closing      {thresholds, settings, tol and rounding: what counts as closed (equations/position_closure.py)}
+guess        {q, v}: places in `numbers` of the initial guess
+rows         scales of the rows of Psi (m, rad)
+scales       {length (m), rate (1/s), mass (kg)}
+rank         of Psi_q outside of singular configurations; null: not known, and there is no "run"
+settings     of a run, by name, in their order; `smallest` and `omega` follow from the times and the state
+smallest     step, in units of rounding of the end time
+drift_tol    violation of Psi, in units of the rows' scales, beyond which a run has failed
+info         names of the first numbers of a run's result "info"; behind them are its last q and v
+sampled      places in `numbers` of what has samples; `samples`: base64 of float64, a row for each interval between breaks
+masses       of each body the places in `numbers` of its mass and inertia
+efforts      a list of {driver, unit, place: of its row in x0, or null where it is redundant}
+pulls        of each body the places in `numbers` of a spring that holds it: point x, y, target x, y, stiffness, damping; or []
+why          why there is no "run"; empty where there is
+modules      run, close, evaluate: {code: base64 of deflated WebAssembly, data_end, fields or places and size, inputs, results}
+
+udkjax/show/player/engine.js runs it: `loadEngine(data)` gives an object with `close(parameters, guess)` and
+`run(parameters, state, times)`, which say there what they return.
+"""
+
+from udkjax.integrate.portable.engine import PortableEngine, portable_engine
+from udkjax.integrate.portable.parameters import scalar_parameters
+
+__all__ = ["PortableEngine", "portable_engine", "scalar_parameters"]

@@ -1,0 +1,194 @@
+"""The data of a portable engine: see the package."""
+
+import base64
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
+from udkjax.equations.quantities import equations_of
+from udkjax.equations.scales import rank_tolerance
+from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.integrate.native_engine import packed, reason_for_diffrax
+from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
+from udkjax.integrate.portable.pull import PREFIX, with_pulls
+from udkjax.integrate.problem import Problem
+from udkjax.integrate.simulate import DRIFT_PROJECTED
+from udkjax.native.evaluation import Evaluation
+from udkjax.native.layout import INFO, INPUTS
+from udkjax.native.operations import Close, Operation
+from udkjax.native.steps import SMALLEST_STEP
+from udkjax.native.wasm import compile_wasm, wasm_module
+from udkjax.native.wasm.object_code import LinkedModule
+from udkjax.scene.arguments import checked
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.units import units_of
+
+Json = dict[str, Any]
+MAX_STEPS = 20_000  # of a run in a page: beyond, it would not answer for seconds
+UNKNOWN_ROWS = "the guess cannot be closed, or not moved: which rows are redundant is not known"
+
+
+class PortableEngine(NamedTuple):
+    """The engine of a mechanism as data that a page runs.
+
+    Attributes:
+        data: as JSON: see the package.
+        numbers: the numbers of the equations as a function of the parameters, as Python evaluates it.
+        mechanism: the mechanism that is simulated.
+    """
+
+    data: Json
+    numbers: NumberProgram
+    mechanism: Mechanism
+
+
+@checked
+def portable_engine(
+    mechanism: Mechanism,
+    parameters: Sequence[str] = (),
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    pull: bool = True,
+) -> PortableEngine:
+    """Compile the engine of a mechanism for pages.
+
+    Args:
+        mechanism: the scene, with known numbers.
+        parameters: names of the numbers that may change, whole (`pin.A`) or one entry (`pin.A[0]`).
+        rtol: relative tolerance of runs.
+        atol: tolerance of runs, relative to the mechanism's scales, as in `simulate`.
+        pull: whether a hand may pull bodies: each gets a spring, without stiffness until it does.
+
+    Returns:
+        The `PortableEngine`.
+
+    Raises:
+        SceneError: a parameter is unknown.
+        UnsupportedError: a scene, or how its numbers follow from a parameter, takes what machine code has no instruction for.
+    """
+    values = scalar_parameters(mechanism, parameters)
+    dress: Callable[[Mechanism], Mechanism] = with_pulls if pull else lambda given: given.without_origin
+    dressed, analysis = dress(mechanism), analyse(mechanism)
+    numbers = NumberProgram(mechanism, values, dress)
+    data: Json = {
+        "format": 1,
+        "bodies": list(mechanism.body_names),
+        "parameters": [{"name": name, "unit": units_of(mechanism, name), "value": x} for name, x in values.items()],
+        "numbers": floats(numbers.base),
+        "count": numbers.count,
+        "rank": analysis.rank,
+        "sampled": [],
+        "samples": "",
+        "thresholds": [0.0, 0.0],
+        "rows": np.asarray(analysis.scales.rows).tolist(),
+        "scales": {name: float(getattr(analysis.scales, name)) for name in ("length", "rate", "mass")},
+    }
+    data |= _places(dressed, pull)
+    problem = _problem(dressed, analysis, rtol, atol)
+    data["why"] = UNKNOWN_ROWS if analysis.redundant_rows is None else reason_for_diffrax(problem)
+    modules = {"close": _close(dressed, data)}
+    if not data["why"]:
+        modules["run"] = _run(problem, data)
+        if data["sampled"] and any(k >= numbers.count for k in numbers.changing):
+            raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
+    modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
+    return PortableEngine(data | {"modules": modules}, numbers, dressed)
+
+
+def floats(x: Any) -> str:
+    """Return numbers as base64 of float64."""
+    return base64.b64encode(np.asarray(x, "<f8").tobytes()).decode()
+
+
+def _module(linked: LinkedModule, **further: Any) -> Json:
+    code = base64.b64encode(zlib.compress(linked.code, 9)).decode()
+    return {"code": code, "bytes": len(linked.code), "data_end": linked.data_end, **further}
+
+
+def _operation(operation: Operation) -> Json:
+    linked, module = wasm_module(operation)
+    names = {"inputs": [*INPUTS, *module.inputs], "results": [*module.results, *module.outputs]}
+    return _module(linked, fields=list(module.call_fields), **names)
+
+
+def _places(mechanism: Mechanism, pull: bool) -> Json:
+    """Return the places in the vector of all numbers of the guess and of the pulls."""
+    leaves, tree = jax.tree.flatten(mechanism.without_origin.without_samples)
+    starts = np.cumsum([0, *(np.size(x) for x in leaves)])
+    numbered = [np.arange(k, k + np.size(x)).reshape(np.shape(x)) for k, x in zip(starts, leaves, strict=False)]
+    places: Mechanism = jax.tree.unflatten(tree, numbered)
+    guess = {"q": [], "v": []}
+    for body in places.bodies.values():
+        guess["q"] += [*np.ravel(body.position).tolist(), int(body.angle)]
+        guess["v"] += [*np.ravel(body.velocity).tolist(), int(body.angular_velocity)]
+    pulls = [places.forces[PREFIX + name] for name in places.body_names] if pull else []
+    held = [[*e.point.tolist(), *e.target.tolist(), int(e.stiffness), int(e.damping)] for e in pulls]
+    masses = [[int(body.mass), int(body.inertia)] for body in places.bodies.values()]
+    return {"guess": guess, "pulls": held, "masses": masses}
+
+
+def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float) -> Problem:
+    """Return a run that stands for all: its times and its state are replaced in the page."""
+    bare = mechanism.without_origin
+    equations = jax.tree.map(np.asarray, equations_of(bare, analysis=analysis))
+    q, v = (np.asarray(x, float).ravel() for x in (bare.q0, bare.v0))
+    given: Any = {"ts": np.array([0.0, 1.0]), "q": q, "v": v, "rtol": np.asarray(rtol), "atol": np.asarray(atol)}
+    units: Any = {"length": np.asarray(analysis.scales.length), "rate": np.asarray(1.0), "smallest": np.asarray(0.0)}
+    return Problem(
+        equations=equations,
+        h=None,
+        solver=None,
+        projected=equations.constrained,
+        max_steps=MAX_STEPS,
+        breakpoints=bare.breakpoints,
+        **given,
+        **units,
+    )
+
+
+def _run(problem: Problem, data: Json) -> Json:
+    """Return the module of runs; what it takes goes into the data."""
+    operation, inputs = packed(problem)
+    given = dict(zip(INPUTS, inputs, strict=False))
+    data |= {
+        "thresholds": given["numbers"][0, -2:].tolist(),
+        "settings": dict(zip(operation.settings, given["settings"][0].tolist(), strict=True)),
+        "smallest": SMALLEST_STEP,
+        "info": list(INFO),
+        "drift_tol": DRIFT_PROJECTED,
+        "sampled": list(operation.sampled),
+        "samples": floats(inputs[len(INPUTS)][0]) if operation.sampled else "",
+    }
+    return _operation(operation)
+
+
+def _close(mechanism: Mechanism, data: Json) -> Json:
+    """Return the module of closing; what it takes goes into the data."""
+    tol = float(rank_tolerance(mechanism))
+    settings = [data["scales"]["length"], tol]
+    data["closing"] = {"thresholds": [tol**2, 0.0], "settings": settings, "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}
+    return _operation(Close(scene_programs(mechanism).with_all_rows))
+
+
+def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json) -> Json:
+    """Return the module of evaluations; which efforts it finds goes into the data."""
+    code = scene_programs(mechanism, analysis.redundant_rows or ())
+    evaluation = Evaluation(code, [numbers.function()])
+    data["efforts"] = [
+        {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", "place": places}
+        for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
+    ]
+    linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
+    return _module(linked, places=evaluation.places, size=evaluation.size)
+
+
+def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[int | None]:
+    """Return where in the solution of the linear system the row of each driver is; None where it is left out."""
+    found = code.eliminated_rows
+    names = [name for name, _ in code.row_names]
+    return [found.get(names.index(name)) for name in mechanism.driver_names]

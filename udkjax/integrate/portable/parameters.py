@@ -1,0 +1,98 @@
+"""Parameters of a mechanism one number at a time, and the program that makes the numbers of its equations of them."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.equations.structure import numbers_as_vector
+from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
+from udkjax.integrate.held_rows import SampleRows
+from udkjax.native.ir import Function
+from udkjax.native.program import consecutive, write
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import parameters_in, split_index
+
+
+def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) -> dict[str, float]:
+    """Return parameters one number at a time: `joint.A.points[0][1]` for an entry of an array.
+
+    Args:
+        mechanism: The scene.
+        names: Of parameters or of entries; by default all parameters of the scene, of one that is drawn without those numbers
+            that follow from its drawing: they would keep their values when the drawing changes.
+
+    Returns:
+        The values by their names, in order.
+
+    Raises:
+        SceneError: A name is unknown.
+    """
+    known, found = mechanism.parameters(), {}
+    for name in independent_parameters(mechanism) if names is None else names:
+        owner, place = split_index(name, known)
+        if owner not in known or (place and place not in np.ndindex(*np.shape(known[owner])[: len(place)])):
+            mechanism.with_parameters({name: 0.0})  # which says what is wrong with the name
+        value = np.asarray(known[owner])
+        for rest in np.ndindex(*value.shape[len(place) :]):
+            found[owner + "".join(f"[{k}]" for k in (*place, *rest))] = float(value[(*place, *rest)])
+    return found
+
+
+def independent_parameters(mechanism: Mechanism) -> list[str]:
+    """Return the names of all parameters that do not follow from a drawing."""
+    known = mechanism.parameters()
+    if mechanism.drawing is None:
+        return list(known)
+    own = {"gravity", *parameters_in(mechanism.drawing.groups), *(split_index(name, known)[0] for name in mechanism.changed)}
+    return [name for name in known if name in own]
+
+
+class NumberProgram:
+    """The numbers of a mechanism's equations as a function of some parameters, with the times of its breakpoints behind them.
+
+    Attributes:
+        base: all numbers and the breakpoints as they are.
+        changing: which of these depend on the parameters.
+        count: how many numbers there are before the breakpoints.
+    """
+
+    def __init__(self, mechanism: Mechanism, values: Mapping[str, float], dress: Callable[[Mechanism], Mechanism]):
+        """Trace it; `dress` makes, of the mechanism with parameters in, the one that is simulated."""
+
+        def numbers(p: Array) -> Array:
+            given = dress(mechanism.with_parameters({name: p[k] for k, name in enumerate(values)}))
+            return jnp.concatenate([jnp.asarray(x, float) for x in _numbers(given)])
+
+        self.base = np.concatenate(_numbers(dress(mechanism)))
+        self.count = len(_numbers(dress(mechanism))[0])
+        graph = Graph(np.float64)
+        inputs = [graph.input(k, "parameter") for k in range(len(values))]
+        outputs: list[Scalar] = []
+        if values:
+            shape = jax.ShapeDtypeStruct((len(values),), jnp.result_type(float))
+            (found,) = trace(numbers, shape)(graph, np.array(inputs, object))
+            outputs = list(found)
+        self.changing = [k for k, s in enumerate(outputs) if s.constant is None]
+        self._program = ScalarProgram(graph, inputs, [outputs[k] for k in self.changing])
+
+    def function(self) -> Function:
+        """Return `numbers(parameters, numbers)`, which writes those that depend on parameters."""
+        inputs = consecutive("parameters", len(self._program.inputs))
+        outputs = [("numbers", k) for k in self.changing]
+        return write(self._program, "numbers", 1, ("parameters", "numbers"), inputs, outputs)
+
+    def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
+        """Return all numbers and the breakpoints, by NumPy."""
+        found = self.base.copy()
+        found[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
+        return found
+
+
+def _numbers(mechanism: Mechanism) -> list[Array | np.ndarray]:
+    """Return all numbers, zeros in place of samples, and the breakpoints."""
+    breakpoints = mechanism.breakpoints
+    stand_in = SampleRows(mechanism, breakpoints).stand_in(mechanism)
+    return [numbers_as_vector(stand_in.numbers), np.zeros(0) if breakpoints is None else breakpoints]

@@ -1,0 +1,50 @@
+"""Springs by which a hand pulls bodies: one for each, without stiffness until it does."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.scene.bodies import Point
+from udkjax.scene.fields import NOT_NEGATIVE, given_number
+from udkjax.scene.forces import ForceElement, Load
+from udkjax.scene.mechanism import Mechanism
+
+PREFIX = "pull of "  # in the names of the elements
+
+
+class Pull(ForceElement):
+    """V = 1/2 stiffness |target - p|^2 with p a point of a body, and a load -damping dp/dt there.
+
+    Unlike `Spring` it has no direction, and so is smooth where its length is zero.
+
+    Args:
+        bodies: the name of the body.
+        point: p in the body's frame (m).
+        target: in ground axes (m).
+        stiffness: in N/m, not negative.
+        damping: in N s/m, not negative.
+    """
+
+    point: Float[Array, "2"] = eqx.field(converter=given_number)
+    target: Float[Array, "2"] = eqx.field(converter=given_number)
+    stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
+    damping: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
+
+    def potential(self, t, *frames):
+        place = frames[0].point(self.point)
+        stretch = Point(self.target[0] - place.x, self.target[1] - place.y)
+        return 0.5 * self.stiffness * stretch.dot(stretch)
+
+    def loads(self, t, *frames) -> list[Load]:
+        body = frames[0]
+        v, arm = body.velocity(self.point), body.vector(self.point)
+        x, y = -self.damping * v.x, -self.damping * v.y
+        return [(x, y, arm.x * y - arm.y * x)]
+
+
+def with_pulls(mechanism: Mechanism) -> Mechanism:
+    """Return a mechanism with a pull without stiffness for each body."""
+    none = {"point": np.zeros(2), "target": np.zeros(2), "stiffness": 0.0, "damping": 0.0}
+    pulls = {PREFIX + name: Pull(bodies=(name,), **none) for name in mechanism.body_names}
+    forces = {**mechanism.forces, **pulls}
+    return Mechanism(mechanism.bodies, mechanism.joints, mechanism.drivers, forces, mechanism.gravity, mechanism.name)

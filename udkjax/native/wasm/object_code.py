@@ -1,0 +1,176 @@
+"""LLVM's WebAssembly object code as a module that can be loaded: with exports, and without what is for linkers.
+
+An object has all its functions under their final numbers and its data from address 0 on, so that nothing has to be relocated; its
+memory and the pointer to its stack are imports. What it lacks is a section of exports: the numbers of its functions are in the
+table of symbols, in the section "linking" (the tool conventions' Linking.md).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+MAGIC = b"\0asm\1\0\0\0"
+CUSTOM, IMPORTS, EXPORTS, DATA = 0, 2, 7, 11  # sections; those of a module are in this order, but the count of data, before code
+SYMBOL_TABLE = 8  # a part of "linking"
+FUNCTION_SYMBOL, DATA_SYMBOL, SECTION_SYMBOL = 0, 1, 3  # all others have a number, too
+UNDEFINED, EXPLICIT_NAME = 0x10, 0x40  # flags of symbols
+I32_CONST = 0x41
+
+
+class LinkedModule(NamedTuple):
+    """A module that can be loaded, and what it takes.
+
+    Attributes:
+        code: its bytes.
+        imports: the names of functions that it calls, in the module "env".
+        data_end: the bytes of memory from 0 on that its constants take.
+    """
+
+    code: bytes
+    imports: tuple[str, ...]
+    data_end: int
+
+
+class Reader:
+    """A place in bytes, from which numbers and names are read one after another."""
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def __bool__(self) -> bool:
+        return self.at < len(self.data)
+
+    def byte(self) -> int:
+        """Read one byte."""
+        return self.take(1)[0]
+
+    def take(self, count: int) -> bytes:
+        """Read so many bytes."""
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def number(self) -> int:
+        """Read a whole number in LEB128."""
+        value = shift = 0
+        while True:
+            byte = self.byte()
+            value, shift = value | (byte & 127) << shift, shift + 7
+            if byte < 128:
+                return value
+
+    def block(self) -> bytes:
+        """Read bytes whose count is before them."""
+        return self.take(self.number())
+
+    def name(self) -> str:
+        """Read a text whose length is before it."""
+        return self.block().decode()
+
+
+def leb128(value: int) -> bytes:
+    """Return a whole number that is not negative in LEB128."""
+    found = bytearray()
+    while value > 127:
+        found.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*found, value])
+
+
+def link(code: bytes, exports: Sequence[str]) -> LinkedModule:
+    """Return an object as a module that exports functions by their names.
+
+    Raises:
+        ValueError: a function is not there, or the bytes are no object code of LLVM's.
+    """
+    sections = list(_sections(code))
+    numbers = _function_numbers(sections)
+    missing = [name for name in exports if name not in numbers]
+    if missing:
+        raise ValueError(f"the module has no function {missing[0]!r}")
+    entries = (leb128(len(name)) + name.encode() + b"\0" + leb128(numbers[name]) for name in exports)
+    exported = leb128(len(exports)) + b"".join(entries)
+    kept = [(kind, body) for kind, body in sections if kind != CUSTOM]
+    place = next(k for k, (kind, _) in enumerate([*kept, (EXPORTS + 1, b"")]) if kind > EXPORTS)
+    kept.insert(place, (EXPORTS, exported))
+    whole = MAGIC + b"".join(bytes([kind]) + leb128(len(body)) + body for kind, body in kept)
+    bodies = dict(kept)
+    return LinkedModule(whole, tuple(_imported_functions(bodies[IMPORTS])), _data_end(bodies.get(DATA, b"\0")))
+
+
+def _sections(code: bytes) -> Iterator[tuple[int, bytes]]:
+    reader = Reader(code)
+    if reader.take(len(MAGIC)) != MAGIC:
+        raise ValueError("these bytes are no WebAssembly")
+    while reader:
+        yield reader.byte(), reader.block()
+
+
+def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
+    """Return the number of each function that is defined, from the table of symbols."""
+    found = {}
+    for kind, body in sections:
+        reader = Reader(body)
+        if kind != CUSTOM or reader.name() != "linking":
+            continue
+        reader.number()  # the version
+        while reader:
+            part, table = reader.byte(), Reader(reader.block())
+            if part != SYMBOL_TABLE:
+                continue
+            for _ in range(table.number()):
+                symbol, name, number = _symbol(table)
+                if symbol == FUNCTION_SYMBOL and name:
+                    found[name] = number
+    return found
+
+
+def _symbol(table: Reader) -> tuple[int, str, int]:
+    """Read a symbol: its kind, its name if it is defined here, and its number."""
+    kind, flags = table.byte(), table.number()
+    defined = not flags & UNDEFINED
+    if kind == DATA_SYMBOL:
+        table.block()
+        for _ in range(3 if defined else 0):  # segment, offset, size
+            table.number()
+        return kind, "", 0
+    number = table.number()
+    if kind == SECTION_SYMBOL:
+        return kind, "", number
+    name = table.name() if defined or flags & EXPLICIT_NAME else ""
+    return kind, name if defined else "", number
+
+
+def _imported_functions(body: bytes) -> Iterator[str]:
+    reader = Reader(body)
+    for _ in range(reader.number()):
+        reader.name()
+        name, kind = reader.name(), reader.byte()
+        if kind == FUNCTION_SYMBOL:
+            yield name
+        _skip_type(reader, kind)
+
+
+def _skip_type(reader: Reader, kind: int):
+    """Read the type of what is imported: of a function, a table, a memory or a global."""
+    if kind in (1, 2):
+        if kind == 1:
+            reader.byte()
+        flags = reader.number()
+        reader.number()
+        if flags & 1:
+            reader.number()
+        return
+    reader.number()
+    if kind == 3:
+        reader.byte()
+
+
+def _data_end(body: bytes) -> int:
+    """Return where the last segment of data ends."""
+    reader, end = Reader(body), 0
+    for _ in range(reader.number()):
+        if reader.number() or reader.byte() != I32_CONST:
+            raise ValueError("data is expected at known places")
+        start = reader.number()
+        reader.byte()  # the end of the expression
+        end = max(end, start + len(reader.block()))
+    return end

@@ -1,0 +1,192 @@
+// The engine of one mechanism in a page: the data of udkjax/integrate/portable, run by WebAssembly.
+//
+//   const engine = await loadEngine(data)      throws where there is no WebAssembly
+//   engine.parameters                          a list of {name, unit, value}
+//   engine.values                              their values as they are in the scene, in the same order
+//   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
+//   engine.run(parameters, state, times, pull) -> {ts, q, v, violation, count, done, words, t, steps, last: {t, q, v}}
+//   engine.measure(parameters, run, efforts)   -> {kinetic, potential, efforts: {driver: values}}
+//
+// Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
+// of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
+
+const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
+const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite"};
+const EPS = 2 ** -52;
+
+const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+const numbersOf = text => new Float64Array(bytesOf(text).buffer);
+const largest = (x, unit) => x.reduce((most, value, k) => Math.max(most, Math.abs(value) / unit(k)), 0);
+
+async function inflate(text) {
+  const stream = new Blob([bytesOf(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).arrayBuffer();
+}
+
+/** One module with a memory of its own: constants, stack, and behind them what a call takes, which the next call overwrites. */
+class Instance {
+  static async load(module) {
+    const found = new Instance();
+    found.module = module;
+    found.start = Math.ceil((module.data_end + STACK) / LINE) * LINE;
+    found.memory = new WebAssembly.Memory({initial: Math.ceil(found.start / PAGE) + 1});
+    const env = {...MATHS, __linear_memory: found.memory, malloc: size => found.reserve(Number(size)), free: () => {}};
+    env.__stack_pointer = new WebAssembly.Global({value: "i32", mutable: true}, found.start);
+    const {instance} = await WebAssembly.instantiate(await inflate(module.code), {env});
+    found.exports = instance.exports;
+    return found;
+  }
+
+  begin() { this.end = this.start; }
+
+  /** The address of so many bytes. */
+  reserve(size) {
+    const place = this.end;
+    this.end = Math.ceil((place + size) / LINE) * LINE;
+    const missing = this.end - this.memory.buffer.byteLength;
+    if (missing > 0) this.memory.grow(Math.ceil(missing / PAGE));
+    return place;
+  }
+
+  put(numbers) {
+    const place = this.reserve(8 * numbers.length);
+    new Float64Array(this.memory.buffer, place, numbers.length).set(numbers);
+    return place;
+  }
+
+  view(place, count) { return new Float64Array(this.memory.buffer, place, count); }
+
+  /** Call `run` for one member: its inputs are arrays by name, and so are the results, by how many numbers they have. */
+  run(inputs, results, counts) {
+    this.begin();
+    const fields = {members: 1, directions: 0, next: this.put([0]), ...counts}, given = {};
+    for (const name of this.module.inputs) fields[name] = this.put(inputs[name]);
+    for (const name of this.module.results) fields[name] = given[name] = this.put(new Float64Array(results[name]));
+    const record = this.reserve(8 * this.module.fields.length);
+    const words = new BigInt64Array(this.memory.buffer, record, this.module.fields.length);
+    this.module.fields.forEach((name, k) => { words[k] = BigInt(fields[name] ?? 0); });
+    this.exports.run(record);
+    return Object.fromEntries(this.module.results.map(name => [name, this.view(given[name], results[name]).slice()]));
+  }
+}
+
+const MATHS = {exp2: x => 2 ** x};
+for (const name of ["exp", "log", "pow", "tanh", "tan", "sinh", "cosh", "asin", "acos", "atan", "atan2"]) MATHS[name] = Math[name];
+
+class Engine {
+  constructor(data, instances) {
+    this.data = data;
+    this.instances = instances;
+    this.parameters = data.parameters;
+    this.values = Float64Array.from(data.parameters, p => p.value);
+    this.base = numbersOf(data.numbers);
+    this.samples = numbersOf(data.samples);
+    this.size = 3 * data.bodies.length;
+    this.row = data.sampled.length;
+  }
+
+  /** All numbers of the scene; behind them the times where the motion is not smooth. */
+  numbers(parameters) {
+    if (!parameters || !this.parameters.length) return this.base.slice();
+    const module = this.instances.evaluate;
+    module.begin();
+    const given = module.put(parameters), to = module.put(this.base);
+    module.exports.numbers(given, to);
+    return module.view(to, this.base.length).slice();
+  }
+
+  breaks(numbers) { return numbers.slice(this.data.count).sort(); }
+
+  /** The numbers of the equations as a module takes them: with two thresholds, and with the samples that hold at a time. */
+  dressed(numbers, thresholds, t) {
+    const found = new Float64Array(this.data.count + 2);
+    found.set(numbers.subarray(0, this.data.count));
+    found.set(thresholds, this.data.count);
+    const passed = this.breaks(numbers).filter(b => b <= t).length;
+    this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
+    return found;
+  }
+
+  guess(numbers) {
+    const {q, v} = this.data.guess;
+    return {t: 0, q: Float64Array.from(q, k => numbers[k]), v: Float64Array.from(v, k => numbers[k])};
+  }
+
+  unit = k => (k % 3 === 2 ? 1 : this.data.scales.length);
+
+  /** Close the loops from a guess {t, q, v}, which by default is the scene's: the nearest closed state.
+   *
+   *  Returns t, q and v; `violation` of Psi and `rate` of Psi_dot, the largest of their rows in units of the scene; the `rank` of
+   *  Psi_q there; and whether the state is `closed`: if not, it is the best that was found.
+   */
+  close(parameters = null, guess = null) {
+    const {data} = this, numbers = this.numbers(parameters), start = {...this.guess(numbers), ...guess}, m = data.rows.length;
+    const given = this.dressed(numbers, data.closing.thresholds, start.t);
+    const inputs = {numbers: given, ts: [start.t, start.t], q: start.q, v: start.v, settings: data.closing.settings,
+      rows: data.rows, breaks: []};
+    const found = this.instances.close.run(inputs, {state: 2 * this.size, residuals: 2 * m, rank: 1}, {times: 2, knots: 0});
+    const q = found.state.slice(0, this.size), v = found.state.slice(this.size), row = k => data.rows[k % m];
+    const violation = largest(found.residuals.slice(0, m), row), rate = largest(found.residuals.slice(m), row);
+    const tol = Math.max(data.closing.tol, data.closing.rounding * EPS * Math.max(1, largest(q, this.unit)));
+    const closed = violation <= tol && rate <= tol * Math.max(data.scales.rate, largest(v, this.unit));
+    return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
+  }
+
+  /** Integrate the motion from a closed state {q, v} at times[0].
+   *
+   *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
+   *  that of the ground (m), stiffness (N/m) and damping (N s/m).
+   *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
+   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; and the `last` state.
+   */
+  run(parameters, state, times, pull = null) {
+    const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
+    if (data.why) throw new Error(data.why);
+    if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
+    const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
+    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
+    const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega});
+    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0]), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
+      samples: this.samples};
+    const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
+    const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
+    const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
+    let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
+    const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
+    if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
+    const last = {t: ended.t, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
+    return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
+      steps: ended.accepted, last};
+  }
+
+  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m). */
+  measure(parameters, {ts, q, v, count}, efforts = false) {
+    const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
+    const numbers = this.dressed(this.numbers(parameters), data.thresholds, ts[0]);
+    module.begin();
+    const given = module.put(numbers), work = module.reserve(8 * module.module.size);
+    module.view(work, module.module.size).fill(0);
+    module.exports.prologue(given, work);
+    const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
+    const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
+      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)]))};
+    for (let i = 0; i < count; i++) {
+      at("t")[0] = ts[i];
+      copy("q", q.subarray(i * size, (i + 1) * size));
+      copy("v", v.subarray(i * size, (i + 1) * size));
+      module.exports.energy(work, work);
+      [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
+      if (!wanted.length) continue;
+      module.exports.accelerations(work, work);
+      for (const {driver, place} of wanted) if (place !== null) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
+    }
+    return found;
+  }
+}
+
+/** The engine of a mechanism, from its data. */
+export async function loadEngine(data) {
+  if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
+  const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
+  return new Engine(data, Object.fromEntries(await Promise.all(loaded)));
+}
