@@ -1,6 +1,5 @@
 """Numbers held between samples, in a run and step by step: the same motion, and its derivatives by every sample."""
 
-import dataclasses
 from itertools import pairwise
 from typing import Any
 
@@ -11,11 +10,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.textbook import prepare
-from udkjax.integrate import native_engine
-from udkjax.integrate.problem import Problem
-from udkjax.native.operations import RunCotangents
+from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.native.primitive import generate
+from udkjax.native.record import STORED
 
 TORQUE, FORCE = np.array([1.0, 2.0, -1.0, 0.5]), np.array([[1.0, 0.0], [-2.0, 0.5], [3.0, 0.0]])
 NAMES = ("force.motor.value", "force.push.vector")
@@ -121,16 +118,11 @@ def code_of(samples: int) -> list[str]:
     torque, times = udk.Held(np.ones(samples), 0.01), np.linspace(0.0, 1.0, samples + 1)
     motor = udk.Driver(["ground", "cart"], "x", udk.Spline(times, 0 * times))
     mechanism = cart(torque, [0.0, 0.0], drivers={"rail motor": motor})
-    state, equations = udk.assemble(mechanism), prepare(mechanism)
-    tolerances = map(jnp.asarray, (1e-8, 1e-8, 1e-14))
-    numbers: Any = (equations, TS, state.q.ravel(), state.v.ravel(), *tolerances, None, None, jnp.ones(()))
-    problem = Problem(*numbers, solver=None, projected=True, max_steps=100, breakpoints=mechanism.breakpoints)
-    run = native_engine._run(problem)
-    settings: dict[str, Any] = {field.name: getattr(run, field.name) for field in dataclasses.fields(run)} | {
-        "code": run.code.for_derivatives
-    }
-    reverse = RunCotangents(**settings, active=(True,) * run.code.number_count)
-    return [generate(operation, 1, False).module for operation in (run, reverse)]
+    compiled = compile_mechanism(mechanism, udk.analyse(mechanism), udk.Auto(), udk.Projection())
+    run = compiled.plan.operation
+    assert run is not None
+    reverse = run.with_cotangents((True,) * run.code.number_count, STORED)
+    return [generate(operation, 1, False).written_text for operation in (run, reverse)]
 
 
 def test_the_code_does_not_depend_on_how_many_samples_there_are():

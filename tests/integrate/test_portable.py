@@ -11,7 +11,6 @@ import udkjax as udk
 from udkjax.integrate.portable import portable_engine, scalar_parameters
 from udkjax.scene.checks import SceneError
 
-
 SLOW = ("parallelogram", "scissor_lift", "door_closer")
 
 

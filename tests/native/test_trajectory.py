@@ -70,14 +70,13 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""
     seen, module = [], sys.modules["udkjax.integrate.simulate"]
-    reason = module.reason_for_diffrax
+    finish = module._finish
 
-    def reason_for_diffrax(*given):
-        why = reason(*given)
-        seen.append(not why)
-        return why
+    def finish_and_note(run, *given):
+        seen.append(run.problem.compiled.plan.is_native)
+        return finish(run, *given)
 
-    monkeypatch.setattr(module, "reason_for_diffrax", reason_for_diffrax)
+    monkeypatch.setattr(module, "_finish", finish_and_note)
     yield seen
     if "served" not in inspect.signature(request.function).parameters:
         assert all(seen)

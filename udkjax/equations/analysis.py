@@ -27,6 +27,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
 from udkjax.scene.arguments import checked
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked for longest ago makes room
@@ -118,6 +119,11 @@ def analyse(mechanism: Mechanism) -> Analysis:
         mechanism = mechanism.without_origin
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
         return Analysis(traced_scales(mechanism), count, names, _rows_of_known_geometry(mechanism))
+    return _analyse_known(mechanism)
+
+
+@cached_by_identity
+def _analyse_known(mechanism: Mechanism) -> Analysis:
     mechanism = mechanism.without_origin
     kind = structure(mechanism)
     return _analyses.get((kind, _bytes_of(mechanism)), lambda: _analyse(mechanism, kind))

@@ -10,7 +10,6 @@ motion of the guess as it is and satisfies the drivers. D^+ is truncated, so red
 one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
 """
 
-import weakref
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
@@ -37,6 +36,7 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import poses_table
 from udkjax.scene.fields import number, number_called
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import suspicions
 
@@ -106,18 +106,6 @@ def assemble(
     return closure.state
 
 
-class CachedClosure(NamedTuple):
-    """The closure of a mechanism at a time."""
-
-    mechanism: "weakref.ref[Mechanism]"
-    time: float
-    closure: Closure
-
-
-# The last closure of each mechanism that still exists: who simulates it again need not close it again.
-_cache: dict[int, CachedClosure] = {}
-
-
 def close(
     mechanism: Mechanism,
     t: Scalar = 0.0,
@@ -128,27 +116,27 @@ def close(
 
     Where all numbers are known the closure is, too, also while something else is traced.
     """
-    if not _is_known((mechanism, t, state)):
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, t, state))):
         analysis = analyse(mechanism) if analysis is None else analysis
         within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
         return (_close if within_jit else _close_compiled)(mechanism.without_origin.at(t), analysis, t, state)
-    key, time = id(mechanism), np.asarray(t).item()
-    cached = _cache.get(key)
-    if state is None and cached is not None and cached.mechanism() is mechanism and cached.time == time:
-        return cached.closure
+    if analysis is not None and isinstance(analysis.scales.length, Tracer):
+        analysis = None  # that of the known mechanism, which lasts
+    return _closure_of_known(mechanism, np.asarray(t).item(), state, analysis)
+
+
+@cached_by_identity  # who simulates a mechanism again need not close it again
+def _closure_of_known(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
     with jax.ensure_compile_time_eval():
         scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
         with np.errstate(all="ignore"):  # what is not finite does not close
-            q, v, psi, psi_dot, rank = _close_known(mechanism, scales, time, q, v)
+            q, v, psi, psi_dot, rank = _close_known(mechanism, scales, t, q, v)
             closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
         rank, closed = (jax.device_put(np.asarray(x)) for x in (rank, closed))
-        found = Closure(state_found, number(psi), number(psi_dot), rank, scales, closed)
-    if state is None:
-        _cache[key] = CachedClosure(weakref.ref(mechanism, lambda _: _cache.pop(key, None)), time, found)
-    return found
+        return Closure(state_found, number(psi), number(psi_dot), rank, scales, closed)
 
 
 def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
@@ -172,10 +160,6 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | N
 
 
 _close_compiled = eqx.filter_jit(_close)
-
-
-def _is_known(tree: PyTree) -> bool:
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def require_closed(mechanism: Mechanism, closure: Closure, t: Scalar = 0.0, guess: State | None = None) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import body_sizes
 
@@ -18,6 +19,7 @@ class AssemblyWarning(UserWarning):
     """Assembly moved a body by more than a hundredth of its size from its initial guess."""
 
 
+@cached_by_identity
 def moves_of_assembly(mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> tuple[str, ...]:
     """Return, in words, how far each body was moved from its initial guess to the assembled q, where that is worth saying."""
     change = np.asarray(q) - np.asarray(mechanism.q0)

@@ -24,13 +24,13 @@ from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, replaced, selec
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
-def differentiable(problem: Problem, native: bool) -> IntegratorOutput:
+def differentiable(problem: Problem) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
     None are taken along numbers that do not depend on what is differentiated.
     """
     problem_of, xs = split_numbers(problem)
-    return _run(Run(problem_of, native), xs)
+    return _run(Run(problem_of, problem.compiled.plan.is_native), xs)
 
 
 @eqx.filter_custom_jvp

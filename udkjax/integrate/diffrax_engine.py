@@ -25,11 +25,11 @@ def integrate_by_diffrax(
 ) -> IntegratorOutput:
     """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
     ts, y0 = problem.ts, jnp.concatenate([problem.q, problem.v])
-    if problem.projected:  # machine code does so, and its derivatives are combined with those of this engine
+    if problem.compiled.plan.projected:  # machine code does so, and its derivatives are combined with those of this engine
         y0 = project(problem.equations, ts[0], y0)
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
-        Constrained(problem.solver or diffrax.Dopri8(), problem.projected),
+        Constrained(problem.compiled.plan.solver or diffrax.Dopri8(), problem.compiled.plan.projected),
         t0=ts[0],
         t1=ts[-1],
         dt0=_first_step(problem, y0) if problem.h is None else problem.h,
@@ -47,7 +47,7 @@ def integrate_by_diffrax(
     reached = ts <= t_end[0]
     later = reached & (jnp.arange(len(ts)) > 0)
     ys = jnp.where(later[:, None], ys, y0)  # a run without any accepted step has saved nothing
-    if problem.projected:
+    if problem.compiled.plan.projected:
         ys = jnp.concatenate([ys[:1], project_all(problem.equations, ts[1:], ys[1:])])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
@@ -87,12 +87,12 @@ def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, un
 def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
     # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
-    if is_explicit(problem.solver):  # the same steps as by machine code
+    if is_explicit(problem.compiled.plan.solver):  # the same steps as by machine code
         settings |= {"safety": SAFETY, "factormin": SHRINK, "factormax": GROW}
     tolerances: dict[str, Any] = {"rtol": problem.rtol, "atol": problem.atol * jnp.concatenate(problem.units())}
-    if problem.breakpoints is None:
+    if problem.compiled.breakpoints is None:
         return diffrax.PIDController(**tolerances, **settings)
-    return diffrax.ClipStepSizeController(_FrozenSteps(**tolerances, **settings), jump_ts=problem.breakpoints)
+    return diffrax.ClipStepSizeController(_FrozenSteps(**tolerances, **settings), jump_ts=problem.compiled.breakpoints)
 
 
 class _FrozenSteps(diffrax.PIDController):

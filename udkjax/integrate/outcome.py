@@ -1,8 +1,8 @@
 """The end of a run and its cost, from the solver's own statistics."""
 
 from types import ModuleType
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -13,7 +13,7 @@ from udkjax.integrate.solution import Result
 from udkjax.native.steps import DONE, LEAST_ATOL, LOOK_AHEAD, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 
 
-class Run(eqx.Module):
+class FinishedRun(NamedTuple):
     """A run as the integrator leaves it."""
 
     raw: IntegratorOutput
@@ -36,7 +36,7 @@ def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: 
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 
-def outcome(run: Run, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
+def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
     """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
     code = xp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = xp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
@@ -65,7 +65,7 @@ def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Arra
     return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
 
 
-def _drift(run: Run, code: Array, xp: ModuleType) -> tuple[Array, Array, Bool[Array, "T"]]:
+def _drift(run: FinishedRun, code: Array, xp: ModuleType) -> tuple[Array, Array, Bool[Array, "T"]]:
     """Return code, time and the reached times, where the first output time at which a row of Psi is violated ends the solution.
 
     That holds for rows that the method leaves out, too.

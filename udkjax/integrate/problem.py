@@ -1,6 +1,6 @@
 """The input and the output of an integrator: the same for all of them."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,16 +8,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.gradients import stop_gradients
-
-if TYPE_CHECKING:
-    import diffrax
 
 
 class Problem(eqx.Module):
     """An initial value problem: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""
 
-    equations: AbstractSystem
+    compiled: CompiledMechanism
     ts: Float[Array, "T"]
     q: Float[Array, "n"]
     v: Float[Array, "n"]
@@ -28,11 +26,13 @@ class Problem(eqx.Module):
     # Of the system, which `atol` is relative to (m); None: its coordinates are of order one as they are.
     length: Float[Array, ""] | None
     rate: Float[Array, ""]  # of the system and the run (1/s)
-    solver: "diffrax.AbstractSolver | None" = eqx.field(static=True)
-    projected: bool = eqx.field(static=True)
     max_steps: Int[ArrayLike, ""]
-    breakpoints: Float[Array, "k"] | None = None  # the times where the motion is not smooth, in any order; None: it is
     points: int | None = eqx.field(static=True, default=None)  # that a record for reverse mode has room for; None: by breakpoints
+
+    @property
+    def equations(self) -> AbstractSystem:
+        """The equations of motion."""
+        return self.compiled.equations
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """Return the units of `atol` for coordinates and for velocities."""

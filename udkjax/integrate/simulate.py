@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from functools import partial
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
@@ -10,29 +10,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.partitioning import PartitionedSystem
-from udkjax.equations.quantities import equations_of
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
 from udkjax.integrate.assembly_moves import warn_of_moves
 from udkjax.integrate.causes.explained import explained
+from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_engine import independent_row_count, integrate_known, reason_for_diffrax
-from udkjax.integrate.outcome import Run, counts, increases, outcome, usable
-from udkjax.integrate.problem import Problem
+from udkjax.integrate.native_engine import integrate_known
+from udkjax.integrate.outcome import FinishedRun, counts, outcome
+from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, prepare_run
+from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SimulationError, Solution
-from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
+from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import traced_numbers_hold
-from udkjax.scene.fields import number, optional_number
+from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 
@@ -45,10 +45,6 @@ GEOMETRY_TRACED = (
     "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, with diffrax, "
     "hundreds of times slower. Make it of plain numbers and change them by with_parameters, or pass analysis=analyse(...)"
 )
-# Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
-# looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
-# 2e-3 open.
-DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
 
 
 @checked
@@ -126,64 +122,62 @@ def simulate(
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
     require_output_times("ts", ts)
-    rtol, atol, ts = number(rtol), number(atol), number(ts)
-    if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and float(rtol) + float(atol) < LEAST_ATOL:
+    if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
         raise ArgumentError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
-    drift = number((DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE) if drift_tol is None else drift_tol)
-    method = Auto() if method is None else method
-    settings = (rtol, atol, method, stabilization, drift, optional_number(dt0), formulation)
-    choices = (solver, _adjoint(adjoint), max_steps, _meter(progress))
-
-    start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
+    if drift_tol is None:
+        drift_tol = DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE
+    choices = Choices(
+        rtol=rtol,
+        atol=atol,
+        drift_tol=drift_tol,
+        dt0=dt0,
+        method=AUTO if method is None else method,
+        stabilization=stabilization,
+        formulation=formulation,
+        solver=solver,
+        adjoint=_adjoint(adjoint),
+        meter=_meter(progress),
+        max_steps=max_steps,
+        engine=engine,
+    )
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
-    bare: Any = mechanism
+    is_known = isinstance(mechanism, Mechanism) and mechanism.is_concrete
     if isinstance(mechanism, Mechanism):
+        start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
         if analysis is None:
             analysis = analyse(mechanism)
-            if analysis.redundant_rows is None and not mechanism.is_concrete and type(method) is Auto and engine == "auto":
+            if analysis.redundant_rows is None and not is_known and type(choices.method) is Auto and engine == "auto":
                 warnings.warn(GEOMETRY_TRACED, stacklevel=2)
-        bare = mechanism.without_origin
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
-            if mechanism.is_concrete:
+            if is_known:
                 warn_of_moves(mechanism, start, closure, stacklevel=3)
         if throw and closure is not None:
             require_closed(mechanism, closure, start)  # before anything runs
 
     if events is not None:
-        if not isinstance(mechanism, Mechanism) or choices[1] is not None or choices[3] is not None:
-            what = (
-                "a ConstrainedSystem"
-                if not isinstance(mechanism, Mechanism)
-                else "an adjoint of diffrax's"
-                if choices[1]
-                else "progress"
-            )
+        if not isinstance(mechanism, Mechanism) or choices.adjoint is not None or choices.meter is not None:
+            others = "an adjoint of diffrax's" if choices.adjoint else "progress"
+            what = others if isinstance(mechanism, Mechanism) else "a ConstrainedSystem"
             raise ValueError(f"a run with events takes a Mechanism, JAX's own derivatives and no progress meter: not {what}")
-        from udkjax.integrate.events.simulate_events import Choices, simulate_events  # a dozen modules that other runs do without
+        from udkjax.integrate.events.simulate_events import simulate_events  # a dozen modules that other runs do without
 
         assert analysis is not None  # a mechanism has one
-        more = (SMALLEST_STEP, isinstance(stabilization, Projection), solver, max_steps, max_events, engine)
-        baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-        given: Any = (rtol, atol, method, baumgarte, formulation, drift, optional_number(dt0), *more)
-        solution = simulate_events(mechanism, events, analysis, ts, state, closure, Choices(*given))
-        if not _has_failed(solution) or not mechanism.is_concrete or int(solution.stats["events"]):
+        solution = simulate_events(mechanism, events, analysis, number(ts), state, closure, choices.arrays(), max_events)
+        if not _has_failed(solution) or not is_known or int(solution.stats["events"]):
             return _required(solution, throw)  # events may have changed what moved
-        return _required(explained(solution, mechanism, analysis, drift, solver), throw)
+        return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
 
-    def run(analysis: Analysis | None) -> tuple[Solution, Any, Any]:
-        return _run(bare, analysis, ts, state, closure, *settings, *choices, engine)
-
-    solution, missed, end = run(analysis)
-    if isinstance(solution.code, Tracer):
-        return solution
-    if isinstance(mechanism, Mechanism) and missed and mechanism.is_concrete:
-        analysis = analyse(mechanism)
-        solution, _, end = run(analysis)  # the analysis was of other numbers, in which a row depended
-    if isinstance(mechanism, Mechanism) and mechanism.is_concrete and _has_failed(solution):
-        solution = explained(solution, mechanism, analysis, drift, solver, end)
+    solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices)
+    if isinstance(solution.code, Tracer) or not isinstance(mechanism, Mechanism):
+        return _required(solution, throw)
+    if missed and is_known:
+        analysis = analyse(mechanism)  # what was given was of other numbers, in which a row depended
+        solution, _, end = _run(mechanism, analysis, ts, state, closure, choices)
+    if is_known and _has_failed(solution):
+        solution = explained(solution, mechanism, analysis, choices.drift_tol, solver, end)
     return _required(solution, throw)
 
 
@@ -199,126 +193,67 @@ def _required(solution: Solution, throw: bool) -> Solution:
     return solution
 
 
-def _run(mechanism, analysis, ts, state, closure, *settings) -> Any:
+def _run(
+    system: Mechanism | ConstrainedSystem,
+    analysis: Analysis | None,
+    ts: Any,
+    state: State | None,
+    closure: Closure | None,
+    choices: Choices,
+) -> tuple[Solution, Any, Any]:
     """Return the solution, whether it takes rows that the method leaves out, and the last state (t, (q, v)) of the integrator.
 
     Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
     """
-    given = (mechanism, analysis, ts, state, closure, *settings)
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves(given)):
-        return _simulate(jnp, *given)
-    with jax.ensure_compile_time_eval():  # while something else is traced
-        known = _simulate(np, *given)
-    return _compiled(*given) if known is None else known
+    is_known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, analysis, ts, state, closure, choices)))
+    if is_known and isinstance(system, Mechanism):
+        with jax.ensure_compile_time_eval():  # while something else is traced
+            compiled = compile_known(system, analysis, *choices.of_mechanism)
+            if compiled.plan.is_native:
+                run = prepare_run(compiled, analysis, np.asarray(ts), state, closure, choices, np)
+                return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
+    bare = system.without_origin if isinstance(system, Mechanism) else system
+    given = bare, analysis, number(ts), state, closure, choices.arrays()
+    return _compiled(*given) if is_known else _simulate(*given)
 
 
 def _simulate(
-    xp,
-    mechanism,
-    analysis,
-    ts,
-    state,
-    closure,
-    rtol,
-    atol,
-    method,
-    stabilization,
-    drift_tol,
-    dt0,
-    formulation,
-    solver,
-    adjoint,
-    max_steps,
-    meter,
-    engine,
-) -> Any:
-    """As `_run`; by NumPy, None where machine code cannot."""
-    if xp is np:
-        ts, rtol, atol, drift_tol = (np.asarray(x) for x in (ts, rtol, atol, drift_tol))
-    baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
-    equations = equations_of(mechanism, method, baumgarte, formulation, analysis)
-    if xp is np:  # each operation of JAX on known numbers would be a program to compile
-        equations, closure, state, dt0 = jax.tree.map(_by_numpy, (equations, closure, state, dt0))
-    projected = equations.constrained and (isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem))
-    if state is None:
-        assert closure is not None
-        state, closed = closure.state, xp.asarray(closure.is_closed)
+    system: Mechanism | ConstrainedSystem,
+    analysis: Analysis | None,
+    ts: Array,
+    state: State | None,
+    closure: Closure | None,
+    choices: Choices,
+) -> tuple[Solution, Any, Any]:
+    compiled = compile_mechanism(system, analysis, *choices.of_mechanism)
+    run = prepare_run(compiled, analysis, ts, state, closure, choices)
+    if choices.adjoint is not None or choices.meter is not None:
+        raw = integrate_by_diffrax(run.problem, choices.adjoint, choices.meter)
     else:
-        closed = xp.array(True)
-    q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
-    good, given_ts = xp.array(True), ts
-    if xp is jnp:  # what is known has passed the door
-        good = usable(*stop_gradients((q, v, rtol, atol, drift_tol, dt0))) | ~closed  # pyright: ignore[reportArgumentType]
-        if isinstance(mechanism, Mechanism):
-            good = good & stop_gradients(traced_numbers_hold(mechanism.elements))
-    if isinstance(ts, Tracer):
-        in_order = increases(stop_gradients(ts))
-        good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))
-    # A member of a batch that cannot be closed is run through in a few steps, instead of holding up the others.
-    loose_rtol, loose_atol = (xp.where(good & closed, tol, 1e3) for tol in (rtol, xp.maximum(atol, LEAST_ATOL)))
-    ulp = np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1]))
-    length, rate = units_of_run(analysis, ts, v, xp)
-    problem = Problem(
-        equations=equations,
-        ts=ts,  # pyright: ignore[reportArgumentType]
-        q=q,
-        v=v,
-        rtol=loose_rtol,
-        atol=loose_atol,
-        smallest=SMALLEST_STEP * ulp,
-        h=dt0,
-        length=length,
-        rate=rate,
-        solver=solver,
-        projected=projected,
-        max_steps=max_steps,
-        breakpoints=mechanism.breakpoints,
-    )
-    why = "it was asked for" if engine == "diffrax" else reason_for_diffrax(problem, adjoint, meter)
-    if engine == "native" and why:
-        raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
-    if xp is np and why:
-        return None
-    if adjoint is not None or meter is not None:
-        raw = integrate_by_diffrax(problem, adjoint, meter)
-    else:
-        raw = integrate_known(problem) if xp is np else differentiable(problem, native=not why)
-    missed = xp.array(False) if why or closure is None else closed & (closure.rank > independent_row_count(problem))
+        raw = differentiable(run.problem)
+    return _finish(run, raw, getattr(system, "body_names", ()), choices)
+
+
+_compiled = eqx.filter_jit(_simulate)
+
+
+def _finish(
+    run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
+) -> tuple[Solution, Any, Any]:
+    """Return what `_run` does, from what the integrator found."""
+    problem, ts = run.problem, run.ts
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
-    q, v = xp.where(later, raw.q, q), xp.where(later, raw.v, v)
-    ends: Any = (raw, given_ts, good, closed, missed, drift_tol)
-    seen = Run(*ends)
-    code, time, reached = outcome(seen if xp is np else stop_gradients(seen), xp)
-    q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *np.shape(state.q)) for y in (q, v))
-    stats = counts(raw, projected, len(ts), xp)
-    chosen = (
-        ("method", type(method).__name__),
-        ("formulation", "UdwadiaKalaba" if formulation is None else type(formulation).__name__),
-        ("stabilization", type(stabilization).__name__),
-        ("solver", "Dopri8" if solver is None else type(solver).__name__),
-        ("max_steps", str(max_steps)),
-        ("first_step", "chosen" if dt0 is None else "given"),
-        ("engine", f"diffrax: {why}" if why else "native"),
-    )
-    arrays = jax.tree.map(jnp.asarray if xp is jnp else jax.device_put, (given_ts, q, v, code, time, stats, rtol, atol))
-    fields: Any = (*arrays, getattr(mechanism, "body_names", ()), chosen)
-    return Solution(*fields), missed, (raw.t, raw.y)
-
-
-def _by_numpy(leaf: Any) -> Any:
-    return np.asarray(leaf) if eqx.is_array(leaf) else leaf
-
-
-_compiled = eqx.filter_jit(partial(_simulate, jnp))
-
-
-def units_of_run(analysis: Analysis | None, ts: Any, v: Any, xp: Any) -> tuple[Any, Any]:
-    """The length and the rate that `atol` is relative to."""
-    if analysis is None:
-        return None, xp.ones(())
-    scales = analysis.scales if xp is jnp else jax.tree.map(np.asarray, analysis.scales)
-    units = scales.length, xp.maximum(xp.maximum(scales.rate, scales.size(v, xp)), 1 / (ts[-1] - ts[0]))
-    return units if xp is np else stop_gradients(units)
+    q, v = xp.where(later, raw.q, problem.q), xp.where(later, raw.v, problem.v)
+    ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows, choices.drift_tol)
+    code, time, reached = outcome(ending if xp is np else stop_gradients(ending), xp)
+    q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *run.state_shape) for y in (q, v))
+    stats = counts(raw, problem.compiled.plan.projected, len(ts), xp)
+    rtol, atol = xp.asarray(choices.rtol, float), xp.asarray(choices.atol, float)
+    arrays: dict[str, Any] = {"ts": ts, "q": q, "v": v, "code": code, "time": time, "stats": stats, "rtol": rtol, "atol": atol}
+    if xp is np:
+        arrays = jax.device_put(arrays)
+    names = choices.settings(problem.compiled.plan.why_not_native)
+    return Solution(**arrays, bodies=bodies, choices=names), run.has_missed_rows, (raw.t, raw.y)
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:

@@ -1,7 +1,7 @@
 """One control interval: from a state and inputs that are held to the next state, for loops that decide as they go."""
 
-import weakref
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -13,19 +13,16 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.quantities import equations_of
 from udkjax.integrate.assembly import State
+from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_engine import reason_for_diffrax
-from udkjax.integrate.outcome import usable
-from udkjax.integrate.problem import Problem
-from udkjax.integrate.simulate import DRIFT_PROJECTED, simulate, units_of_run
-from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
-from udkjax.pinv import Auto
+from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
+from udkjax.integrate.projection import Projection
+from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.fields import number
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 POINTS = 6  # accepted steps of one interval that reverse mode has stored; of more than that it runs again
@@ -74,10 +71,10 @@ def step(
     numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, state, values, numbers, analysis))):
         return _advance(mechanism, analysis or analyse(mechanism), state, values, numbers, max_steps, engine)
-    compiled = _compiled(mechanism, analysis)
-    run = _program(compiled.form, max_steps, engine)
+    parts = _parts(mechanism, analysis)
+    run = _program(parts.form, max_steps, engine)
     found = State.__new__(State)
-    q, v = run(compiled.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
+    q, v = run(parts.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
     object.__setattr__(found, "q", q)
     object.__setattr__(found, "v", v)
     if not np.isfinite(np.asarray(q)).all():
@@ -101,57 +98,27 @@ def _advance(
     moved = mechanism.with_parameters(values).without_origin if values else mechanism.without_origin
     known = not isinstance(t, Tracer) and not isinstance(dt, Tracer)  # and stays so while something else is traced
     ts = number(np.array([float(t), float(t) + float(dt)])) if known else jnp.stack([t, t + dt])
-    equations, q, v = equations_of(moved, Auto(), analysis=analysis), jnp.ravel(state.q), jnp.ravel(state.v)
-    smallest = SMALLEST_STEP * np.finfo(float).eps * jnp.max(jnp.abs(ts))
-    length, rate = units_of_run(analysis, ts, v, jnp)
-    problem = Problem(
-        equations=equations,
-        ts=ts,
-        q=q,
-        v=v,
-        rtol=rtol,
-        atol=jnp.maximum(atol, LEAST_ATOL),
-        smallest=smallest,
-        h=dt,
-        length=length,
-        rate=rate,
-        solver=None,
-        projected=equations.constrained,
-        max_steps=max_steps,
-        breakpoints=moved.breakpoints,
-        points=POINTS,
-    )
-    why = engine == "diffrax" or reason_for_diffrax(problem)
-    if engine == "native" and why:
-        raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
-    raw = differentiable(problem, native=not why)
-    good = usable(*stop_gradients((q, v, rtol, atol, number(DRIFT_PROJECTED), dt))) & traced_numbers_hold(moved.elements)
-    good = stop_gradients(good & raw.reached[-1] & (jnp.max(raw.violation) <= DRIFT_PROJECTED))
+    choices = Choices(rtol, atol, DRIFT_PROJECTED, dt, AUTO, Projection(), max_steps=max_steps, engine=engine)
+    compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
+    run = prepare_run(compiled, analysis, ts, state, None, choices)
+    raw = differentiable(replace(run.problem, points=POINTS))
+    good = stop_gradients(run.is_usable & raw.reached[-1] & (jnp.max(raw.violation) <= DRIFT_PROJECTED))
     failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
 
 
-class Compiled(NamedTuple):
+class MechanismParts(NamedTuple):
     """A mechanism and its analysis, taken apart."""
 
-    mechanism: "weakref.ref[Mechanism]"
-    analysis: Analysis | None  # that was given: while it is here no other has its identity
     form: Hashable  # all but the numbers
     leaves: list[Array]
 
 
-_compiled_mechanisms: dict[tuple[int, int], Compiled] = {}
-
-
-def _compiled(mechanism: Mechanism, analysis: Analysis | None) -> Compiled:
+@cached_by_identity
+def _parts(mechanism: Mechanism, analysis: Analysis | None) -> MechanismParts:
     """Return a mechanism taken apart: once, however many steps it takes."""
-    key = id(mechanism), id(analysis)
-    found = _compiled_mechanisms.get(key)
-    if found is None or found.mechanism() is not mechanism:
-        leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or analyse(mechanism)))
-        reference = weakref.ref(mechanism, lambda _: _compiled_mechanisms.pop(key, None))
-        found = _compiled_mechanisms[key] = Compiled(reference, analysis, form, leaves)
-    return found
+    leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or analyse(mechanism)))
+    return MechanismParts(form, leaves)
 
 
 @lru_cache(maxsize=64)

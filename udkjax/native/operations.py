@@ -102,6 +102,14 @@ class Run(Operation):
             sampled=self.sampled,
         )
 
+    def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
+        """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
+        return RunTangents(self.code.for_derivatives, self.method, self.projected, self.breaks, self.sampled, active)
+
+    def with_cotangents(self, active: tuple[bool, ...], points: int) -> "RunCotangents":
+        """Return the operation that walks back to the numbers that are active, by a record of so many points."""
+        return RunCotangents(self.code.for_derivatives, self.method, self.projected, self.breaks, self.sampled, active, points)
+
     def module(self, width: int, several: bool, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))
 

@@ -55,6 +55,7 @@ class Compiled:
     def __init__(self, operation: Operation, width: int, several: bool):
         self._module, self._in_passes = generate(operation, width, several), operation.is_reverse
         self.name, self._run = load(self._module.written_text)
+        self._fields = self._module.call_fields
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Outputs of these shapes, on as many threads as there are cores."""
@@ -72,7 +73,7 @@ class Compiled:
         following = ctypes.c_int64(0)
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
         fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
-        call = (ctypes.c_int64 * len(names.call_fields))(*(fields[name] for name in names.call_fields))
+        call = (ctypes.c_int64 * len(self._fields))(*[fields[name] for name in self._fields])
         threads = min(os.cpu_count() or 1, members)
         if threads == 1:
             self._run(ctypes.addressof(call))

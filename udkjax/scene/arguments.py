@@ -49,9 +49,11 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         bound = parameters.bind(*args, **kwargs)
+        given = frozenset(bound.arguments)  # defaults are right
         bound.apply_defaults()
         for name, check in checks:
-            check(name, bound.arguments[name], bound.arguments)
+            if name in given:
+                check(name, bound.arguments[name], bound.arguments)
         return function(*args, **kwargs)
 
     return call

@@ -57,7 +57,9 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
             raise ArgumentTypeError(f"{name} must be an array of numbers; its rows have different lengths") from None
         except TypeError:
             raise ArgumentTypeError(f"{name} must be an array of numbers, {describe(value)}") from None
-    if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):
+    if found.dtype.kind in "fiu":
+        return found
+    if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):  # of few digits
         kind = "complex numbers" if jnp.issubdtype(found.dtype, jnp.complexfloating) else None
         raise ArgumentTypeError(f"{name} must be real numbers, {f'not {kind}' if kind else describe(value)}")
     return found

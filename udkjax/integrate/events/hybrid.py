@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate import native_engine
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, RunPlan
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.events.actions import Action, Impact, Log, Stop
 from udkjax.integrate.events.conditions import Gap, WithinLimit, frames_of
@@ -24,11 +25,7 @@ from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
-from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.joints import Joint
-
-if TYPE_CHECKING:
-    import diffrax
 
 T = TypeVar("T")
 Added = tuple[Joint, ...]  # the joints that events add, with the numbers that they have now
@@ -69,10 +66,8 @@ class Hybrid(eqx.Module):
     method: Pseudoinverse
     baumgarte: Baumgarte | None
     formulation: Formulation | None
-    solver: "diffrax.AbstractSolver | None" = eqx.field(static=True)
-    projects: bool = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
-    engine: str = eqx.field(static=True)
+    plans: tuple[RunPlan, ...] = eqx.field(static=True)  # of each phase
 
     # --- what is known of the events
 
@@ -87,17 +82,22 @@ class Hybrid(eqx.Module):
         return self.phases.mechanisms[0].body_names
 
     @property
+    def projects(self) -> bool:
+        """True if states are projected after each step."""
+        return any(plan.projected for plan in self.plans)
+
+    @property
     def scales(self) -> Scales:
         """The characteristic length, time and mass of the scene."""
         return self.phases.analyses[0].scales
 
     @property
     def has_usable_numbers(self) -> Bool[Array, ""]:
-        """True if the scene's numbers are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
+        """True if the numbers of events are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
 
         Those that are known were checked before; those that were traced then are looked at here.
         """
-        found, limits = traced_numbers_hold(self.phases.mechanisms[0].elements), {}
+        found, limits = jnp.array(True), {}
         for e in self.events:
             if isinstance(e.condition, WithinLimit):
                 limits[e.name] = e.condition.limit
@@ -166,42 +166,26 @@ class Hybrid(eqx.Module):
         mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
         return Problem(
-            equations,
-            ts,
-            q,
-            v,
-            self.rtol,
-            self.atol,
-            self.smallest,
-            self.h,
-            self.length,
-            self.rate,
-            solver=self.solver,
-            projected=equations.constrained and self.projects,
+            compiled=CompiledMechanism(equations, mechanism.breakpoints, self.plans[phase]),
+            ts=ts,
+            q=q,
+            v=v,
+            rtol=self.rtol,
+            atol=self.atol,
+            smallest=self.smallest,
+            h=self.h,
+            length=self.length,
+            rate=self.rate,
             max_steps=self.max_steps,
-            breakpoints=mechanism.breakpoints,
         )
-
-    def problem_of_guess(self, phase: int) -> Problem:
-        """Return the problem of a phase at the initial guess, for what does not depend on the state."""
-        first = self.phases.mechanisms[0]
-        return self.problem(phase, jnp.zeros(2), first.q0.ravel(), first.v0.ravel(), self.phases.first_added())
-
-    def reasons(self) -> tuple[str, ...]:
-        """Return why machine code cannot integrate each phase; empty where it can."""
-        return tuple(self._reason_for_diffrax(self.problem_of_guess(k)) for k in range(len(self.phases.mechanisms)))
-
-    def _reason_for_diffrax(self, problem: Problem) -> str:
-        return "it was asked for" if self.engine == "diffrax" else native_engine.reason_for_diffrax(problem)
 
     def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
         """Integrate from a state over the times `ts`, the first of which is its own; with `derivatives`, differentiably."""
 
         def of_phase(phase: int, ts: Array, q: Array, v: Array, added: Added) -> IntegratorOutput:
             problem = self.problem(phase, ts, q, v, added)
-            native = not self._reason_for_diffrax(problem)
-            if derivatives or not native:
-                return differentiable(problem, native)
+            if derivatives or not self.plans[phase].is_native:
+                return differentiable(problem)
             return native_engine.integrate(problem)
 
         return self.in_phase(state.phase, of_phase, ts, state.q, state.v, state.added)

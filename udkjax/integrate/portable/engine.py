@@ -3,6 +3,7 @@
 import base64
 import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -10,14 +11,16 @@ import numpy as np
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
-from udkjax.equations.quantities import equations_of
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.integrate.native_engine import packed, reason_for_diffrax
+from udkjax.integrate.assembly import State
+from udkjax.integrate.compiled_mechanism import compile_known
+from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
 from udkjax.integrate.portable.pull import PREFIX, with_pulls
+from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
-from udkjax.integrate.simulate import DRIFT_PROJECTED
+from udkjax.integrate.projection import Projection
 from udkjax.native.evaluation import Evaluation
 from udkjax.native.layout import INFO, INPUTS
 from udkjax.native.operations import Close, Operation
@@ -90,7 +93,7 @@ def portable_engine(
     }
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
-    data["why"] = UNKNOWN_ROWS if analysis.redundant_rows is None else reason_for_diffrax(problem)
+    data["why"] = UNKNOWN_ROWS if analysis.redundant_rows is None else problem.compiled.plan.why_not_native
     modules = {"close": _close(dressed, data)}
     if not data["why"]:
         modules["run"] = _run(problem, data)
@@ -134,21 +137,12 @@ def _places(mechanism: Mechanism, pull: bool) -> Json:
 
 def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float) -> Problem:
     """Return a run that stands for all: its times and its state are replaced in the page."""
-    bare = mechanism.without_origin
-    equations = jax.tree.map(np.asarray, equations_of(bare, analysis=analysis))
-    q, v = (np.asarray(x, float).ravel() for x in (bare.q0, bare.v0))
-    given: Any = {"ts": np.array([0.0, 1.0]), "q": q, "v": v, "rtol": np.asarray(rtol), "atol": np.asarray(atol)}
-    units: Any = {"length": np.asarray(analysis.scales.length), "rate": np.asarray(1.0), "smallest": np.asarray(0.0)}
-    return Problem(
-        equations=equations,
-        h=None,
-        solver=None,
-        projected=equations.constrained,
-        max_steps=MAX_STEPS,
-        breakpoints=bare.breakpoints,
-        **given,
-        **units,
-    )
+    choices = Choices(rtol=rtol, atol=atol, drift_tol=DRIFT_PROJECTED, dt0=None, method=AUTO, stabilization=Projection())
+    choices = choices._replace(max_steps=MAX_STEPS)
+    compiled = compile_known(mechanism, analysis, *choices.of_mechanism)
+    start = State(mechanism.q0, mechanism.v0)
+    problem = prepare_run(compiled, analysis, np.array([0.0, 1.0]), start, None, choices, np).problem
+    return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))
 
 
 def _run(problem: Problem, data: Json) -> Json:

@@ -1,0 +1,65 @@
+"""Results that are found again by the identities of what they were computed of."""
+
+import gc
+
+import numpy as np
+import pytest
+
+from udkjax.scene import identity_cache
+from udkjax.scene.identity_cache import cached_by_identity
+
+
+class Thing:
+    """An object whose end can be told."""
+
+
+@pytest.fixture
+def counted():
+    calls = []
+
+    @cached_by_identity
+    def function(*args):
+        calls.append(len(args))
+        return object()
+
+    return function, calls
+
+
+def test_objects_are_told_apart_by_identity_and_numbers_by_value(counted):
+    function, calls = counted
+    one, two = np.zeros(3), np.zeros(3)
+    assert function(one, 1.0, None, "a") is function(one, 0.5 + 0.5, None, "a")
+    assert len(calls) == 1
+    others = [function(two, 1.0, None, "a"), function(one, 1, None, "a"), function(one, True, None, "a"), function(one, 1.0)]
+    assert len({function(one, 1.0, None, "a"), *others}) == 5 == len(calls)
+
+
+def test_a_result_goes_with_its_object(counted):
+    function, calls = counted
+    things = [Thing() for _ in range(3)]
+    for thing in things:
+        function(thing)
+    del thing, things[:]
+    gc.collect()
+    for _ in range(20):  # new objects take the places in memory of those that are gone
+        function(Thing())
+    assert len(calls) == 23
+
+
+def test_what_cannot_be_watched_is_held(counted):
+    """A list has no weak references: it stays, so that no other gets its identity."""
+    function, calls = counted
+    for k in range(10):
+        function([k])
+    assert len(calls) == 10
+
+
+def test_the_oldest_make_room(counted, monkeypatch):
+    monkeypatch.setattr(identity_cache, "CACHE_SIZE", 2)
+    function, calls = counted
+    one, two, three = (Thing() for _ in range(3))
+    for thing in (one, two, one, three, one):  # the second one was asked for longest ago
+        function(thing)
+    assert len(calls) == 3
+    function(two)
+    assert len(calls) == 4

@@ -1,0 +1,152 @@
+"""What is decided of a mechanism before it runs: its equations, and the operation of machine code, or why there is none."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.elements import has_pieces
+from udkjax.equations.formulations import Formulation
+from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.partitioning import PartitionedSystem
+from udkjax.equations.quantities import equations_of
+from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.textbook import TextbookEquations
+from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.integrate.held_rows import SampleRows
+from udkjax.integrate.projection import Projection
+from udkjax.integrate.solvers import is_explicit, method_of
+from udkjax.native.operations import Run, Tableau
+from udkjax.native.primitive import unsupported
+from udkjax.pinv import Auto, Elimination, Pseudoinverse
+from udkjax.pinv.rank_policy import RankPolicy
+from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.scene.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    import diffrax
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What the structure of a mechanism and the choices of a run decide, whatever the numbers are."""
+
+    solver: "diffrax.AbstractSolver | None"
+    projected: bool
+    operation: Run | None  # of machine code that integrates it
+    why_not_native: str  # why there is none, or it is not taken; empty where it is
+
+    @property
+    def is_native(self) -> bool:
+        """True if machine code integrates."""
+        return not self.why_not_native
+
+
+class CompiledMechanism(eqx.Module):
+    """A mechanism as runs take it, whatever their times, states and tolerances: found once, and handed down.
+
+    The arrays of the equations and the breakpoints may be traced or batched.
+    """
+
+    equations: AbstractSystem
+    breakpoints: Float[Array, "k"] | None  # the times where the motion is not smooth, in any order; None: it is
+    plan: RunPlan = eqx.field(static=True)
+
+    @property
+    def samples(self) -> SampleRows:
+        """The rows of all that has samples."""
+        equations: Any = self.equations
+        return SampleRows(equations.mechanism, self.breakpoints)
+
+    @property
+    def independent_row_count(self) -> int:
+        """How many rows elimination takes."""
+        equations: Any = self.equations
+        return len(equations.scales.rows) - len(equations.redundant or ())
+
+
+def compile_mechanism(
+    system: Mechanism | ConstrainedSystem,
+    analysis: Analysis | None,
+    method: Pseudoinverse,
+    stabilization: Projection | Baumgarte | None,
+    formulation: Formulation | None = None,
+    solver: "diffrax.AbstractSolver | None" = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
+    meter: "diffrax.AbstractProgressMeter | None" = None,
+    engine: str = "auto",
+) -> CompiledMechanism:
+    """Return a mechanism, or a system of the user's own, as runs take it; the arguments are those of `simulate`.
+
+    Raises:
+        ValueError: machine code was asked for and cannot run it.
+    """
+    baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
+    equations = equations_of(system, method, baumgarte, formulation, analysis)
+    projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
+    projected, breakpoints, operation = equations.constrained and projects, system.breakpoints, None
+    why = "it was asked for" if engine == "diffrax" else _reason_for_diffrax(equations, solver, adjoint, meter)
+    if not why:
+        assert isinstance(equations, TextbookEquations)  # there is a reason for diffrax where they are not
+        operation = _run_operation(equations, solver, projected, breakpoints)
+        missing = unsupported(operation)
+        why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
+    if engine == "native" and why:
+        raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
+    return CompiledMechanism(equations, breakpoints, RunPlan(solver, projected, None if why else operation, why))
+
+
+@cached_by_identity
+def compile_known(system: Mechanism, *choices: Any) -> CompiledMechanism:
+    """Return the same of a mechanism of known numbers, as arrays of NumPy: each operation of JAX would be a program."""
+    compiled = compile_mechanism(system.without_origin, *choices)
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, compiled)
+
+
+def _reason_for_diffrax(
+    equations: AbstractSystem,
+    solver: "diffrax.AbstractSolver | None",
+    adjoint: "diffrax.AbstractAdjoint | None",
+    meter: "diffrax.AbstractProgressMeter | None",
+) -> str:
+    """Return why machine code cannot integrate equations, whatever the scene is; empty where it can."""
+    if adjoint is not None:
+        return f"{type(adjoint).__name__} is an adjoint of diffrax"
+    if meter is not None:
+        return "a progress meter is diffrax's"
+    if type(equations) is not TextbookEquations:
+        return f"it knows the Udwadia-Kalaba equation of a mechanism, not {type(equations).__name__}"
+    if not isinstance(equations.method, Auto | Elimination):
+        return f"it eliminates, and {type(equations.method).__name__} was asked for"
+    if isinstance(equations.method, Auto) and equations.redundant is None:
+        return "which rows are redundant is not known"
+    if not is_explicit(solver):
+        return f"{type(solver).__name__} is no explicit Runge-Kutta method"
+    if jax.default_backend() != "cpu":
+        return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
+    if not jax.config.jax_enable_x64:
+        return "it computes in float64, which JAX is told not to"
+    return ""
+
+
+def _run_operation(equations: TextbookEquations, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> Run:
+    mechanism = equations.mechanism
+    elements = (*mechanism.constraints.values(), *mechanism.forces.values())
+    return Run(
+        code=_programs(equations),
+        method=Tableau(method_of(solver)),
+        projected=projected,
+        breaks=breakpoints is not None or any(map(has_pieces, elements)),
+        sampled=SampleRows(mechanism, breakpoints).places(mechanism),
+    )
+
+
+def _programs(equations: TextbookEquations) -> ScenePrograms:
+    """Return the programs of a scene: with pivots that are refused, where the method falls back on a rank-revealing one."""
+    policy = RankPolicy.DROP if isinstance(equations.method, Elimination) else RankPolicy.REFUSE
+    return scene_programs(equations.mechanism, equations.redundant or (), equations.baumgarte is not None, policy)
