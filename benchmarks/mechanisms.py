@@ -23,6 +23,7 @@ from udkjax.study.drive import drive
 CRANK, COUPLER, ROCKER, GROUND = 0.5, 1.2, 0.8, 1.0
 START, TURN = math.pi / 3, 2 * math.pi
 INPUT, JOINT = "body.crank.angle", "joint.D.points[0][0]"
+POINTS = [f"joint.{name}.points" for name in "ABCD"]  # sixteen numbers: where each pin is on both of its links
 MEMBERS, VALUES, ROUNDS = 2000, 360, 5
 TOLERANCE = 1e-12  # m and rad: what all candidates must agree to
 
@@ -113,7 +114,14 @@ def positions(smoke: bool) -> list[dict[str, Any]]:
     assert np.all(np.asarray(whole(grounds).status) == 0)
     moved = jax.jit(jax.vmap(lambda g: jax.jvp(lambda g: public(g).q, (g,), (1.0,))))
     np.asarray(moved(grounds)[1])
+    lone, along = (udk.PositionBatch(mech, INPUT, names, derivatives=d) for names, d in (([JOINT], False), (POINTS, True)))
+    given = {JOINT: np.asarray(grounds)}
+    few = min(members, 50)  # 26 MB of derivatives: to get fresh memory from the system takes longer than to fill it
+    pins = {name: np.repeat(np.asarray(mech.parameters()[name])[None], few, 0) for name in POINTS}
+    assert np.max(np.abs(np.sin((lone(given, values).q[:, :, 2, 2] - exact) / 2))) < TOLERANCE
     candidates = {
+        "udkjax: PositionBatch": (lambda: lone(given, values, threads=1), members * VALUES),
+        "udkjax: PositionBatch, derivatives by all pins": (lambda: along(pins, values, threads=1), few * VALUES),
         "udkjax: q, q', q'' in a batch": (lambda: batch(grounds), members * VALUES),
         "udkjax: kinematics() in a batch": (lambda: whole(grounds), members * VALUES),
         "udkjax: and a derivative by a length": (lambda: moved(grounds), members * VALUES),

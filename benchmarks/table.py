@@ -104,6 +104,9 @@ def _claims() -> Iterable[Claim]:
     for name in ("udkjax: q, q', q'' in a batch", "udkjax: kinematics() in a batch"):
         rate = value("per_second", name=name)
         yield Claim(f"{name}: closed positions of a four-bar a second and core", "mechanisms", 1e6, rate, True)
+    for name, least in (("udkjax: PositionBatch", 5e6), ("udkjax: PositionBatch, derivatives by all pins", 1e6)):
+        rate = value("per_second", name=name)
+        yield Claim(f"{name}: closed positions of a four-bar a second and core", "mechanisms", least, rate, True)
     for name, target in STARTS.items():
         yield Claim(f"start: {name}, s", "startup", target, value("seconds", name=name))
     for scene in SCENES:

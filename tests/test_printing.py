@@ -70,6 +70,7 @@ def objects() -> dict[str, object]:
         udk.ConstrainedSystem(mass=jnp.diag, force=anything),
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
         *(drawing, drawing.links["bar"], udk.Held(ts, 0.1)),
+        *((batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])), batch({"gravity": np.zeros((2, 2))}, [0.1])),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
     return {type(one).__name__: one for one in found}

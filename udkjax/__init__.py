@@ -136,6 +136,8 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.kinematics import travel as travel
     from udkjax.study.modes import Modes as Modes
     from udkjax.study.modes import modes as modes
+    from udkjax.study.position_batch import BatchPositions as BatchPositions
+    from udkjax.study.position_batch import PositionBatch as PositionBatch
     from udkjax.study.power_balance import PowerBalance as PowerBalance
     from udkjax.study.power_balance import power_balance as power_balance
     from udkjax.study.reaction_peaks import envelope as envelope
@@ -186,6 +188,7 @@ _NAMES = {
     "udkjax.study.equilibrium": "equilibria equilibrium Equilibrium",
     "udkjax.study.inverse_dynamics": "feed_forward inverse_dynamics Effort InverseDynamics",
     "udkjax.study.modes": "modes Modes",
+    "udkjax.study.position_batch": "BatchPositions PositionBatch",
     "udkjax.study.kinematics": "kinematics Kinematics travel Travel",
     "udkjax.study.transmission": "coupler_curve mechanical_advantage transmission_angle workspace Workspace",
     "udkjax.integrate": "simulate step Solution Projection Result SimulationError Verner65 Adams BDF",

@@ -1,0 +1,189 @@
+"""The positions of a driven mechanism as programs of its free numbers: for whole batches of mechanisms in machine code.
+
+A model gives Psi(x, s, q), the free numbers x and the driver's value s, and measures g(x, s, q, d) of a position, with data d.
+At Psi = 0, by one elimination of Psi_q (expressions/elimination.py),
+
+    q <- q - Psi_q^+ Psi,      dq/ds = -Psi_q^+ Psi_s,      dq/dx = -Psi_q^+ Psi_x,
+    dg/dx = g_x - y^T Psi_x,   dg/ds = g_s - y^T Psi_s,     Psi_q^T y = g_q^T.
+
+What depends on x alone is computed once a mechanism: the `constants`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, trace
+from udkjax.expressions.differential import Differential
+from udkjax.expressions.elimination import SymbolicFactors
+
+Model = Callable[..., dict[str, jax.Array]]
+
+
+class Sizes(NamedTuple):
+    """How many numbers a model takes and gives."""
+
+    parameters: int  # x
+    coordinates: int  # q
+    data: int  # d, of one position
+    measures: int  # g
+
+
+class Place(NamedTuple):
+    """Where the value of a measure, its derivative by s and its first derivative by x are among the outputs."""
+
+    value: int
+    by_value: int
+    by_parameters: slice
+
+
+class PositionPrograms:
+    """Programs of a driven mechanism.
+
+    Args:
+        model: `model(x, s, q, d)` returns "psi" (m,), "q0" (n,) and "s0" (), a closed position of the numbers x and the value
+            there, and "measures" (G,), by JAX.
+        parameters: The number of free numbers x.
+        coordinates: The number n of coordinates.
+        data: The number of data d of a position.
+        transmission: Whether the last measure is the transmission of the position: det(B) over the product of the lengths of
+            its columns, where B is what known numbers leave of Psi_q. Of a four-bar it is the sine of the transmission angle;
+            it vanishes, and changes its sign, where branches meet.
+        positions: Whether the first n measures are q itself.
+        derivatives: Whether measures have derivatives.
+        rows: The scales of the m rows of Psi, by which what redundant rows leave is judged; by default one.
+
+    Raises:
+        ValueError: The positions do not follow from the driver's value.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        parameters: int,
+        coordinates: int,
+        data: int = 0,
+        transmission: bool = True,
+        positions: bool = False,
+        derivatives: bool = True,
+        rows: Sequence[float] | np.ndarray | None = None,
+    ):
+        graph = self._graph = Graph()
+        self._x = _inputs(graph, "x", "parameter", parameters)
+        self._s = graph.input("s", "value")
+        self._q = _inputs(graph, "q", "position", coordinates)
+        self._d = _inputs(graph, "d", "data", data)
+        examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
+        traced = trace(lambda *given: [model(*given)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
+        psi, q0, s0, measures = traced(
+            graph, np.array(self._x, object), np.array(self._s, object), np.array(self._q, object), np.array(self._d, object)
+        )
+        self._psi, self._q0, self._s0 = list(psi.flat), list(q0.flat), s0.item()
+        self._scales = np.ones(len(self._psi)) if rows is None else np.asarray(rows, float)
+        self._differential = Differential(graph, self._psi, [*self._x, self._s, *self._q])
+        place = {v.index: k for k, v in enumerate(self._q)}
+        entries = [{place[k]: a for k, a in self._differential.row(r).items() if k in place} for r in self._psi]
+        self._factors = SymbolicFactors(graph, entries, coordinates)
+        self._measures = [*(self._q if positions else []), *measures.flat]
+        self._transmission = self._find_transmission() if transmission else None
+        count = len(self._measures) + transmission
+        self.sizes = Sizes(parameters, coordinates, data, count)
+        step = 2 + parameters if derivatives else 1
+        self.places = [Place(k * step, k * step + 1, slice(k * step + 2, (k + 1) * step)) for k in range(count)]
+        self.output_count = count * step
+        self._write(derivatives)
+
+    def _write(self, derivatives: bool):
+        correction = self._factors.solve(self._psi)
+        rate = [-x for x in self._factors.solve(self._column(self._s))]
+        closer = [q - dq for q, dq in zip(self._q, correction, strict=True)]
+        newton = [*closer, *rate, self._sign(), self._violation()]
+        outputs = self._outputs(derivatives)
+        constants = frontier(self._graph, [*newton, *outputs], lambda node: node.depends <= {"parameter"})
+        self.constant_count = len(constants)
+        state = [*constants, self._s, *self._q]
+        self.prologue = ScalarProgram(self._graph, self._x, [*constants, *self._q0, self._s0])
+        """x; the constants, q0 and s0."""
+        self.newton = ScalarProgram(self._graph, state, newton)
+        """The constants, s and q; q after a Newton step, dq/ds, what changes its sign where branches meet, and the violation."""
+        self.measure = ScalarProgram(self._graph, [*state, *self._d], outputs)
+        """The constants, s, q and d; the outputs."""
+
+    def _outputs(self, derivatives: bool) -> list[Scalar]:
+        values = [*self._measures, *([] if self._transmission is None else [self._transmission[0]])]
+        if not derivatives:
+            return values
+        slopes = self._slopes()
+        return [x for value, slope in zip(values, slopes, strict=True) for x in (value, *slope)]
+
+    def _slopes(self) -> list[list[Scalar]]:
+        """The derivatives of all measures by s and x: by as many solutions as there are measures, or as there are numbers."""
+        graph, moved = self._graph, [self._s, *self._x]
+        differential = Differential(graph, self._measures, [*moved, *self._q])
+        zero = graph.constant(0.0)
+        partial = [[differential.row(g).get(v.index, zero) for v in (*moved, *self._q)] for g in self._measures]
+        if self._transmission is not None:
+            partial.append(self._transmission[1])
+        columns = [self._column(v) for v in moved]
+        if len(partial) > len(moved):
+            changes = [[-x for x in self._factors.solve(column)] for column in columns]
+            along = [[_dot(row[len(moved) :], change, zero) for change in changes] for row in partial]
+        else:
+            adjoints = [self._factors.solve_transposed(row[len(moved) :]) for row in partial]
+            along = [[-_dot(y, column, zero) for column in columns] for y in adjoints]
+        return [[a + b for a, b in zip(row, part, strict=False)] for row, part in zip(partial, along, strict=True)]
+
+    def _column(self, variable: Scalar) -> list[Scalar]:
+        """The derivatives of Psi by one number."""
+        zero = self._graph.constant(0.0)
+        return [self._differential.row(r).get(variable.index, zero) for r in self._psi]
+
+    @property
+    def _is_square(self) -> bool:
+        return len(self._factors.block) == len(self._factors.open_columns)
+
+    def _violation(self) -> Scalar:
+        """The sum of the squares of Psi, each row over its scale; zero where no row is redundant: then steps say it all."""
+        zero = self._graph.constant(0.0)
+        if self._is_square:
+            return zero
+        rows = [r * (1.0 / float(scale)) for r, scale in zip(self._psi, self._scales, strict=True)]
+        return _dot(rows, rows, zero)
+
+    def _sign(self) -> Scalar:
+        """The determinant of B where it is square: what changes its sign where branches meet; one otherwise."""
+        R, found = self._factors.triangle, self._graph.constant(1.0)
+        if not self._is_square:
+            return found
+        for k in range(len(self._factors.open_columns)):
+            found = found * R[k][k]
+        return found
+
+    def _find_transmission(self) -> tuple[Scalar, list[Scalar]]:
+        """Transmission tau, and its partial derivatives by s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
+        graph, factors = self._graph, self._factors
+        B, R, count = factors.block, factors.triangle, len(factors.open_columns)
+        zero, tau = graph.constant(0.0), graph.constant(1.0)
+        variables = [self._s, *self._x, *self._q]
+        seeds, entries = [], []
+        for j in range(count):
+            square = _dot([row[j] for row in B], [row[j] for row in B], zero)
+            tau = tau * R[j][j] / graph.sqrt(square)
+            unit = [graph.constant(float(j == k)) for k in range(count)]
+            inverse = factors.block_transposed(unit)
+            for row, x in zip(B, inverse, strict=True):
+                seeds.append(x - row[j] / square)
+                entries.append(row[j])
+        slopes = cotangents(graph, entries, seeds, variables) if entries else [zero] * len(variables)
+        return tau, [tau * slope for slope in slopes]
+
+
+def _inputs(graph: Graph, name: str, group: str, count: int) -> list[Scalar]:
+    return [graph.input((name, k), group) for k in range(count)]
+
+
+def _dot(a: Sequence[Scalar], b: Sequence[Scalar], zero: Scalar) -> Scalar:
+    return sum((x * y for x, y in zip(a, b, strict=True)), zero)

@@ -1,0 +1,25 @@
+"""Machine code of the positions of batches (native/positions.py) for models of mechanisms, with errors that name the scene."""
+
+from typing import Any
+
+from udkjax.equations.position_programs import Model, PositionPrograms
+from udkjax.native.positions import PositionCode
+from udkjax.native.program import UnsupportedError
+from udkjax.scene.checks import SceneError
+from udkjax.scene.mechanism import Mechanism
+
+
+def compile_programs(mechanism: Mechanism, model: Model, parameters: int, coordinates: int, **choices: Any) -> PositionPrograms:
+    """Return the programs of a model; raise `SceneError` where positions do not follow."""
+    try:
+        return PositionPrograms(model, parameters, coordinates, **choices)
+    except ValueError as problem:
+        raise SceneError([f"positions do not follow from the driver: {problem}"], mechanism.name) from None
+
+
+def position_code(mechanism: Mechanism, programs: PositionPrograms) -> PositionCode:
+    """Return the machine code of programs; raise `SceneError` where there is no instruction for something."""
+    try:
+        return PositionCode(programs)
+    except UnsupportedError as problem:
+        raise SceneError([f"machine code has no instruction for {problem}"], mechanism.name) from None
