@@ -1,13 +1,17 @@
-"""Public functions of the lower floors name their arguments, their results and their errors."""
+"""Docstrings are sentences; public functions of the lower floors name their arguments, their results and their errors."""
 
+import ast
 import inspect
 import re
+from pathlib import Path
 
 import pytest
 
+import udkjax
 from udkjax import equations, expressions, pinv, scene
 
 FLOORS = scene, pinv, expressions, equations
+NO_SUBJECT = re.compile("(What|Whatever|Whether|Which|Who|Whose|How|Where|When|As|Those|That)\\b")
 FUNCTIONS = {
     f"{floor.__name__}.{name}": found
     for floor in FLOORS
@@ -46,3 +50,20 @@ def test_what_it_raises_is_described(name):
 def test_a_missing_argument_is_noticed():
     doc = "Do it.\n\nArgs:\n    one: The first.\n    two: The\n        second: with a colon.\n\nReturns:\n    x: No."
     assert described(doc, "Args") == {"one", "two"}
+
+
+def without_subject(text: str) -> list[str]:
+    """The first lines of docstrings that begin with a word that no sentence with a subject begins with."""
+    kinds = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
+    docs = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+    return [doc.splitlines()[0] for doc in docs if NO_SUBJECT.match(doc)]
+
+
+def test_docstrings_are_sentences_with_a_subject():
+    files = sorted(Path(udkjax.__file__).parent.rglob("*.py"))
+    assert {f"{file}: {line}" for file in files for line in without_subject(file.read_text(encoding="utf-8"))} == set()
+
+
+def test_a_docstring_without_a_subject_is_noticed():
+    text = 'def one():\n    """Whether it is."""\n\n\nclass Two:\n    """Thosely named."""\n\n    def f(self):\n        """As `one`."""'
+    assert without_subject(text) == ["Whether it is.", "As `one`."]

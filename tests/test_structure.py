@@ -79,3 +79,12 @@ def test_a_circle_is_found_wherever_it_hides(tmp_path, line):
     assert circles(root) == set()
     (root / "third.py").write_text("import package.one")
     assert circles(root) == {frozenset({"package.one", "package.other", "package.third"})}
+
+
+def test_each_name_of_a_class_is_used_once():
+    places: dict[str, list[str]] = {}
+    for module, file in modules(ROOT).items():
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(module)
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from udkjax import Mechanism
-    from udkjax.study.channels import Channel, Trajectory
+    from udkjax.study.channels import Channel, StateHistory
 
     Columns = dict[str, tuple[np.ndarray, str]]  # values over time and their unit, by name
 
@@ -27,7 +27,7 @@ def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
     return found
 
 
-def measure_channels(mech: "Mechanism", motion: "Trajectory", channels: "Sequence[Channel]") -> "Columns":
+def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Sequence[Channel]") -> "Columns":
     """Return the values of channels over a motion."""
     import jax
     import numpy as np

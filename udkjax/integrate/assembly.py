@@ -175,7 +175,7 @@ def require_closed(mechanism: Mechanism, closure: Closure, t: Scalar = 0.0, gues
 
 @prints_table
 class Check(NamedTuple):
-    """What there is to know of a mechanism's constraints before it moves."""
+    """The findings on a mechanism's constraints before it moves."""
 
     bodies: int
     coordinates: int

@@ -12,7 +12,7 @@ from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, Trac
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_closing
-from udkjax.integrate.linear_map import Function, Linear
+from udkjax.integrate.linear_map import DifferentiableFunction, Linear
 from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
@@ -34,7 +34,7 @@ def close_by_machine_code(
     return _close_by_code(AssemblyFunction(guess), xs)
 
 
-class AssemblyFunction(Function):
+class AssemblyFunction(DifferentiableFunction):
     """q and v of a closed state as a function of the numbers of a guess: a mechanism, its analysis, and t, q and v."""
 
     guess: TreeOfNumbers

@@ -1,4 +1,4 @@
-"""What is decided of a mechanism before it runs: its equations, and the operation of machine code, or why there is none."""
+"""Decisions on a mechanism before it runs: its equations, and the operation of machine code, or why there is none."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.held_rows import SampleRows
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
-from udkjax.native.operations import Run, Tableau
+from udkjax.native.operations import RunStates, Tableau
 from udkjax.native.primitive import unsupported
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What the structure of a mechanism and the choices of a run decide, whatever the numbers are."""
+    """The part of a run that follows from the structure of a mechanism and the choices, whatever the numbers are."""
 
     solver: "diffrax.AbstractSolver | None"
     projected: bool
-    operation: Run | None  # of machine code that integrates it
+    operation: RunStates | None  # of machine code that integrates it
     why_not_native: str  # why there is none, or it is not taken; empty where it is
 
     @property
@@ -65,7 +65,7 @@ class CompiledMechanism(eqx.Module):
 
     @property
     def independent_row_count(self) -> int:
-        """How many rows elimination takes."""
+        """The number of rows that elimination takes."""
         equations: Any = self.equations
         return len(equations.scales.rows) - len(equations.redundant or ())
 
@@ -134,10 +134,12 @@ def _reason_for_diffrax(
     return ""
 
 
-def _run_operation(equations: TextbookEquations, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> Run:
+def _run_operation(
+    equations: TextbookEquations, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None
+) -> RunStates:
     mechanism = equations.mechanism
     elements = (*mechanism.constraints.values(), *mechanism.forces.values())
-    return Run(
+    return RunStates(
         code=_programs(equations),
         method=Tableau(method_of(solver)),
         projected=projected,

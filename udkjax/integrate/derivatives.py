@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from udkjax.integrate import native_engine
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.linear_map import Function, Linear, change_along
+from udkjax.integrate.linear_map import DifferentiableFunction, Linear, change_along
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.split_jvp import split_jvp
 from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
@@ -30,11 +30,11 @@ def differentiable(problem: Problem) -> IntegratorOutput:
     None are taken along numbers that do not depend on what is differentiated.
     """
     problem_of, xs = split_numbers(problem)
-    return _run(Run(problem_of, problem.compiled.plan.is_native), xs)
+    return _run(DifferentiableRun(problem_of, problem.compiled.plan.is_native), xs)
 
 
 @eqx.filter_custom_jvp
-def _run(function: "Run", xs: list[Array]) -> IntegratorOutput:
+def _run(function: "DifferentiableRun", xs: list[Array]) -> IntegratorOutput:
     return function.fast(xs)
 
 
@@ -66,7 +66,7 @@ def _(primals, tangents):
 
 
 @eqx.filter_custom_jvp
-def _as_run(function: "Run", xs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
+def _as_run(function: "DifferentiableRun", xs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
     """Return the results of a run, with the derivatives of the run."""
     del function, xs
     return raw
@@ -80,7 +80,7 @@ def _(primals, tangents):
     return raw, eqx.filter_jvp(_run, tuple(at), tuple(tangents[:2]))[1]
 
 
-class Run(Function):
+class DifferentiableRun(DifferentiableFunction):
     """Positions and velocities at the output times, and at the end, of the numbers of a problem.
 
     Derivatives beyond the first are those of diffrax alone: `plain`.
@@ -90,7 +90,7 @@ class Run(Function):
     native: bool = eqx.field(static=True)
 
     @property
-    def plain(self) -> "Run":
+    def plain(self) -> "DifferentiableRun":
         return replace(self, native=False)
 
     def fast(self, xs: list[Array]) -> IntegratorOutput:

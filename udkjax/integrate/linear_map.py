@@ -27,7 +27,7 @@ from udkjax.integrate.traced_numbers import Mask, replaced, select
 from udkjax.pinv.linear_primitive import linear_primitive
 
 
-class Function(eqx.Module):
+class DifferentiableFunction(eqx.Module):
     """A function of a list of arrays that returns a list of arrays. Forward mode of it is JAX's."""
 
     @abstractmethod
@@ -57,15 +57,15 @@ class Function(eqx.Module):
         return self.pull(xs, active, ws)
 
     @property
-    def plain(self) -> "Function":
+    def plain(self) -> "DifferentiableFunction":
         """The same in the form that is differentiated more than once."""
         return self
 
 
-class Along(Function):
+class Along(DifferentiableFunction):
     """g(x, v) = J(x) v, with v of those of x that are active."""
 
-    of: Function
+    of: DifferentiableFunction
     active: Mask = eqx.field(static=True)
 
     def __call__(self, xs: list[Array]) -> list[Array]:
@@ -120,7 +120,7 @@ def change_along(function: Callable, xs: list[Array], active: Mask, vs: list[Arr
 class Linear(eqx.Module):
     """v -> J(x) v, or transposed w -> J(x)^T w, of those of x that are active."""
 
-    function: Function
+    function: DifferentiableFunction
     xs: list[Array]
     run: Any  # what evaluating it has left for its first derivatives; None: nothing
     active: Mask = eqx.field(static=True)

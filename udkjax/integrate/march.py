@@ -26,7 +26,7 @@ MOST_KNOTS = 100  # of motions by splines: their programs are whole, and take 10
 DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on others; march ends long before
 
 
-class March(NamedTuple):
+class MarchResult(NamedTuple):
     """Positions and their derivatives by the value; the first `trusted` of them are right."""
 
     q: Float[Array, "T n"]
@@ -43,7 +43,7 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis))
 
 
-def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
+def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
     """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
 
     The mechanism's driver has the value for its time; `unit` is what values are measured by.
@@ -52,7 +52,7 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: 
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
-def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> March:
+def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
     """March with known numbers, by NumPy: nothing is traced or compiled for it."""
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
@@ -69,9 +69,9 @@ def _by_numpy(x: PyTree) -> PyTree:
     return np.asarray(x) if eqx.is_array(x) else x
 
 
-def _march(found: Sequence, xp: ModuleType) -> March:
+def _march(found: Sequence, xp: ModuleType) -> MarchResult:
     q, dq, ddq = (x[0, APPROACH:] for x in found[:3])
-    return March(q, dq, ddq, xp.maximum(found[3][0, 0].astype(int) - APPROACH, 0))
+    return MarchResult(q, dq, ddq, xp.maximum(found[3][0, 0].astype(int) - APPROACH, 0))
 
 
 def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector, xp: ModuleType) -> list:

@@ -15,7 +15,7 @@ from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.layout import INFO, OUTPUTS
-from udkjax.native.operations import Run
+from udkjax.native.operations import RunStates
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
@@ -24,7 +24,7 @@ from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.identity_cache import cached_by_identity
 
 
-def packed(problem: Problem) -> tuple[Run, list[np.ndarray]]:
+def packed(problem: Problem) -> tuple[RunStates, list[np.ndarray]]:
     """Return the operation of a problem whose numbers are all known, and its inputs."""
     operation = _operation(problem)
     return operation, _inputs(problem, operation, np)
@@ -102,7 +102,7 @@ def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: A
     return eqx.tree_at(places, none, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
 
 
-def _operation(problem: Problem, active: Problem | None = None, reverse: bool = False) -> Run:
+def _operation(problem: Problem, active: Problem | None = None, reverse: bool = False) -> RunStates:
     """Return the operation of a problem: a run, or one with tangents or cotangents of what is active."""
     run = problem.compiled.plan.operation
     assert run is not None  # who comes here has asked whether there is one
@@ -115,7 +115,7 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
     return run.with_cotangents(which, problem.points or STORED + PER_BREAKPOINT * (0 if breaks is None else len(breaks)))
 
 
-def _inputs(problem: Problem, operation: Run, xp: ModuleType = jnp) -> list[Any]:
+def _inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
     """Return the arrays that machine code takes, for one member."""
     compiled = problem.compiled
     scene = _known_scene_inputs(compiled) if xp is np else _scene_inputs(compiled, operation.code.policy)

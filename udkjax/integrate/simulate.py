@@ -182,7 +182,7 @@ def simulate(
 
 
 def _has_failed(solution: Solution) -> bool:
-    """Whether a single run, of known numbers, has not reached its end."""
+    """Return whether a single run, of known numbers, has not reached its end."""
     return not isinstance(solution.code, Tracer) and not solution.result.is_success
 
 
@@ -257,7 +257,7 @@ def _finish(
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
-    """As in diffrax_engine.py: diffrax is imported where it is asked for, since that takes as long as all of JAX."""
+    """Integrate as in diffrax_engine.py: diffrax is imported where it is asked for, since that takes as long as all of JAX."""
     from udkjax.integrate.diffrax_engine import integrate_by_diffrax
 
     return integrate_by_diffrax(problem, adjoint, meter)

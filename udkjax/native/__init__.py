@@ -10,7 +10,7 @@ How the code of a run is made, and where to look:
 4. `trajectory` adds the algorithm: `runge_kutta` (stages and errors of a step), `manifold` (projection), `controller` (accept or
    reject, and the next step), `singular` and `fallback` (steps near singular configurations), `breakpoints` and `pieces` (where
    the motion is not smooth), `dense_output` (states between steps), `members` (which member runs in which lane).
-5. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `linearization` and
+5. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `program_derivative` and
    `prologue`; `closing`, `closing_derivatives` and `corrections` are a module that assembles a mechanism instead, `marching` one
    that follows its positions.
 6. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules

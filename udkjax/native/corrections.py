@@ -20,12 +20,12 @@ from collections.abc import Iterator
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
 from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.ir import POINTER, Function, Value
-from udkjax.native.linearization import Linearization
 from udkjax.native.module import Module
+from udkjax.native.program_derivative import ProgramDerivative
 from udkjax.native.weighted_rows import WeightedRows
 
 
-class EliminationCorrection(Linearization):
+class EliminationCorrection(ProgramDerivative):
     """A correction by elimination."""
 
     def write_adjoint(self):

@@ -81,7 +81,7 @@ class Operation(ABC):
 
 
 @dataclass(frozen=True)
-class Run(Operation):
+class RunStates(Operation):
     """Integrate: q, v, the violation of Psi, and how the run ended."""
 
     method: Tableau
@@ -119,7 +119,7 @@ class Run(Operation):
 
 
 @dataclass(frozen=True)
-class RunTangents(Run):
+class RunTangents(RunStates):
     """Integrate, with the changes of the states and of the end along directions."""
 
     active: tuple[bool, ...] = ()  # of the numbers of the scene: along which there are derivatives
@@ -138,7 +138,7 @@ class RunTangents(Run):
 
 
 @dataclass(frozen=True)
-class RunCotangents(Run):
+class RunCotangents(RunStates):
     """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
 
     active: tuple[bool, ...] = ()

@@ -49,7 +49,7 @@ def unsupported(operation: Operation) -> str:
     return ""
 
 
-class Compiled:
+class LoadedCode:
     """The machine code of one operation, in so many lanes."""
 
     def __init__(self, operation: Operation, width: int, several: bool):
@@ -104,9 +104,9 @@ def load(text: str) -> tuple[str, Any]:
 
 
 @lru_cache(maxsize=256)
-def machine_code(operation: Operation, width: int, several: bool) -> Compiled:
+def machine_code(operation: Operation, width: int, several: bool) -> LoadedCode:
     """The machine code of an operation."""
-    return Compiled(operation, width, several)
+    return LoadedCode(operation, width, several)
 
 
 def call_known(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
@@ -117,7 +117,7 @@ def call_known(operation: Operation, inputs: Sequence[np.ndarray], times: int) -
 # --- as a primitive of JAX
 
 
-def _select_code(inputs: Sequence[Any], operation: Operation) -> Compiled:
+def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     few = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
     several = bool(operation.tangents) and few and inputs[-1].shape[1] > 1 and operation.code.is_small
     return machine_code(operation, 1 if few else machine.lanes(), several)
@@ -133,7 +133,7 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     found = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
     if not operation.is_reverse:
         return found
-    # What a pass leaves out, as in `Compiled`, is memory as it was.
+    # What a pass leaves out, as in `LoadedCode`, is memory as it was.
     results, (*bars, record) = found[: len(OUTPUTS)], found[len(OUTPUTS) :]
     if inputs[-1].shape[0]:
         return [*map(jnp.zeros_like, results), *bars, record]

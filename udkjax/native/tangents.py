@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from udkjax.native.dense_output import write_between, write_differences
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
-from udkjax.native.linearization import Linearization
+from udkjax.native.program_derivative import ProgramDerivative
 from udkjax.native.prologue import FORWARD, write_prologue_derivative
 from udkjax.native.samples import row_address
 from udkjax.native.steps import POINTS
@@ -36,8 +36,8 @@ class Differentiated(Trajectory):
         self.active, self.count, self.last = active, len(self.moving), plan.method.stages
         # Of each active number that has samples: its column there, and its place among the numbers.
         self.active_samples = {k: place for k, place in enumerate(plan.sampled) if active[place]}
-        self.of_accelerations = Linearization(self, "accelerations")
-        self.of_projection = Linearization(self, "projection") if plan.projected else None
+        self.of_accelerations = ProgramDerivative(self, "accelerations")
+        self.of_projection = ProgramDerivative(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last: of the end
             self.places.add(f"stage{i} linearization", self.of_accelerations.stored)
         if self.of_projection:
@@ -53,7 +53,7 @@ class Differentiated(Trajectory):
             each.evaluation()
 
     @property
-    def _linearizations(self) -> list[Linearization]:
+    def _linearizations(self) -> list[ProgramDerivative]:
         """The differentiable programs of the module."""
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 

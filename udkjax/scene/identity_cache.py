@@ -1,4 +1,4 @@
-"""What is computed of objects that stay as they are, found again by their identities.
+"""Results computed of objects that stay as they are, found again by their identities.
 
 Mechanisms, states and methods are trees of arrays: to compare their values takes as long as much of what is computed of them.
 """

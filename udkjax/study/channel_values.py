@@ -19,11 +19,11 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import LOADS, POINT_UNITS, Channel, Quantity, Trajectory, locate, point_of_pin
+from udkjax.study.channels import LOADS, POINT_UNITS, Channel, Quantity, StateHistory, locate, point_of_pin
 from udkjax.study.channels import Point as Place
 
 
-def measure(mechanism: Mechanism, solution: Trajectory, channels: Sequence[Channel | Quantity]) -> Float[Array, "T C"]:
+def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Channel | Quantity]) -> Float[Array, "T C"]:
     """Compute the values of channels at the output times of a solution; it may be traced and batched.
 
     Accelerations and reactions are those of the constraints without stabilization,
@@ -50,7 +50,7 @@ def measure(mechanism: Mechanism, solution: Trajectory, channels: Sequence[Chann
 
 @checked
 def path(
-    mechanism: Mechanism, solution: Trajectory, of: str, point: Numbers | None = None, derivative: Literal[0, 1, 2] = 0
+    mechanism: Mechanism, solution: StateHistory, of: str, point: Numbers | None = None, derivative: Literal[0, 1, 2] = 0
 ) -> Float[Array, "T 2"]:
     """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities, or accelerations.
 
@@ -84,7 +84,7 @@ def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
 
 
 def _fill(
-    mechanism: Mechanism, solution: Trajectory | SimpleNamespace, analysis: Analysis | None = None
+    mechanism: Mechanism, solution: StateHistory | SimpleNamespace, analysis: Analysis | None = None
 ) -> tuple["_Motion", Bool[Array, "T"]]:
     """Return a motion with the scene's guess where it is not a number, so that all derivatives are, and where it is one."""
     reached = jnp.all(jnp.isfinite(solution.q) & jnp.isfinite(solution.v), axis=(1, 2))

@@ -36,7 +36,7 @@ RATES = ("vx", "vy", "omega")  # of the coordinates of a body
 _ACCELERATIONS = ("ax", "ay", "alpha")
 
 
-class Trajectory(Protocol):
+class StateHistory(Protocol):
     """A motion to measure: a pytree with output times ts (T,) and states q and v (T, bodies, 3), such as a `Solution`."""
 
     @property
@@ -74,7 +74,7 @@ class Quantity:
     """
 
     name: str
-    function: Callable[[Mechanism, Trajectory], Float[Array, "T"]]
+    function: Callable[[Mechanism, StateHistory], Float[Array, "T"]]
     units: str = ""
 
     def __repr__(self) -> str:

@@ -35,7 +35,7 @@ from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import CALLED, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory
+from udkjax.study.channels import StateHistory
 from udkjax.study.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
 from udkjax.study.free_directions import free_part
 from udkjax.study.kinematics import Kinematics, kinematics
@@ -90,7 +90,7 @@ class InverseDynamics(PrintsTable):
 States: TypeAlias = Float[Array, "T bodies 3"]
 
 
-class AcceleratedTrajectory(Trajectory, Protocol):
+class AcceleratedTrajectory(StateHistory, Protocol):
     """A trajectory with accelerations a (T, bodies, 3), such as a `Kinematics`."""
 
     @property

@@ -28,7 +28,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory
+from udkjax.study.channels import StateHistory
 
 
 @prints_table
@@ -82,7 +82,7 @@ class PowerBalance(NamedTuple):
 
 @checked
 def power_balance(
-    mechanism: Mechanism, solution: Trajectory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+    mechanism: Mechanism, solution: StateHistory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
 ) -> PowerBalance:
     """Return the power of each driver, force element and joint along a motion, and the rates of the energies.
 

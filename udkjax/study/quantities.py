@@ -30,7 +30,7 @@ class Length:
 
 
 @dataclass(frozen=True)
-class Angle:
+class InitialAngle:
     """Gives bodies another initial angle (rad): see `with_angle`."""
 
     bodies: tuple[str, ...]

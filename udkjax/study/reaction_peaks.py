@@ -21,7 +21,7 @@ from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory, has_point
+from udkjax.study.channels import StateHistory, has_point
 
 UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_time="s", torque_time="s")
 
@@ -58,7 +58,7 @@ Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
 
 
 @checked
-def reaction_peaks(mechanism: Mechanism, solution: Trajectory, **choices: Any) -> Peaks:
+def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> Peaks:
     """Return the peaks and root mean squares of all reactions over a run.
 
     Args:
@@ -78,7 +78,7 @@ def reaction_peaks(mechanism: Mechanism, solution: Trajectory, **choices: Any) -
 
 
 @checked
-def pin_reactions(mechanism: Mechanism, solution: Trajectory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load at each pin on each body that meets there, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
 
     Where k bodies share a pin there are k - 1 joints, such as B, B-2: their loads on one body are added up.

@@ -15,7 +15,7 @@ from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory
+from udkjax.study.channels import StateHistory
 from udkjax.study.drive import Coordinate, value_of
 from udkjax.study.kinematics import Kinematics, kinematics
 
@@ -36,7 +36,7 @@ class Workspace(NamedTuple):
 
 
 @checked
-def transmission_angle(mechanism: Mechanism, motion: Trajectory, joint: str) -> Float[Array, "T"]:
+def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -> Float[Array, "T"]:
     """Return the angle (rad, 0 to pi) at a pin between the two links that it joins: acos(u . w / (|u| |w|)).
 
     u and w lead from the pin to the other pin of each link. At pi/2 force is passed on best, at 0 and pi not at all.

@@ -31,7 +31,7 @@ UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-
 
 
 class Given(NamedTuple):
-    """What is compiled for: a mechanism's phases, and the start and the choices of a run."""
+    """The arguments that code is compiled for: a mechanism's phases, and the start and the choices of a run."""
 
     phases: Phases
     events: tuple[Event, ...]

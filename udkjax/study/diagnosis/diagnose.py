@@ -8,7 +8,7 @@ from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory
+from udkjax.study.channels import StateHistory
 from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, Positions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
@@ -24,7 +24,7 @@ MOST_FIXES = 64  # of a cure, one after another
 def diagnose(
     mechanism: Mechanism,
     state: State | None = None,
-    solution: Trajectory | None = None,
+    solution: StateHistory | None = None,
     t: float = 0.0,
     rank_tol: float = STATIC_RANK_TOL,
     time_tol: float | None = None,

@@ -21,7 +21,7 @@ from udkjax.integrate import State, simulate
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Trajectory
+from udkjax.study.channels import StateHistory
 
 SAMPLES_PER_OUTPUT = 4  # samples from one output to the next, to look for minima
 PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated anew
@@ -55,7 +55,7 @@ class Timeline(NamedTuple):
         return self.singular_values[:, max(int(self.rank.max()) - 1, 0)] / self.singular_values[:, 0]
 
 
-def timeline(mechanism: Mechanism, solution: Trajectory, rank_tol: float, tol: float | None = None) -> Timeline:
+def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol: float | None = None) -> Timeline:
     """Follow the rank along a trajectory.
 
     Args:
@@ -123,7 +123,7 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 
 
 def _renew(
-    mechanism: Mechanism, analysis: Analysis, solution: Trajectory, ts: np.ndarray, low: float, high: float
+    mechanism: Mechanism, analysis: Analysis, solution: StateHistory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
     """Integrate the trajectory between two times anew, from the output before."""
     if not isinstance(solution, Solution):

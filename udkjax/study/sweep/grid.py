@@ -13,7 +13,7 @@ from udkjax.extras import OptionalImport
 from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
 from udkjax.scene.toml_text import parse_toml
 from udkjax.study.choices import CHOICES, Choice, choice
-from udkjax.study.quantities import Angle, Length, Scaled, Setter
+from udkjax.study.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped
 
 Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"
@@ -193,7 +193,7 @@ class _GridReader:
             return Length(self.names(f"{place}.length", given["length"]), given.get("as_rod", False) is True)
         if "angle" in given:
             self.check_keys(place, given, ("angle",))
-            return Angle(self.names(f"{place}.angle", given["angle"]))
+            return InitialAngle(self.names(f"{place}.angle", given["angle"]))
         return Scaled({name: self.number(f"{place}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
 
     def settings(self, given: Table) -> dict[str, Any]:

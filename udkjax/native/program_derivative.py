@@ -17,7 +17,7 @@ from udkjax.native.module import Module
 from udkjax.native.program import Place
 
 
-class Linearization:
+class ProgramDerivative:
     """One of the differentiable programs of a scene with its derivative, in a module."""
 
     stored: int
