@@ -65,5 +65,5 @@ def test_docstrings_are_sentences_with_a_subject():
 
 
 def test_a_docstring_without_a_subject_is_noticed():
-    text = 'def one():\n    """Whether it is."""\n\n\nclass Two:\n    """Thosely named."""\n\n    def f(self):\n        """As `one`."""'
-    assert without_subject(text) == ["Whether it is.", "As `one`."]
+    text = 'class One:\n    """Thosely."""\n    def f(self):\n        """As `g`."""\ndef g():\n    """Whether it is."""'
+    assert without_subject(text) == ["Whether it is.", "As `g`."]
