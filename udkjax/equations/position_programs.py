@@ -24,7 +24,7 @@ Model = Callable[..., dict[str, jax.Array]]
 
 
 class Sizes(NamedTuple):
-    """How many numbers a model takes and gives."""
+    """The counts of numbers that a model takes and gives."""
 
     parameters: int  # x
     coordinates: int  # q
@@ -33,7 +33,7 @@ class Sizes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where the value of a measure, its derivative by s and its first derivative by x are among the outputs."""
+    """The places of a measure, its derivative by s and its first derivative by x among the outputs."""
 
     value: int
     by_value: int
