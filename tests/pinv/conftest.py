@@ -1,36 +1,14 @@
 """Each method, and matrices with exactly known pseudoinverses."""
 
-import json
-from fractions import Fraction
-from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
 import pytest
 
+from tests.pinv.matrices import Exact, read_exact
 from tests.pinv.methods import METHODS, Entry
-
-
-class Exact(NamedTuple):
-    name: str
-    a: np.ndarray
-    plus: np.ndarray
-    rank: int
-    cond: float  # over the nonzero singular values
-
-
-def _read() -> list[Exact]:
-    def floats(rows):
-        return np.array([[float(Fraction(x)) for x in row] for row in rows])
-
-    path = Path(__file__).parents[1] / "data" / "pinv_test_matrices.json"
-    entries = json.loads(path.read_text()).items()
-    return [Exact(k, floats(e["A"]), floats(e["pinv"]), e["rank"], float(e["cond_eff"])) for k, e in entries]
 
 
 @pytest.fixture(scope="session")
 def exact() -> list[Exact]:
-    return _read()
+    return read_exact()
 
 
 @pytest.fixture(scope="session", params=METHODS, ids=lambda entry: entry.name)

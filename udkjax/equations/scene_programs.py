@@ -201,6 +201,21 @@ class ScenePrograms:
         psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
         return program(self.equation_terms.parts, self.rows("psi"), psi_dot)
 
+    @cached_property
+    def dense_accelerations(self) -> LoopProgram:
+        """What accelerations by a dense pseudoinverse take: psi_q of all rows, terms and root."""
+        return program(self.equation_terms.parts, self._terms.every_entry(), [self._root])
+
+    @cached_property
+    def dense_newton_q(self) -> LoopProgram:
+        """What a Newton step to Psi = 0 takes: psi_q and psi of all rows, and root."""
+        return program([self.sincos], self.rows("psi"))
+
+    @cached_property
+    def dense_newton_v(self) -> LoopProgram:
+        """What a Newton step to Psi_dot = 0 takes: psi_q of all rows, Psi_dot as psi, and root."""
+        return program([self.sincos], self.rows("psi_dot"))
+
     @property
     def sincos(self) -> KernelLoop:
         """The sines and cosines of a state."""
@@ -208,13 +223,17 @@ class ScenePrograms:
 
     def rows(self, residual: str) -> list[KernelLoop | Reset]:
         """Psi_q, Psi or Psi_dot as psi, of all rows, and root, M^(-1/2); of a state whose sines are known."""
-        terms = self._terms
+        return [*self._terms.every_entry(), *self._terms.row_terms(residual, "psi"), self._root]
+
+    @property
+    def _root(self) -> KernelLoop:
+        """M^(-1/2)."""
 
         def write(w: KernelWriter):
             for k in range(3):
                 w.write(w.graph.sqrt(compliance(w, k)), "root", BODY_COORDINATES, k)
 
-        return [*terms.every_entry(), *terms.row_terms(residual, "psi"), terms.over_bodies("root", write)]
+        return self._terms.over_bodies("root", write)
 
     @cached_property
     def pieces(self) -> LoopProgram:

@@ -15,6 +15,8 @@ from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
 from udkjax.expressions.loop_program import LoopProgram
 from udkjax.expressions.unroll import Arrays, unroll
 
+WITH_ENTRIES = ("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v")  # programs that return Psi_q
+
 Place = tuple[str, int]  # a number of an array: the array, and its place there
 
 
@@ -62,7 +64,7 @@ class WrittenOut:
         layout = unroll(programs.prologue, {"numbers": dict(enumerate(self.numbers))}, graph)["constants"]
         self._arrays: Arrays = {"constants": layout, **state}
         self._results = {
-            name: _entries(self._unroll(getattr(programs, name)), (*RESULTS, "psi_q") if name == "rows_and_loads" else RESULTS)
+            name: _entries(self._unroll(getattr(programs, name)), (*RESULTS, "psi_q") if name in WITH_ENTRIES else RESULTS)
             for name in names
         }
         moved = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])

@@ -23,6 +23,7 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.operations import RunStates, Tableau
 from udkjax.native.primitive import unsupported
+from udkjax.native.pseudoinverses import dense_method
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.identity_cache import cached_by_identity
@@ -65,9 +66,9 @@ class CompiledMechanism(eqx.Module):
 
     @property
     def independent_row_count(self) -> int:
-        """The number of rows that elimination takes."""
+        """The number of rows that the method takes."""
         equations: Any = self.equations
-        return len(equations.scales.rows) - len(equations.redundant or ())
+        return len(equations.scales.rows) - len((equations.redundant or ()) if eliminates(equations.method) else ())
 
 
 def compile_mechanism(
@@ -121,8 +122,8 @@ def _reason_for_diffrax(
         return "a progress meter is diffrax's"
     if type(equations) is not TextbookEquations:
         return f"it knows the Udwadia-Kalaba equation of a mechanism, not {type(equations).__name__}"
-    if not isinstance(equations.method, Auto | Elimination):
-        return f"it eliminates, and {type(equations.method).__name__} was asked for"
+    if not eliminates(equations.method) and dense_method(equations.method) is None:
+        return f"it does not know the pseudoinverse {type(equations.method).__name__}"
     if isinstance(equations.method, Auto) and equations.redundant is None:
         return "which rows are redundant is not known"
     if not is_explicit(solver):
@@ -132,6 +133,11 @@ def _reason_for_diffrax(
     if not jax.config.jax_enable_x64:
         return "it computes in float64, which JAX is told not to"
     return ""
+
+
+def eliminates(method: Pseudoinverse) -> bool:
+    """Return whether a method eliminates rows, and leaves out those that are redundant."""
+    return isinstance(method, Auto | Elimination)
 
 
 def _run_operation(
@@ -145,10 +151,11 @@ def _run_operation(
         projected=projected,
         breaks=breakpoints is not None or any(map(has_pieces, elements)),
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
+        pseudoinverse=dense_method(equations.method),
     )
 
 
 def _programs(equations: TextbookEquations) -> ScenePrograms:
     """Return the programs of a scene: with pivots that are refused, where the method falls back on a rank-revealing one."""
-    policy = RankPolicy.DROP if isinstance(equations.method, Elimination) else RankPolicy.REFUSE
+    policy = RankPolicy.REFUSE if isinstance(equations.method, Auto) else RankPolicy.DROP
     return scene_programs(equations.mechanism, equations.redundant or (), equations.baumgarte is not None, policy)

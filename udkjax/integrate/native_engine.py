@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.integrate.compiled_mechanism import CompiledMechanism
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.layout import INFO, OUTPUTS
@@ -146,8 +147,10 @@ def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleTyp
     equations: Any = compiled.equations
     method, samples = equations.method, compiled.samples
     rank_tol = method.rank_tol
-    safe_tol = method.branch_tol if isinstance(method, Auto) else rank_tol**2
-    fallback_tol = FALLBACK_RANK_SHARE * rank_tol
+    # Elimination, by which derivatives of all methods are taken, has relative thresholds.
+    relative_tol = rank_tol if method.relative else rank_tolerance(equations.mechanism)
+    safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
+    fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
     drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
     numbers = samples.stand_in(equations.mechanism), equations.baumgarte
     further = [samples.rows(xp)] if samples.samples else []

@@ -43,6 +43,7 @@ class Plan:
     written_out: bool  # programs are written out, or loops
     steps: bool = True  # it integrates
     sampled: tuple[int, ...] = ()  # places of the numbers of the scene that have samples
+    pseudoinverse: Any = None  # the `DenseMethod` that solves; None: elimination
 
 
 @dataclass

@@ -45,6 +45,7 @@ def write_begin(module: Module):
         rows = module.member_address(f, call, "rows", member)
         with f.each(module.m) as i:
             put("rows", f.load(rows, i), i)
+        module.begin_rows(f, k, settings["length"])
     ts = module.member_address(f, call, "ts", member)
     times = f.load(call, module.call_fields.index("times"), base=INT)
     start, end = f.load(ts), f.load(ts, times - 1)
@@ -131,6 +132,7 @@ def write_run(module: Module):
     with f.each(size) as i:
         f.store(0.0, work, i)
     f.store(call, work, module.places["call"] * width, base=POINTER)
+    module.begin_memory(f)
     blocks = [block, *module.allocate_memory(f, call)]
     for name in ("length", "omega", "rtol", "atol", "smallest"):  # of lanes that stay empty
         setattr(s, name, f.const(1.0, DOUBLE, width))

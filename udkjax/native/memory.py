@@ -20,6 +20,7 @@ class Memory:
     places: Layout
     tangents: Layout  # of one direction of a derivative
     n: int  # coordinates
+    m: int  # rows of Psi
     rowcount: int  # registers that they take
     stage_accelerations: list[str]
 
@@ -74,7 +75,7 @@ class Memory:
     def total(self, f: Function, x: Value) -> Value:
         name = f"llvm.vector.reduce.fadd.v{x.width}f64"
         f.declared.add(f"declare double @{name}(double, {x.type})")
-        return f.op(f"call double @{name}(double {f.const(0.0).name}, {x.type} {x.name})", DOUBLE)
+        return f.op(f"call reassoc double @{name}(double {f.const(0.0).name}, {x.type} {x.name})", DOUBLE)
 
     def address(self, f: Function, name: str) -> Value:
         return f.at(f.given["work"], self.places[name] * self.plan.width)

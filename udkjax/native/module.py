@@ -43,6 +43,7 @@ class Module(Memory):
         if plan.sampled:
             self.inputs = ("samples", *self.inputs)
         self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small to be trusted
+        self.is_dense = plan.pseudoinverse is not None and m > 0
         self.pieces = code.piece_count if plan.breaks else 0
         self.programs = {name: getattr(code, name) for name in self.program_names()}
         self.written_out = WrittenOut(code, list(self.programs), differentiated, active, reverse) if plan.written_out else None
@@ -85,6 +86,8 @@ class Module(Memory):
             p.add("numbers", -(-code.number_count // plan.width))
         if not self.written_out:
             self._add_arrays("", code.scratch)
+        if self.is_dense and "root" not in p.places:
+            self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.written_out else {}))
         if self.falls_back:
             self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
             if self.written_out:
@@ -114,14 +117,23 @@ class Module(Memory):
 
     # --- programs
 
+    @property
+    def solving(self) -> list[str]:
+        """The names of the functions that the module calls to solve: programs by elimination, or dense equations."""
+        if not self.plan.projected:
+            return ["accelerations"]
+        of_step = ["project_and_accelerate", "tangent_part"] if self.method.ends else ["end_of_step"]
+        return ["accelerations", "newton_q", *of_step, "newton_v_and_psi", "project"]
+
     def program_names(self) -> list[str]:
         """The names of the scene's programs that the module calls."""
-        names = ["accelerations", "equation_terms", "psi"]
+        names = ["equation_terms", "psi"]
         if self.pieces:
             names.append("pieces")
-        if self.plan.projected:
-            of_step = ["project_and_accelerate", "tangent_part"] if self.method.ends else ["end_of_step"]
-            names += ["newton_q", *of_step, "newton_v_and_psi", "project"]
+        if self.is_dense:
+            names += ["dense_accelerations", *(["dense_newton_q", "dense_newton_v", "psi_dot"] if self.plan.projected else [])]
+        else:
+            names += self.solving
         if self.falls_back and self.plan.written_out:
             names.append("rows_and_loads")
         return names
@@ -146,6 +158,8 @@ class Module(Memory):
             named |= {x: x for x in self.code.scratch}
         elif self.falls_back:
             named |= {x: x for x in ("psi_q", "psi_dot", "root")}
+        if self.is_dense:
+            named |= {x: x for x in ("psi_q", "root")}
         return {x: ("work", self.places[place]) for x, place in named.items()}
 
     def write_programs(self):
@@ -172,7 +186,16 @@ class Module(Memory):
         lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers}
         inputs, outputs = find(program.inputs), find(program.outputs)
         self.functions.append(
-            write(program.program, name, width or self.plan.width, pointers, inputs, outputs, name in COLD, lanes)
+            write(
+                program.program,
+                name,
+                width or self.plan.width,
+                pointers,
+                inputs,
+                outputs,
+                name in COLD and not self.is_dense,
+                lanes,
+            )
         )
 
     def write_prologue(self, name: str, written_out: WrittenOut | None):
@@ -188,7 +211,7 @@ class Module(Memory):
         return [("work", self.places[name] + k) for k in range(count)]
 
     def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
-        f = Function(name, arguments, self.plan.width, cold=name in COLD)
+        f = Function(name, arguments, self.plan.width, cold=name in COLD and not self.is_dense)
         self.functions.append(f)
         return f, Lane(f, self.places)
 
@@ -203,6 +226,12 @@ class Module(Memory):
 
     def record_output(self, f: Function, s: Lane):
         """Hook: called with a state between steps (`state t`, `state q`, `result v`) of lanes that are `due`."""
+
+    def begin_memory(self, f: Function):
+        """Hook: called once a run, with all memory zero; does nothing by default."""
+
+    def begin_rows(self, f: Function, lane: Value, length: Value):
+        """Hook: called once the scales of the rows of a member are in its lane; does nothing by default."""
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         """Hook: called with a member that is taken into a lane; does nothing by default."""

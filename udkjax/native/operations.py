@@ -18,6 +18,7 @@ from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS, Plan
 from udkjax.native.marching import Marching
 from udkjax.native.module import Module
+from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.record import STORED, record_length
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
@@ -88,6 +89,7 @@ class RunStates(Operation):
     projected: bool
     breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
     sampled: tuple[int, ...] = ()  # places of the numbers that have samples
+    pseudoinverse: DenseMethod | None = None  # None: elimination
 
     def plan(self, width: int, vector: int) -> Plan:
         """Return what the module's code depends on."""
@@ -100,6 +102,7 @@ class RunStates(Operation):
             vector=vector,
             written_out=self.code.is_small,
             sampled=self.sampled,
+            pseudoinverse=self.pseudoinverse,
         )
 
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":

@@ -16,14 +16,15 @@ The functions of one module, all of them on one piece of memory (`Layout`): `run
 `decide` (whether it counts, and the next), `outputs` (states between steps).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from udkjax.native.breakpoints import aim
 from udkjax.native.controller import write_decide
+from udkjax.native.dense_equations import DenseEquations
 from udkjax.native.dense_output import write_between, write_differences, write_outputs
 from udkjax.native.fallback import write_fallback
-from udkjax.native.ir import DOUBLE, Function
-from udkjax.native.layout import Lane
+from udkjax.native.ir import DOUBLE, Function, Value
+from udkjax.native.layout import Lane, Plan
 from udkjax.native.members import write_begin, write_finish, write_run
 from udkjax.native.module import Module
 from udkjax.native.pieces import write_leave
@@ -34,6 +35,23 @@ from udkjax.native.steps import RUNNING
 
 class Trajectory(Module):
     """The code of whole trajectories."""
+
+    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = (), reverse: bool = False):
+        super().__init__(plan, differentiated, active, reverse)
+        self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
+
+    def write_programs(self):
+        super().write_programs()
+        if self.dense:
+            self.dense.write()
+
+    def begin_memory(self, f: Function):
+        if self.dense:
+            self.dense.number_columns(f)
+
+    def begin_rows(self, f: Function, lane: Value, length: Value):
+        if self.dense:
+            self.dense.begin_member(f, lane, length)
 
     def text(self) -> str:
         """LLVM's text of the whole module."""

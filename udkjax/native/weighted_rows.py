@@ -12,11 +12,10 @@ from udkjax.native.module import Module
 _ENTRIES, _FACTORS = "@entries", "@factors"
 
 
-class WeightedRows:
-    """The rows of a module, with the tables of the entries of Psi_q among its constants."""
+class RowEntries:
+    """The entries of Psi_q, with their tables among the constants of a module."""
 
     def __init__(self, module: Module):
-        self._module = module
         rows, columns, places, factors = module.code.psi_q_entries
         self._count = len(rows)
         entries = ", ".join(f"i64 {x}" for entry in zip(rows, columns, places, strict=True) for x in entry)
@@ -27,14 +26,22 @@ class WeightedRows:
         ):
             if line not in module.loops.globals:
                 module.loops.globals.append(line)
-        if all(f.name != LEAST_NORM for f in module.functions):
-            module.functions.append(least_norm())
 
     def entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
         """Run the block for each entry of Psi_q: its row, its column, its place in `psi_q`, and the factor of what is there."""
         with f.each(self._count) as e:
             row, column, place = (f.load(Value(f, _ENTRIES, POINTER), e * 3 + j, base=INT) for j in range(3))
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
+
+
+class WeightedRows(RowEntries):
+    """The rows of a module, one lane at a time."""
+
+    def __init__(self, module: Module):
+        super().__init__(module)
+        self._module = module
+        if all(f.name != LEAST_NORM for f in module.functions):
+            module.functions.append(least_norm())
 
     def weight(self, f: Function, row: Value, lane: Operand = 0) -> Value:
         """Return the weight of a row."""

@@ -1,0 +1,140 @@
+"""The pseudoinverses in machine code are those of `udkjax.pinv`: the same ranks, and D^+ b to rounding, in every lane."""
+
+import ctypes
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from tests.pinv.matrices import read_exact
+from udkjax import pinv
+from udkjax.native import machine
+from udkjax.native.ir import POINTER, Function
+from udkjax.native.layout import Layout
+from udkjax.native.memory import Memory
+from udkjax.native.pseudoinverses import dense_method
+from udkjax.native.pseudoinverses.dense import Dense, DenseLayout
+
+METHODS = {
+    "SVD": pinv.SVD,
+    "Varga": pinv.Varga,
+    "Householder": pinv.Householder,
+    "GramSchmidt": pinv.GramSchmidt,
+    "GramSchmidt once": lambda *a, **k: pinv.GramSchmidt(*a, **k, twice=False),
+    "Greville": pinv.Greville,
+}
+
+
+class Solver(Memory):
+    """One method on (m, n) matrices in so many lanes."""
+
+    def __init__(self, method, m, n, width):
+        self.plan = SimpleNamespace(width=width, vector=machine.lanes())
+        self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
+        self.places.add("fallback_tol")
+        layout = DenseLayout(self, dense_method(method))
+        functions = []
+        for name in ("index", "factor", "solve"):
+            f = Function(name, [(POINTER, "work")], width)
+            d = Dense(layout, f)
+            if name == "index":
+                d.number_columns()
+            else:
+                getattr(dense_method(method), name)(d)
+            functions.append(f)
+        declared = sorted(set().union(*(f.declared for f in functions)))
+        text = "\n".join([*declared, *(f.text() for f in functions)])
+        self._library = machine.library(text, ["index", "factor", "solve"])
+        self._layout = layout
+
+    def _view(self, memory, name):
+        """The entries of a matrix, (rows, columns, lanes)."""
+        rows, columns = self._layout.shapes[name]
+        width, start = self.plan.width, self.places[f"dense {name}"] * self.plan.width
+        stride = self._layout.registers[name] * self.plan.vector
+        return memory[start : start + rows * stride].reshape(rows, -1, width)[:, :columns]
+
+    def __call__(self, matrices, right, tols):
+        """x and the ranks, of as many matrices as there are lanes."""
+        size = self.places.size * self.plan.width
+        memory = np.zeros(size + 8)
+        memory = memory[(-memory.ctypes.data // 8) % 8 :][:size]
+        memory[: self.plan.width] = tols
+        self._view(memory, "D")[:] = np.moveaxis(matrices, 0, -1)
+        self._view(memory, "b")[0] = np.moveaxis(right, 0, -1)
+        for name in ("index", "factor", "solve"):
+            machine.function(self._library[name], ctypes.c_void_p)(memory.ctypes.data)
+        return np.moveaxis(self._view(memory, "x")[0], -1, 0), self._view(memory, "rank")[0, 0]
+
+
+def solved(make, matrices, right, tols, width, relative=True):
+    """By machine code, in groups of lanes; the last one is filled up."""
+    method = make(1.0, relative=relative)
+    solver, found, ranks = Solver(method, *matrices.shape[1:], width), [], []
+    for k in range(0, len(matrices), width):
+        chosen = np.minimum(np.arange(k, k + width), len(matrices) - 1)
+        x, rank = solver(matrices[chosen], right[chosen], np.broadcast_to(tols, len(matrices))[chosen])
+        found.append(x)
+        ranks.append(rank)
+    return np.concatenate(found)[: len(matrices)], np.concatenate(ranks)[: len(matrices)]
+
+
+def plain(make, matrices, right, tols, relative=True):
+    of = jax.jit(jax.vmap(lambda D, b, tol: tuple(make(tol, relative=relative).solve(D, b))))
+    return [np.asarray(x) for x in of(matrices, right, jnp.broadcast_to(jnp.asarray(tols), len(matrices)))]
+
+
+def random_matrices(m, n, ranks, seed=0):
+    random = np.random.default_rng(seed)
+    found = []
+    for rank in ranks:
+        u, v = (np.linalg.qr(random.standard_normal((k, k)))[0] for k in (m, n))
+        found.append((u[:, :rank] * random.uniform(0.5, 2.0, rank)) @ v[:rank])
+    return np.array(found), random.standard_normal((len(ranks), m))
+
+
+@pytest.mark.parametrize("width", [1, machine.lanes()])
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("m, n", [(12, 12), (5, 20), (9, 5), (3, 1)])
+def test_every_lane_has_a_rank_of_its_own(name, m, n, width):
+    """Right-hand sides are not consistent: where the rank falls these are least-squares solutions of least norm."""
+    ranks = [k % (min(m, n) + 1) for k in range(min(m, n), 2 * min(m, n) + 9)]
+    matrices, right = random_matrices(m, n, ranks)
+    x, found = solved(METHODS[name], matrices, right, 1e-6, width)
+    assert_array_equal(found, ranks)
+    assert_allclose(x, [np.linalg.pinv(D, rcond=1e-6) @ b for D, b in zip(matrices, right, strict=True)], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_exact_matrices(name):
+    """Errors of D^+ are those that the plain form promises: eps cond(D), or its square."""
+    make = METHODS[name]
+    power = 2 if name in ("Greville", "GramSchmidt once") else 1
+    eps = np.finfo(float).eps
+    for matrix in read_exact():
+        if matrix.cond**power * eps * 100 > 1 or (name == "Greville" and matrix.cond > 0.3 * eps ** (-1 / 3)):
+            continue
+        m = len(matrix.a)
+        tol = eps ** (1 / 3) if name == "Greville" else 1e-12 if matrix.cond < 1e11 else 0.0
+        matrices, right = np.broadcast_to(matrix.a, (m, *matrix.a.shape)), np.eye(m)
+        x, rank = solved(make, matrices, right, tol, machine.lanes())
+        bound = 100 * eps * matrix.cond**power * np.linalg.norm(matrix.plus)
+        assert_array_equal(rank, matrix.rank, err_msg=matrix.name)
+        assert np.linalg.norm(x.T - matrix.plus) <= bound, matrix.name
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("relative", [True, False])
+def test_thresholds_meet_the_same_scale(name, relative):
+    """Of rows whose lengths fall by tenths: ranks as the plain form finds them, at thresholds between."""
+    lengths = 10.0 ** -np.arange(5)
+    matrices = np.array([np.diag(lengths) * 3.0] * 7)
+    right, tols = np.ones((7, 5)), np.array([3e-1, 0.05, 3e-2, 5e-3, 3e-4, 1e-5, 4.0]) * (1.0 if relative else 1.7)
+    x, rank = solved(METHODS[name], matrices, right, tols, machine.lanes(), relative)
+    reference, expected = plain(METHODS[name], matrices, right, tols, relative)
+    assert len(set(expected)) > 4
+    assert_array_equal(rank, expected)
+    assert_allclose(x, reference, rtol=1e-12)

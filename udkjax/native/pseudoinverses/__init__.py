@@ -1,0 +1,30 @@
+"""Machine code of the pseudoinverses of `udkjax.pinv`: D^+ b of a dense D, each by the algorithm of its class there.
+
+`dense` has matrices in the memory of a run, one of each lane: rows of whole registers, with the few operations that all methods
+are made of. A method says what arrays it needs, how D becomes factors, and how these solve. Each lane has pivots and a rank of
+its own: what differs between lanes is chosen, as everywhere in machine code.
+"""
+
+from udkjax import pinv
+from udkjax.native.pseudoinverses.dense import DenseMethod
+from udkjax.native.pseudoinverses.gram_schmidt import GramSchmidt
+from udkjax.native.pseudoinverses.greville import Greville
+from udkjax.native.pseudoinverses.householder import Householder
+from udkjax.native.pseudoinverses.svd import SVD
+from udkjax.native.pseudoinverses.varga import Varga
+
+METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
+    pinv.SVD: SVD,
+    pinv.Varga: Varga,
+    pinv.Greville: Greville,
+    pinv.Householder: Householder,
+    pinv.GramSchmidt: GramSchmidt,
+}
+
+
+def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
+    """Return the machine code of a pseudoinverse; None where there is none."""
+    kind = METHODS.get(type(method))
+    if kind is None:
+        return None
+    return GramSchmidt(method.relative, method.twice) if isinstance(method, pinv.GramSchmidt) else kind(method.relative)

@@ -1,0 +1,221 @@
+"""Dense matrices in the memory of a run, one of each lane, and the operations on their rows.
+
+The entries of a row lie behind one another, each in all lanes, and fill whole registers; what fills up the last one is zero. So
+an operation on rows is one on registers: of one member they hold several columns, of W members side by side one column of each.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from udkjax.native.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
+from udkjax.native.memory import Memory
+
+UNROLLED = 16  # registers of a row up to which operations on it are written out; of longer ones, as many a round
+SUMS = 4  # independent partial sums of a scalar product: as many as hide the latency of an addition
+
+
+@dataclass(frozen=True)
+class DenseMethod(ABC):
+    """A pseudoinverse as machine code: what it stores, how it factorizes D and how it solves D x = b by that.
+
+    `relative`: whether the threshold of the rank is relative to the method's scale of D.
+    """
+
+    relative: bool
+
+    @abstractmethod
+    def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
+        """Return the rows and columns of the matrices that it stores besides D (m, n), by name."""
+
+    @abstractmethod
+    def factor(self, d: "Dense") -> None:
+        """Write how factors are made of D, which is overwritten."""
+
+    @abstractmethod
+    def solve(self, d: "Dense") -> None:
+        """Write how the row `x` becomes D^+ b of the row `b`, which is overwritten."""
+
+
+class DenseLayout:
+    """The matrices of a method in the memory of a module."""
+
+    def __init__(self, module: Memory, method: DenseMethod):
+        self.module = module
+        m, n = module.m, module.n
+        shapes = {"D": (m, n), "b": (1, m), "x": (1, n), "index": (1, max(m, n)), **method.matrices(m, n)}
+        self.shapes, self.registers, vector, width = shapes, {}, module.plan.vector, module.plan.width
+        for name, (rows, columns) in shapes.items():
+            self.registers[name] = -(-columns * width // vector)
+            module.places.add(f"dense {name}", rows * self.registers[name] * max(vector // width, 1))
+
+
+class Row:
+    """A row of a matrix, by its address: so many registers."""
+
+    def __init__(self, d: "Dense", address: Value, registers: int):
+        self._d, self.address, self.registers = d, address, registers
+
+    def __getitem__(self, r: Operand) -> Value:
+        d = self._d
+        return d.f.load(self.address, d.f.like(r, INT, 1) * d.vector if isinstance(r, Value) else r * d.vector, d.vector)
+
+    def __setitem__(self, r: Operand, x: Value):
+        d = self._d
+        d.f.store(x, self.address, d.f.like(r, INT, 1) * d.vector if isinstance(r, Value) else r * d.vector, d.vector)
+
+    def entry(self, j: Operand) -> Value:
+        """One entry, in all lanes."""
+        f = self._d.f
+        return f.load(self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
+
+    def put(self, j: Operand, x: Operand):
+        """Store one entry, in all lanes."""
+        f = self._d.f
+        f.store(x, self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
+
+    def at(self, places: Value) -> Value:
+        """The entries at places that differ from lane to lane."""
+        f = self._d.f
+        if f.width == 1:
+            return f.load(self.address, places)
+        found = Value(f, "poison", DOUBLE, f.width)
+        for k in range(f.width):
+            x = f.load(self.address, self._place(places, k))
+            found = f.op(f"insertelement {found.type} {found.name}, double {x.name}, i64 {k}", DOUBLE, f.width)
+        return found
+
+    def put_at(self, places: Value, x: Value):
+        """Store entries at places that differ from lane to lane."""
+        f = self._d.f
+        if f.width == 1:
+            f.store(x, self.address, places)
+            return
+        for k in range(f.width):
+            f.store(f.lane(x, f.const(k, INT)), self.address, self._place(places, k))
+
+    def _place(self, places: Value, k: int) -> Value:
+        f = self._d.f
+        return f.lane(places, f.const(k, INT)) * f.width + k
+
+    def clear(self):
+        def put_zero(r: Operand):
+            self[r] = self._d.register(0.0)
+
+        self._d.over_registers(self.registers, put_zero)
+
+
+class Dense:
+    """The matrices of a method in one function, which has the arguments `work`."""
+
+    def __init__(self, layout: DenseLayout, f: Function):
+        self.layout, self.f, self.module = layout, f, layout.module
+        self.m, self.n, self.vector = self.module.m, self.module.n, self.module.plan.vector
+        self.steps = min(self.m, self.n)
+
+    # --- numbers of each lane
+
+    def wide(self, x: float) -> Value:
+        """The same number in all lanes."""
+        return self.f.const(x, DOUBLE, self.f.width)
+
+    def register(self, x: float) -> Value:
+        """A register of the same number."""
+        return self.f.const(x, DOUBLE, self.vector)
+
+    def spread(self, x: Value) -> Value:
+        """A number of each lane, to go with registers."""
+        return self.module.broadcast(self.f, x)
+
+    def number(self, k: Value) -> Value:
+        """A whole number as a number in all lanes."""
+        return self.f.like(k, DOUBLE, self.f.width)
+
+    def whole(self, x: Value) -> Value:
+        """Numbers as places."""
+        return self.f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width)
+
+    def sqrt(self, x: Value) -> Value:
+        return self.f.intrinsic("sqrt", x)
+
+    @property
+    def tol(self) -> Value:
+        """The threshold of the rank."""
+        return self.f.load(self.f.given["work"], self.module.places["fallback_tol"] * self.f.width, self.f.width)
+
+    def threshold(self, method: DenseMethod, square_of_scale: Value) -> Value:
+        """Return the square of the threshold, from that of the method's scale of D."""
+        tol = self.tol
+        return tol * tol * square_of_scale if method.relative else tol * tol
+
+    # --- rows
+
+    def number_columns(self):
+        """Store the numbers of columns, which nothing changes."""
+        row = self.row("index")
+        with self.f.each(self.layout.shapes["index"][1]) as j:
+            row.put(j, self.number(j))
+
+    def row(self, name: str, i: Operand = 0) -> Row:
+        """Return row i of a matrix."""
+        f, registers = self.f, self.layout.registers[name]
+        start, stride = self.module.places[f"dense {name}"] * f.width, registers * self.vector
+        place = f.like(i, INT, 1) * stride + start if isinstance(i, Value) else int(i) * stride + start
+        return Row(self, f.at(f.given["work"], place), registers)
+
+    def over_registers(self, registers: int, do: Callable[[Operand], None]):
+        """Do something with each register of a row: written out, or in rounds of several."""
+        f = self.f
+        if registers <= UNROLLED:
+            for r in range(registers):
+                do(r)
+            return
+        rounds = registers // UNROLLED
+        with f.each(rounds) as k:
+            first = k * UNROLLED
+            for r in range(UNROLLED):
+                do(first + r)
+        for r in range(rounds * UNROLLED, registers):
+            do(r)
+
+    def sum(self, registers: int, term: Callable[[Operand, Value], Value]) -> Value:
+        """Add up over registers, and of one member over what they hold: `term(r, sum)` is the sum with a register's share."""
+        f, totals = self.f, [self.register(0.0)] * min(SUMS, registers)
+        if registers <= UNROLLED:
+            for r in range(registers):
+                totals[r % len(totals)] = term(r, totals[r % len(totals)])
+        else:
+            variables = [f.variable(0.0, width=self.vector) for _ in range(SUMS)]
+            rounds = registers // SUMS
+            with f.each(rounds) as k:
+                for j, variable in enumerate(variables):
+                    variable.value = term(k * SUMS + j, variable.value)
+            totals = [variable.value for variable in variables]
+            for j, r in enumerate(range(rounds * SUMS, registers)):
+                totals[j] = term(r, totals[j])
+        while len(totals) > 1:
+            totals = [a + b for a, b in zip(totals[::2], totals[1::2], strict=False)] + totals[len(totals) & ~1 :]
+        return totals[0] if f.width > 1 else self.module.total(f, totals[0])
+
+    def dot(self, a: Row, b: Row) -> Value:
+        """The scalar product of two rows, of each lane."""
+        return self.sum(a.registers, lambda r, total: self.f.fma(a[r], b[r], total))
+
+    def axpy(self, factor: Value, x: Row, y: Row):
+        """Add a multiple of the row x to the row y."""
+        wide = self.spread(factor)
+
+        def add(r: Operand):
+            y[r] = self.f.fma(wide, x[r], y[r])
+
+        self.over_registers(y.registers, add)
+
+    def largest(self, row: Row, count: int) -> Value:
+        """The largest of the first entries of a row."""
+        worst = self.f.variable(0.0)
+        with self.f.each(count) as j:
+            worst.value = self.f.max(row.entry(j), worst.value)
+        return worst.value
+
+    def yes(self) -> Value:
+        return self.f.const(True, BOOL, self.f.width)

@@ -1,0 +1,57 @@
+"""D^+ by Greville's recursion, one row at a time (`udkjax.pinv.Greville`)."""
+
+from dataclasses import dataclass
+
+from udkjax.native.ir import Operand
+from udkjax.native.pseudoinverses.dense import Dense, DenseMethod
+
+
+@dataclass(frozen=True)
+class Greville(DenseMethod):
+    """The columns of D^+ are rows of `plus`; each row of D adds one, and corrects those before."""
+
+    def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
+        return {"plus": (m, n), "d": (1, m), "c": (1, n), "rank": (1, 1)}
+
+    def factor(self, d: Dense):
+        f, along, c = d.f, d.row("d"), d.row("c")
+        scale = f.variable(0.0)
+        with f.each(d.m) as i:
+            row = d.row("D", i)
+            scale.value = f.max(d.dot(row, row), scale.value)
+        threshold, rank = f.variable(d.threshold(self, scale.value)), f.variable(0.0)
+        with f.each(d.m) as i:
+            row, found = d.row("D", i), d.row("plus", i)
+
+            def copy(r: Operand):
+                c[r] = row[r]
+
+            d.over_registers(c.registers, copy)
+            length = f.variable(0.0)
+            with f.each(i) as j:
+                part = d.dot(row, d.row("plus", j))
+                along.put(j, part)
+                length.value = f.fma(part, part, length.value)
+                d.axpy(-part, d.row("D", j), c)
+            square = d.dot(c, c)
+            is_independent = square > threshold.value
+            rank.value = rank.value + f.select(is_independent, d.wide(1.0), 0.0)
+            share = d.spread(f.select(is_independent, 1.0 / f.select(is_independent, square, 1.0), 0.0))
+
+            def take(r: Operand):
+                found[r] = c[r] * share
+
+            d.over_registers(found.registers, take)
+            with f.if_(f.any_of(~is_independent)):
+                share = f.select(is_independent, 0.0, 1.0 / (length.value + 1.0))
+                with f.each(i) as j:
+                    d.axpy(along.entry(j) * share, d.row("plus", j), found)
+            with f.each(i) as j:
+                d.axpy(-along.entry(j), found, d.row("plus", j))
+        d.row("rank").put(0, rank.value)
+
+    def solve(self, d: Dense):
+        x = d.row("x")
+        x.clear()
+        with d.f.each(d.m) as i:
+            d.axpy(d.row("b").entry(i), d.row("plus", i), x)

@@ -1,0 +1,103 @@
+"""D^+ by Householder's QR: a basic solution, freed of its part in the null space (`udkjax.pinv.Householder`)."""
+
+from dataclasses import dataclass
+
+from udkjax.native.ir import INT, Operand, Value
+from udkjax.native.pseudoinverses.dense import Dense, DenseMethod
+from udkjax.native.pseudoinverses.qr import (
+    apply_q_transposed,
+    apply_reflector,
+    pivoted_qr,
+    qr_matrices,
+    reflect_row,
+    reversed_each,
+)
+
+
+@dataclass(frozen=True)
+class Householder(DenseMethod):
+    """D = Q T G, with T of the pivot columns of R and G = T^(-1) R: rows e_f - sum_i G_if e_(pivot i) span the null space of D.
+
+    The basic solution solves T; reflections of the null space's basis then take out its part along that.
+    """
+
+    def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
+        steps = min(m, n)
+        return qr_matrices(m, n) | {
+            "triangle": (steps, steps),
+            "inverse": (1, steps),
+            "y": (1, steps),
+            "null": (n, n),
+            "z": (n, n),
+            "tau_z": (1, n),
+            "free": (1, 1),
+        }
+
+    def factor(self, d: Dense):
+        f = d.f
+        pivoted_qr(d, lambda scale: d.threshold(self, scale))
+        rank = f.variable(d.row("rank").entry(0))
+        with reversed_each(d, d.steps) as i:  # D becomes G
+            counts = d.number(i) < rank.value
+            row, triangle = d.row("D", i), d.row("triangle", i)
+            triangle.clear()
+            inverse = f.select(counts, 1.0 / f.select(counts, d.row("diagonal").entry(i), 1.0), 0.0)
+            d.row("inverse").put(i, inverse)
+            with f.each(d.steps, i + 1) as j:
+                entry = row.at(d.whole(d.row("order").entry(j)))
+                inside = d.number(j) < rank.value
+                triangle.put(j, f.select(inside, entry, 0.0))
+            with f.each(d.steps, i + 1) as j:
+                d.axpy(-triangle.entry(j), d.row("D", j), row)
+            wide = d.spread(inverse)
+
+            def scale(r: Operand):
+                row[r] = row[r] * wide
+
+            d.over_registers(row.registers, scale)
+        self._reflect_null_space(d, d.wide(float(d.n)) - rank.value)
+
+    def _reflect_null_space(self, d: Dense, free: Value):
+        """Reflect the basis of the null space to the first coordinates, one vector after another: one for each free column."""
+        f = d.f
+        d.row("free").put(0, free)
+        column = f.variable(-1.0)
+        with f.each(self._count(d)) as k:
+            is_there = d.number(k) < d.row("free").entry(0)
+            following = f.variable(0.0)
+            with reversed_each(d, d.n) as j:
+                number = d.number(j)
+                following.where((d.row("unused").entry(j) > 0.5) & (number > column.value), number)
+            column.value = following.value
+            place, vector = d.whole(column.value), d.row("null", k)
+            vector.clear()
+            with f.each(d.steps) as i:
+                vector.put_at(d.whole(d.row("order").entry(i)), -d.row("D", i).at(place))
+            vector.put_at(place, f.select(is_there, d.wide(1.0), 0.0))
+            with f.each(k) as j:
+                apply_reflector(d, "z", "tau_z", j, "null", k)
+            reflect_row(d, "null", k, is_there, "z", "tau_z")
+
+    def _count(self, d: Dense) -> Value:
+        """The largest number of free columns of any lane."""
+        found = d.row("free").entry(0)
+        return d.whole(found if d.f.width == 1 else d.f.reduce("fmax", found))
+
+    def solve(self, d: Dense):
+        f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
+        apply_q_transposed(d)
+        x.clear()
+        y.clear()
+        with reversed_each(d, d.steps) as i:
+            y.put(i, (b.entry(i) - d.dot(d.row("triangle", i), y)) * d.row("inverse").entry(i))
+        with f.each(d.steps) as i:
+            x.put_at(d.whole(d.row("order").entry(i)), y.entry(i))
+        count = f.variable(self._count(d), INT, 1)
+        with f.each(count.value) as k:
+            apply_reflector(d, "z", "tau_z", k, "x")
+        free = d.row("free").entry(0)
+        with f.each(count.value) as k:
+            is_there = d.number(k) < free
+            x.put(k, f.select(is_there, 0.0, x.entry(k)))
+        with reversed_each(d, count.value) as k:
+            apply_reflector(d, "z", "tau_z", k, "x")

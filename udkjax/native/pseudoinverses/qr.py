@@ -1,0 +1,144 @@
+"""Householder's reflections: QR with column pivoting, and their counterpart from the right."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from udkjax.native.ir import BOOL, INT, Operand, Value
+from udkjax.native.pseudoinverses.dense import Dense
+
+
+def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
+    """The matrices of `pivoted_qr`: reflectors, their factors, the diagonal of R, pivot columns, and lengths of columns."""
+    steps = min(m, n)
+    return {
+        "v": (steps, m),
+        "tau": (1, steps),
+        "diagonal": (1, steps),
+        "order": (1, steps),
+        "rank": (1, 1),
+        "squares": (1, n),
+        "unused": (1, n),
+        "product": (1, n),
+    }
+
+
+def start_pivoting(d: Dense) -> Value:
+    """Note that no column of D is used, and the squares of their lengths; return the largest."""
+    unused, squares = d.row("unused"), d.row("squares")
+
+    def of_column(r: Operand):
+        total = d.f.variable(0.0, width=d.vector)
+        with d.f.each(d.m) as i:
+            x = d.row("D", i)[r]
+            total.value = d.f.fma(x, x, total.value)
+        squares[r] = total.value
+        unused[r] = d.register(1.0)
+
+    d.over_registers(squares.registers, of_column)
+    return d.largest(squares, d.n)
+
+
+def choose_pivot(d: Dense) -> tuple[Value, Value]:
+    """Return the square of the longest of the columns that are left, and which one it is: the first of those as long."""
+    f, squares = d.f, d.row("squares")
+    best, pivot = f.variable(-1.0), f.variable(0.0)
+    with f.each(d.n) as j:
+        x = squares.entry(j)
+        longer = x > best.value
+        pivot.where(longer, d.number(j))
+        best.where(longer, x)
+    return best.value, pivot.value
+
+
+def use_column(d: Dense, pivot: Value, r: Operand, square: Value):
+    """Of a register of columns: note their squares, -1 for those that are used; the pivot is one of them from now on."""
+    f, unused, squares = d.f, d.row("unused"), d.row("squares")
+    left = f.select(d.row("index")[r].is_(d.spread(pivot)), 0.0, unused[r])
+    unused[r] = left
+    squares[r] = f.select(left > 0.5, square, -1.0)
+
+
+def pivoted_qr(d: Dense, threshold: Callable[[Value], Value]):
+    """Write D = Q R, its columns in their places: D becomes R; each step takes the longest column that is left.
+
+    Rows of `v` are the reflectors of Q; it stops, in each lane, where the longest is at most the threshold, whose square is a
+    function of the square of the longest column of D.
+    """
+    f = d.f
+    least = f.variable(threshold(start_pivoting(d)))
+    going, rank = f.variable(d.yes(), BOOL), f.variable(0.0)
+    with f.each(d.steps) as k:
+        square, pivot = choose_pivot(d)
+        goes_on = going.value & (square > least.value)
+        going.value = goes_on
+        rank.value = rank.value + f.select(goes_on, d.wide(1.0), 0.0)
+        place, norm, used = d.whole(pivot), d.sqrt(square), f.select(goes_on, pivot, -1.0)
+        top = d.row("D", k).at(place)
+        end = f.select(top > 0.0, -norm, norm)  # away from it: no cancellation
+        tau = f.select(goes_on, 1.0 / (square + f.abs(top) * norm), 0.0)
+        v = d.row("v", k)
+        v.clear()
+        v.put(k, top - end)
+        with f.each(d.m, k + 1) as i:
+            v.put(i, d.row("D", i).at(place))
+        for name, x in (("tau", tau), ("diagonal", end), ("order", pivot)):
+            d.row(name).put(k, x)
+        wide_tau = d.spread(tau)
+
+        def reflect(r: Operand):
+            total = f.variable(0.0, width=d.vector)
+            with f.each(d.m, k) as i:
+                total.value = f.fma(d.spread(v.entry(i)), d.row("D", i)[r], total.value)
+            change = -(total.value * wide_tau)
+            first = d.row("D", k)
+            first[r] = f.fma(d.spread(v.entry(k)), change, first[r])
+            square = f.variable(0.0, width=d.vector)
+            with f.each(d.m, k + 1) as i:
+                row = d.row("D", i)
+                x = f.fma(d.spread(v.entry(i)), change, row[r])
+                row[r] = x
+                square.value = f.fma(x, x, square.value)
+            use_column(d, used, r, square.value)
+
+        d.over_registers(d.row("D", 0).registers, reflect)
+    d.row("rank").put(0, rank.value)
+
+
+def apply_q_transposed(d: Dense):
+    """Write b = Q^T b."""
+    b = d.row("b")
+    with d.f.each(d.steps) as k:
+        v = d.row("v", k)
+        d.axpy(-(d.dot(v, b) * d.row("tau").entry(k)), v, b)
+
+
+def reflect_row(d: Dense, name: str, k: Value, is_active: Value, reflectors: str, factors: str) -> Value:
+    """Write the reflection from the right that leaves of row k of a matrix nothing behind column k; return what stays there."""
+    f, row, z = d.f, d.row(name, k), d.row(reflectors, k)
+    number = d.spread(d.number(k))
+
+    def copy(r: Operand):
+        z[r] = f.select(d.row("index")[r] >= number, row[r], 0.0)
+
+    d.over_registers(row.registers, copy)
+    square, first = d.dot(z, z), row.entry(k)
+    norm = d.sqrt(square)
+    end = f.select(first > 0.0, -norm, norm)
+    z.put(k, first - end)
+    divisor = square + f.abs(first) * norm
+    counts = is_active & (divisor > 0.0)
+    d.row(factors).put(k, f.select(counts, 1.0 / f.select(counts, divisor, 1.0), 0.0))
+    return end
+
+
+def apply_reflector(d: Dense, reflectors: str, factors: str, k: Value, name: str, i: Operand = 0):
+    """Write a reflection of row i of a matrix."""
+    z, row = d.row(reflectors, k), d.row(name, i)
+    d.axpy(-(d.dot(z, row) * d.row(factors).entry(k)), z, row)
+
+
+@contextmanager
+def reversed_each(d: Dense, count: Operand) -> Iterator[Value]:
+    """Do something for every whole number from `count` - 1 down to zero."""
+    with d.f.each(count) as k:
+        yield d.f.like(count, INT, 1) - 1 - k
