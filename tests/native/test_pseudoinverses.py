@@ -16,7 +16,7 @@ from udkjax.native.ir import POINTER, Function
 from udkjax.native.layout import Layout
 from udkjax.native.memory import Memory
 from udkjax.native.pseudoinverses import dense_method
-from udkjax.native.pseudoinverses.dense import Dense, DenseLayout
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 
 METHODS = {
     "SVD": pinv.SVD,
@@ -39,7 +39,7 @@ class Solver(Memory):
         functions = []
         for name in ("index", "factor", "solve"):
             f = Function(name, [(POINTER, "work")], width)
-            d = Dense(layout, f)
+            d = DenseMatrices(layout, f)
             if name == "index":
                 d.number_columns()
             else:

@@ -203,17 +203,17 @@ class ScenePrograms:
 
     @cached_property
     def dense_accelerations(self) -> LoopProgram:
-        """What accelerations by a dense pseudoinverse take: psi_q of all rows, terms and root."""
+        """The terms of accelerations by a dense pseudoinverse: psi_q of all rows, terms and root."""
         return program(self.equation_terms.parts, self._terms.every_entry(), [self._root])
 
     @cached_property
     def dense_newton_q(self) -> LoopProgram:
-        """What a Newton step to Psi = 0 takes: psi_q and psi of all rows, and root."""
+        """The terms of a Newton step to Psi = 0: psi_q and psi of all rows, and root."""
         return program([self.sincos], self.rows("psi"))
 
     @cached_property
     def dense_newton_v(self) -> LoopProgram:
-        """What a Newton step to Psi_dot = 0 takes: psi_q of all rows, Psi_dot as psi, and root."""
+        """The terms of a Newton step to Psi_dot = 0: psi_q of all rows, Psi_dot as psi, and root."""
         return program([self.sincos], self.rows("psi_dot"))
 
     @property

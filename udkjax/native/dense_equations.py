@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.module import Module
-from udkjax.native.pseudoinverses.dense import Dense, DenseLayout, DenseMethod, Row
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.weighted_rows import RowEntries
 
 FACTOR, SOLVE = "factor_rows", "solve_rows"
@@ -31,9 +31,9 @@ class DenseEquations:
         """Write the functions that the module calls in place of programs."""
         module = self._in
         f, _ = module.function(FACTOR)
-        self._method.factor(Dense(self._layout, f))
+        self._method.factor(DenseMatrices(self._layout, f))
         f, _ = module.function(SOLVE)
-        self._method.solve(Dense(self._layout, f))
+        self._method.solve(DenseMatrices(self._layout, f))
         for name, write in self._functions.items():
             if name in module.solving:
                 f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
@@ -61,7 +61,7 @@ class DenseEquations:
 
     def number_columns(self, f: Function):
         """Store the numbers of columns, once a run."""
-        Dense(self._layout, f).number_columns()
+        DenseMatrices(self._layout, f).number_columns()
 
     # --- D x = b
 
@@ -76,25 +76,25 @@ class DenseEquations:
 
     def _factor(self, f: Function):
         """Factorize D, of the entries of Psi_q at hand."""
-        d = Dense(self._layout, f)
+        d = DenseMatrices(self._layout, f)
         with f.each(d.m) as i:
             d.row("D", i).clear()
         for row, column, value in self._each_entry(f):
             d.row("D", row).put(column, value * self._array(f, "root", column))
         f.call(FACTOR, f.given["work"])
 
-    def _solve(self, f: Function, right: str, start: int = 0) -> Row:
+    def _solve(self, f: Function, right: str, start: int = 0) -> MatrixRow:
         """Return D^+ W b, with b in an array."""
-        d = Dense(self._layout, f)
+        d = DenseMatrices(self._layout, f)
         b = d.row("b")
         with f.each(d.m) as i:
             b.put(i, self._array(f, right, i + start) * self._array(f, "weights", i))
         f.call(SOLVE, f.given["work"])
         return d.row("x")
 
-    def _solve_rates(self, f: Function, change: str) -> Row:
+    def _solve_rates(self, f: Function, change: str) -> MatrixRow:
         """Return D^+ W Psi_q dq."""
-        d = Dense(self._layout, f)
+        d = DenseMatrices(self._layout, f)
         b = d.row("b")
         b.clear()
         for row, column, value in self._each_entry(f):
@@ -102,7 +102,7 @@ class DenseEquations:
         f.call(SOLVE, f.given["work"])
         return d.row("x")
 
-    def _correct(self, f: Function, x: Row, start: str, to: str, sign: float = -1.0):
+    def _correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):
         """Write `start` plus or minus M^(-1/2) x; `to` is an array, or `out`."""
         place = 0 if to == "out" else self._in.start(to, "work")
         with f.each(self._in.n) as i:

@@ -6,7 +6,7 @@ all members share has only one.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -107,11 +107,16 @@ class RunStates(Operation):
 
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
         """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
-        return RunTangents(self.code.for_derivatives, self.method, self.projected, self.breaks, self.sampled, active)
+        return RunTangents(**self._for_derivatives, active=active)
 
     def with_cotangents(self, active: tuple[bool, ...], points: int) -> "RunCotangents":
         """Return the operation that walks back to the numbers that are active, by a record of so many points."""
-        return RunCotangents(self.code.for_derivatives, self.method, self.projected, self.breaks, self.sampled, active, points)
+        return RunCotangents(**self._for_derivatives, active=active, points=points)
+
+    @property
+    def _for_derivatives(self) -> dict[str, Any]:
+        """The fields of the same operation with derivatives."""
+        return {each.name: getattr(self, each.name) for each in fields(self)} | {"code": self.code.for_derivatives}
 
     def module(self, width: int, several: bool, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))

@@ -84,8 +84,7 @@ def test_forward_tangents(monkeypatch):
     mechanism = udk.library.parallelogram()
     run, inputs, times = known_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))
     n, count = run.coordinates, run.code.number_count
-    settings = run.method, run.projected, run.breaks, run.sampled
-    operation = operations.RunTangents(run.code.for_derivatives, *settings, active=(True,) * count)
+    operation = run.with_tangents((True,) * count)
     along = np.zeros((1, 1, count))
     along[0, 0, 1] = 1.0  # of gravity, along y
     wasm, native = both(operation, [*inputs, along, np.zeros((1, 1, n)), np.zeros((1, 1, n))], times)

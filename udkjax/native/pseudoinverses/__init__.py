@@ -7,18 +7,18 @@ its own: what differs between lanes is chosen, as everywhere in machine code.
 
 from udkjax import pinv
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.pseudoinverses.gram_schmidt import GramSchmidt
-from udkjax.native.pseudoinverses.greville import Greville
-from udkjax.native.pseudoinverses.householder import Householder
-from udkjax.native.pseudoinverses.svd import SVD
-from udkjax.native.pseudoinverses.varga import Varga
+from udkjax.native.pseudoinverses.gram_schmidt import GramSchmidtCode
+from udkjax.native.pseudoinverses.greville import GrevilleCode
+from udkjax.native.pseudoinverses.householder import HouseholderCode
+from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.native.pseudoinverses.varga import VargaCode
 
 METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
-    pinv.SVD: SVD,
-    pinv.Varga: Varga,
-    pinv.Greville: Greville,
-    pinv.Householder: Householder,
-    pinv.GramSchmidt: GramSchmidt,
+    pinv.SVD: SVDCode,
+    pinv.Varga: VargaCode,
+    pinv.Greville: GrevilleCode,
+    pinv.Householder: HouseholderCode,
+    pinv.GramSchmidt: GramSchmidtCode,
 }
 
 
@@ -27,4 +27,4 @@ def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
     kind = METHODS.get(type(method))
     if kind is None:
         return None
-    return GramSchmidt(method.relative, method.twice) if isinstance(method, pinv.GramSchmidt) else kind(method.relative)
+    return GramSchmidtCode(method.relative, method.twice) if isinstance(method, pinv.GramSchmidt) else kind(method.relative)

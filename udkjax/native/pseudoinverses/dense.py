@@ -1,4 +1,4 @@
-"""Dense matrices in the memory of a run, one of each lane, and the operations on their rows.
+"""DenseMatrices matrices in the memory of a run, one of each lane, and the operations on their rows.
 
 The entries of a row lie behind one another, each in all lanes, and fill whole registers; what fills up the last one is zero. So
 an operation on rows is one on registers: of one member they hold several columns, of W members side by side one column of each.
@@ -29,11 +29,11 @@ class DenseMethod(ABC):
         """Return the rows and columns of the matrices that it stores besides D (m, n), by name."""
 
     @abstractmethod
-    def factor(self, d: "Dense") -> None:
+    def factor(self, d: "DenseMatrices") -> None:
         """Write how factors are made of D, which is overwritten."""
 
     @abstractmethod
-    def solve(self, d: "Dense") -> None:
+    def solve(self, d: "DenseMatrices") -> None:
         """Write how the row `x` becomes D^+ b of the row `b`, which is overwritten."""
 
 
@@ -50,10 +50,10 @@ class DenseLayout:
             module.places.add(f"dense {name}", rows * self.registers[name] * max(vector // width, 1))
 
 
-class Row:
+class MatrixRow:
     """A row of a matrix, by its address: so many registers."""
 
-    def __init__(self, d: "Dense", address: Value, registers: int):
+    def __init__(self, d: "DenseMatrices", address: Value, registers: int):
         self._d, self.address, self.registers = d, address, registers
 
     def __getitem__(self, r: Operand) -> Value:
@@ -105,7 +105,7 @@ class Row:
         self._d.over_registers(self.registers, put_zero)
 
 
-class Dense:
+class DenseMatrices:
     """The matrices of a method in one function, which has the arguments `work`."""
 
     def __init__(self, layout: DenseLayout, f: Function):
@@ -156,12 +156,12 @@ class Dense:
         with self.f.each(self.layout.shapes["index"][1]) as j:
             row.put(j, self.number(j))
 
-    def row(self, name: str, i: Operand = 0) -> Row:
+    def row(self, name: str, i: Operand = 0) -> MatrixRow:
         """Return row i of a matrix."""
         f, registers = self.f, self.layout.registers[name]
         start, stride = self.module.places[f"dense {name}"] * f.width, registers * self.vector
         place = f.like(i, INT, 1) * stride + start if isinstance(i, Value) else int(i) * stride + start
-        return Row(self, f.at(f.given["work"], place), registers)
+        return MatrixRow(self, f.at(f.given["work"], place), registers)
 
     def over_registers(self, registers: int, do: Callable[[Operand], None]):
         """Do something with each register of a row: written out, or in rounds of several."""
@@ -197,11 +197,11 @@ class Dense:
             totals = [a + b for a, b in zip(totals[::2], totals[1::2], strict=False)] + totals[len(totals) & ~1 :]
         return totals[0] if f.width > 1 else self.module.total(f, totals[0])
 
-    def dot(self, a: Row, b: Row) -> Value:
+    def dot(self, a: MatrixRow, b: MatrixRow) -> Value:
         """The scalar product of two rows, of each lane."""
         return self.sum(a.registers, lambda r, total: self.f.fma(a[r], b[r], total))
 
-    def axpy(self, factor: Value, x: Row, y: Row):
+    def axpy(self, factor: Value, x: MatrixRow, y: MatrixRow):
         """Add a multiple of the row x to the row y."""
         wide = self.spread(factor)
 
@@ -210,7 +210,7 @@ class Dense:
 
         self.over_registers(y.registers, add)
 
-    def largest(self, row: Row, count: int) -> Value:
+    def largest(self, row: MatrixRow, count: int) -> Value:
         """The largest of the first entries of a row."""
         worst = self.f.variable(0.0)
         with self.f.each(count) as j:

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from udkjax.native.ir import BOOL, Operand
-from udkjax.native.pseudoinverses.dense import Dense, DenseMethod
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import choose_pivot, start_pivoting, use_column
 
 
 @dataclass(frozen=True)
-class GramSchmidt(DenseMethod):
+class GramSchmidtCode(DenseMethod):
     """D = Q R with column pivoting, then R = L Z^T: D^+ = Z L^(-1) Q^T.
 
     Once the rank is decided the rows of R are independent: the second factorization needs no pivots.
@@ -31,11 +31,11 @@ class GramSchmidt(DenseMethod):
             "y": (1, steps),
         }
 
-    def factor(self, d: Dense):
+    def factor(self, d: DenseMatrices):
         self._orthogonalize_columns(d)
         self._orthogonalize_rows(d)
 
-    def _orthogonalize_columns(self, d: Dense):
+    def _orthogonalize_columns(self, d: DenseMatrices):
         """D = Q R: rows of `q` are the columns of Q, and D is what remains of it."""
         f, column, above = d.f, d.row("column"), d.row("above")
         threshold = f.variable(d.threshold(self, start_pivoting(d)))
@@ -90,7 +90,7 @@ class GramSchmidt(DenseMethod):
                         earlier.put_at(place, earlier.at(place) + more)
         d.row("rank").put(0, rank.value)
 
-    def _orthogonalize_rows(self, d: Dense):
+    def _orthogonalize_rows(self, d: DenseMatrices):
         """R = L Z^T: rows of `r` become the columns of Z."""
         f, above = d.f, d.row("above")
         rank = f.variable(d.row("rank").entry(0))
@@ -121,7 +121,7 @@ class GramSchmidt(DenseMethod):
                 d.row("l", i).put(k, along)
                 d.axpy(-along, row, later)
 
-    def solve(self, d: Dense):
+    def solve(self, d: DenseMatrices):
         f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
         x.clear()
         y.clear()

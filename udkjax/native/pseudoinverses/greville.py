@@ -3,17 +3,17 @@
 from dataclasses import dataclass
 
 from udkjax.native.ir import Operand
-from udkjax.native.pseudoinverses.dense import Dense, DenseMethod
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 
 @dataclass(frozen=True)
-class Greville(DenseMethod):
+class GrevilleCode(DenseMethod):
     """The columns of D^+ are rows of `plus`; each row of D adds one, and corrects those before."""
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
         return {"plus": (m, n), "d": (1, m), "c": (1, n), "rank": (1, 1)}
 
-    def factor(self, d: Dense):
+    def factor(self, d: DenseMatrices):
         f, along, c = d.f, d.row("d"), d.row("c")
         scale = f.variable(0.0)
         with f.each(d.m) as i:
@@ -50,7 +50,7 @@ class Greville(DenseMethod):
                 d.axpy(-along.entry(j), found, d.row("plus", j))
         d.row("rank").put(0, rank.value)
 
-    def solve(self, d: Dense):
+    def solve(self, d: DenseMatrices):
         x = d.row("x")
         x.clear()
         with d.f.each(d.m) as i:

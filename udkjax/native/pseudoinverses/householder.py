@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from udkjax.native.ir import INT, Operand, Value
-from udkjax.native.pseudoinverses.dense import Dense, DenseMethod
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import (
     apply_q_transposed,
     apply_reflector,
@@ -15,7 +15,7 @@ from udkjax.native.pseudoinverses.qr import (
 
 
 @dataclass(frozen=True)
-class Householder(DenseMethod):
+class HouseholderCode(DenseMethod):
     """D = Q T G, with T of the pivot columns of R and G = T^(-1) R: rows e_f - sum_i G_if e_(pivot i) span the null space of D.
 
     The basic solution solves T; reflections of the null space's basis then take out its part along that.
@@ -33,7 +33,7 @@ class Householder(DenseMethod):
             "free": (1, 1),
         }
 
-    def factor(self, d: Dense):
+    def factor(self, d: DenseMatrices):
         f = d.f
         pivoted_qr(d, lambda scale: d.threshold(self, scale))
         rank = f.variable(d.row("rank").entry(0))
@@ -57,7 +57,7 @@ class Householder(DenseMethod):
             d.over_registers(row.registers, scale)
         self._reflect_null_space(d, d.wide(float(d.n)) - rank.value)
 
-    def _reflect_null_space(self, d: Dense, free: Value):
+    def _reflect_null_space(self, d: DenseMatrices, free: Value):
         """Reflect the basis of the null space to the first coordinates, one vector after another: one for each free column."""
         f = d.f
         d.row("free").put(0, free)
@@ -78,12 +78,12 @@ class Householder(DenseMethod):
                 apply_reflector(d, "z", "tau_z", j, "null", k)
             reflect_row(d, "null", k, is_there, "z", "tau_z")
 
-    def _count(self, d: Dense) -> Value:
+    def _count(self, d: DenseMatrices) -> Value:
         """The largest number of free columns of any lane."""
         found = d.row("free").entry(0)
         return d.whole(found if d.f.width == 1 else d.f.reduce("fmax", found))
 
-    def solve(self, d: Dense):
+    def solve(self, d: DenseMatrices):
         f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
         apply_q_transposed(d)
         x.clear()

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from udkjax.native.ir import BOOL, INT, Operand, Value
-from udkjax.native.pseudoinverses.dense import Dense
+from udkjax.native.pseudoinverses.dense import DenseMatrices
 
 
 def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
@@ -22,7 +22,7 @@ def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
     }
 
 
-def start_pivoting(d: Dense) -> Value:
+def start_pivoting(d: DenseMatrices) -> Value:
     """Note that no column of D is used, and the squares of their lengths; return the largest."""
     unused, squares = d.row("unused"), d.row("squares")
 
@@ -38,7 +38,7 @@ def start_pivoting(d: Dense) -> Value:
     return d.largest(squares, d.n)
 
 
-def choose_pivot(d: Dense) -> tuple[Value, Value]:
+def choose_pivot(d: DenseMatrices) -> tuple[Value, Value]:
     """Return the square of the longest of the columns that are left, and which one it is: the first of those as long."""
     f, squares = d.f, d.row("squares")
     best, pivot = f.variable(-1.0), f.variable(0.0)
@@ -50,7 +50,7 @@ def choose_pivot(d: Dense) -> tuple[Value, Value]:
     return best.value, pivot.value
 
 
-def use_column(d: Dense, pivot: Value, r: Operand, square: Value):
+def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
     """Of a register of columns: note their squares, -1 for those that are used; the pivot is one of them from now on."""
     f, unused, squares = d.f, d.row("unused"), d.row("squares")
     left = f.select(d.row("index")[r].is_(d.spread(pivot)), 0.0, unused[r])
@@ -58,7 +58,7 @@ def use_column(d: Dense, pivot: Value, r: Operand, square: Value):
     squares[r] = f.select(left > 0.5, square, -1.0)
 
 
-def pivoted_qr(d: Dense, threshold: Callable[[Value], Value]):
+def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
     """Write D = Q R, its columns in their places: D becomes R; each step takes the longest column that is left.
 
     Rows of `v` are the reflectors of Q; it stops, in each lane, where the longest is at most the threshold, whose square is a
@@ -104,7 +104,7 @@ def pivoted_qr(d: Dense, threshold: Callable[[Value], Value]):
     d.row("rank").put(0, rank.value)
 
 
-def apply_q_transposed(d: Dense):
+def apply_q_transposed(d: DenseMatrices):
     """Write b = Q^T b."""
     b = d.row("b")
     with d.f.each(d.steps) as k:
@@ -112,7 +112,7 @@ def apply_q_transposed(d: Dense):
         d.axpy(-(d.dot(v, b) * d.row("tau").entry(k)), v, b)
 
 
-def reflect_row(d: Dense, name: str, k: Value, is_active: Value, reflectors: str, factors: str) -> Value:
+def reflect_row(d: DenseMatrices, name: str, k: Value, is_active: Value, reflectors: str, factors: str) -> Value:
     """Write the reflection from the right that leaves of row k of a matrix nothing behind column k; return what stays there."""
     f, row, z = d.f, d.row(name, k), d.row(reflectors, k)
     number = d.spread(d.number(k))
@@ -131,14 +131,14 @@ def reflect_row(d: Dense, name: str, k: Value, is_active: Value, reflectors: str
     return end
 
 
-def apply_reflector(d: Dense, reflectors: str, factors: str, k: Value, name: str, i: Operand = 0):
+def apply_reflector(d: DenseMatrices, reflectors: str, factors: str, k: Value, name: str, i: Operand = 0):
     """Write a reflection of row i of a matrix."""
     z, row = d.row(reflectors, k), d.row(name, i)
     d.axpy(-(d.dot(z, row) * d.row(factors).entry(k)), z, row)
 
 
 @contextmanager
-def reversed_each(d: Dense, count: Operand) -> Iterator[Value]:
+def reversed_each(d: DenseMatrices, count: Operand) -> Iterator[Value]:
     """Do something for every whole number from `count` - 1 down to zero."""
     with d.f.each(count) as k:
         yield d.f.like(count, INT, 1) - 1 - k

@@ -12,19 +12,19 @@ from dataclasses import dataclass
 
 from udkjax.native.ir import INT, Operand, Value
 from udkjax.native.least_norm import ROUNDING, SWEEPS
-from udkjax.native.pseudoinverses.dense import Dense, DenseMethod, Row
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q_transposed, pivoted_qr, qr_matrices
 
 
 @dataclass(frozen=True)
-class SVD(DenseMethod):
+class SVDCode(DenseMethod):
     """Rows of D become the right singular vectors times singular values; rows of `u`, times Q, the left singular vectors."""
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
         steps = min(m, n)
         return qr_matrices(m, n) | {"u": (steps, steps), "lengths": (1, steps)}
 
-    def factor(self, d: Dense):
+    def factor(self, d: DenseMatrices):
         f, squares = d.f, d.row("lengths")
         pivoted_qr(d, lambda _: d.wide(0.0))
         with f.each(d.steps) as i:
@@ -68,7 +68,7 @@ class SVD(DenseMethod):
             squares.put(i, f.select(counts, 1.0 / f.select(counts, square, 1.0), 0.0))
         d.row("rank").put(0, rank.value)
 
-    def _turn(self, d: Dense, one: Row, two: Row, cosine: Value, sine: Value):
+    def _turn(self, d: DenseMatrices, one: MatrixRow, two: MatrixRow, cosine: Value, sine: Value):
         f, c, s = d.f, d.spread(cosine), d.spread(sine)
 
         def turn(r: Operand):
@@ -78,7 +78,7 @@ class SVD(DenseMethod):
 
         d.over_registers(one.registers, turn)
 
-    def solve(self, d: Dense):
+    def solve(self, d: DenseMatrices):
         b, x = d.row("b"), d.row("x")
         apply_q_transposed(d)
         x.clear()

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from udkjax.native.pseudoinverses.dense import Dense, DenseMethod
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import (
     apply_q_transposed,
     apply_reflector,
@@ -14,7 +14,7 @@ from udkjax.native.pseudoinverses.qr import (
 
 
 @dataclass(frozen=True)
-class Varga(DenseMethod):
+class VargaCode(DenseMethod):
     """D = Q R with column pivoting, then R = L Z^T by reflections from the right: D^+ = Z L^(-1) Q^T.
 
     Once the rank is decided the rows of R are independent: the second factorization needs no pivots.
@@ -24,7 +24,7 @@ class Varga(DenseMethod):
         steps = min(m, n)
         return qr_matrices(m, n) | {"z": (steps, n), "tau_z": (1, steps), "inverse": (1, steps)}
 
-    def factor(self, d: Dense):
+    def factor(self, d: DenseMatrices):
         f = d.f
         pivoted_qr(d, lambda scale: d.threshold(self, scale))
         rank = f.variable(d.row("rank").entry(0))
@@ -35,7 +35,7 @@ class Varga(DenseMethod):
             with f.each(d.steps, k + 1) as i:
                 apply_reflector(d, "z", "tau_z", k, "D", i)
 
-    def solve(self, d: Dense):
+    def solve(self, d: DenseMatrices):
         f, b, x = d.f, d.row("b"), d.row("x")
         apply_q_transposed(d)
         x.clear()
