@@ -32,6 +32,7 @@ def animate(
     measures: tuple[str, ...] = ("violation", "energy", "rank"),
     reactions: bool = False,
     traces: tuple[str, ...] = (),
+    live: tuple[str, ...] | None = None,
     theme: Literal["light", "dark"] | None = None,
     autoplay: bool = False,
     t: float | None = None,
@@ -53,6 +54,8 @@ def animate(
         measures: what a strip shows over time: violation, energy, rank, or a variable over time of the file.
         reactions: draw the forces of the joints as arrows.
         traces: joints or bodies whose paths are drawn; by default the pins that move.
+        live: a page with sliders that solves the motion anew, and whose bodies one can pull at; of every number of the scene, or
+            of those that are named (motor.crank.speed, pin.B).
         theme: colours; by default, on a page, what the reader's system prefers, else light.
         autoplay: a page moves at once.
         t: time of a pose (s); by default the start.
@@ -68,6 +71,8 @@ def animate(
         refuse(f"--t1 {t1:g} must be at least one --dt {dt:g}, which must be positive")
     if labels and len(labels) != len(files):
         refuse(f"{len(labels)} --labels for {len(files)} files")
+    if live is not None and kind != ".html":
+        refuse(f"--live makes a page that simulates: --out must be a .html, not {out.name}")
     names = list(labels or (file.stem if len(files) > 1 else "" for file in files))
     if len(set(names)) < len(names):
         refuse(f"runs must have different labels, not {', '.join(names)}: give --labels")
@@ -88,6 +93,7 @@ def animate(
                 measures=_measures(measures, runs) if kind == ".html" else (),
                 reactions=reactions,
                 traces=traces or None,
+                live=list(live or ()) or live is not None,
             )
         found.save(out, t, **options)
     except (ValueError, OSError) as problem:

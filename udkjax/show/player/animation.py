@@ -9,10 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from udkjax.integrate.simulate import simulate
 from udkjax.scene import Mechanism
 from udkjax.scene.arguments import checked, require_mechanism
-from udkjax.scene.requirements import require_history
+from udkjax.scene.requirements import ArgumentError, require_history
 from udkjax.show.player import pictures
+from udkjax.show.player.live import live_data
+from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks import Shapes
 from udkjax.show.player.measure_curves import Measures, ShownMotion
 from udkjax.show.player.packing import Json
@@ -22,6 +25,7 @@ from udkjax.show.player.player_data import Traces, failure_of, mode_record, moti
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
 
+LIVE_SECONDS, LIVE_INSTANTS = 10.0, 501  # of a live page whose run is not given
 FRAME_HEIGHT = 560  # px, of the player inside another page
 
 
@@ -114,6 +118,7 @@ def animate(
     traces: Traces | None = None,
     shapes: Shapes | None = None,
     title: str | None = None,
+    live: Live = False,
 ) -> Animation:
     """Show the motion of a mechanism, or several motions side by side and in step.
 
@@ -121,21 +126,27 @@ def animate(
         mechanism: what moved; for runs of different mechanisms, one under each run's label.
         solution: what `simulate` returned, or anything with ts (T,), q and v (T, bodies, 3); several under their labels,
             {"projected": one, "not stabilized": other}. By default the mechanism stands as its scene says.
-        measures: what a strip shows over time: any of "violation" (m; radians as an arc of the characteristic length), "energy"
-            and "rank", or {"torque (N m)": array} for values of your own, of several runs {"torque (N m)": {label: array}}.
+        measures: what a strip shows over time: any of "violation" (m; radians as an arc of the characteristic length), "energy",
+            "rank" and "effort" (of drivers, N or N m), or {"torque (N m)": array} for values of your own, of several runs
+            {"torque (N m)": {label: array}}.
         reactions: draw the forces of the joints as arrows; of redundant joints, the shares of least norm.
         traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
             the pins that move, up to eight.
         shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
         title: by default the mechanism's name.
+        live: numbers that the page changes by sliders, by their names (`parameters()`), whole or one entry: the motion is closed
+            and solved anew in the page, which a hand can pull at, too. {"pin.B[0]": (0.5, 2.0)} gives a slider its range; True
+            takes every number of the scene. Of one run, by default ten seconds; "rank" is not among its measures.
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
         A run that failed is shown as far as it came; a `FailedRunWarning` and the page say how it ended.
 
     Raises:
-        ValueError: a batch, a name that is not known, or a run without any state.
+        ValueError: a batch, a name that is not known, a run without any state, or one that cannot be live.
     """
+    if live:
+        mechanism, solution, measures = _live_run(mechanism, solution, measures)
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
@@ -148,7 +159,31 @@ def animate(
         if failure := failure_of(run):
             failures[label] = failure
             warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)
-    return Animation(player_data(title or found[0][0].name or "mechanism", found), failures)
+    data = player_data(title or found[0][0].name or "mechanism", found)
+    if live:
+        one, run = found[0][0], next(iter(runs.values()))
+        assert run is not None
+        data["live"] = live_data(one, run, data["runs"][0], data["runs"][0]["symbols"], live)
+    return Animation(data, failures)
+
+
+def _live_run(
+    mechanism: Mechanism | Mapping[str, Mechanism],
+    solution: ShownMotion | Mapping[str, ShownMotion] | None,
+    measures: Measures,
+) -> tuple[Mechanism, ShownMotion, Measures]:
+    """Return the mechanism, the run and the measures of a live page."""
+    one: Any = next(iter(mechanism.values())) if isinstance(mechanism, Mapping) and len(mechanism) == 1 else mechanism
+    run: Any = next(iter(solution.values())) if isinstance(solution, Mapping) and len(solution) == 1 else solution
+    if isinstance(one, Mapping) or isinstance(run, Mapping):
+        raise ArgumentError("live: a page solves one run anew: give one mechanism and one solution")
+    one = require_mechanism(one)
+    if run is None:
+        run = simulate(one, np.linspace(0.0, LIVE_SECONDS, LIVE_INSTANTS), throw=False)
+    wanted = [name for name in measures if name != "rank"]
+    if one.driver_names and "effort" not in wanted:
+        wanted.append("effort")
+    return one, run, {name: measures.get(name) if isinstance(measures, Mapping) else None for name in wanted}
 
 
 @checked

@@ -13,6 +13,8 @@ export const HELP = [
   ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
 ];
 
+export const LIVE_HELP = [["Drag a body", "pull at it"], ["G", "first motion"], ["Backspace", "reset the numbers"]];
+
 /** An element with properties and children; texts are texts. */
 export function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);

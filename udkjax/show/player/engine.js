@@ -10,11 +10,12 @@
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
 // of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
 
+import {bytesOf} from "./motion.js";
+
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
 const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite"};
 const EPS = 2 ** -52;
 
-const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const numbersOf = text => new Float64Array(bytesOf(text).buffer);
 const largest = (x, unit) => x.reduce((most, value, k) => Math.max(most, Math.abs(value) / unit(k)), 0);
 

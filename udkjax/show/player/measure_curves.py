@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from udkjax.equations import Analysis, analyse, energy, reactions, singular_values, unique_reactions, violation
+from udkjax.equations import Analysis, analyse, efforts, energy, reactions, singular_values, unique_reactions, violation
 from udkjax.equations.determinacy import STATIC_RANK_TOL
 from udkjax.scene import GROUND, Mechanism
 from udkjax.study.accuracy import conserves_energy
@@ -119,7 +119,13 @@ def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     return found
 
 
-MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank}
+def _effort(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
+    units = {name: ("torque", "N m") if d.coordinate == "angle" else ("force", "N") for name, d in mechanism.drivers.items()}
+    found = efforts(mechanism, solution).items()
+    return [MeasureCurve(f"{units[name][0]} of {name}", units[name][1], np.asarray(values)) for name, values in found]
+
+
+MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort": _effort}
 
 
 def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArrows:

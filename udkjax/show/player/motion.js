@@ -1,6 +1,6 @@
 // Motions: packed tables, and where the bodies of a run are at any time.
 
-const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+export const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const floats = text => new Float32Array(bytesOf(text).buffer);
 
 /** A packed table (udkjax/show/player/packing.py), row by row. Sums stay below 2^53: no bit operations, which have 32 bits. */
@@ -46,7 +46,23 @@ export class Run {
     this.measures = record.measures.map(m => ({...m, values: floats(m.values)}));
     this.forces = record.reactions && unpack(record.reactions.force);
     this.paths = null;
+    this.fine = 4;  // points of a path for each instant
     this.now = new Float64Array(this.size);
+  }
+
+  /** Another motion of the same bodies. */
+  replace(ts, q, v, measures, frame) {
+    Object.assign(this, {ts, q, v, measures, frame, paths: null, fine: 1});
+  }
+
+  /** The coordinates and their rates at any time between the first and the last instant. */
+  state(t) {
+    const [i, j, h, s] = this.find(t), n = this.size, {q, v, frame} = this, rates = new Float64Array(n), r = 1 - s;
+    for (let k = 0; k < n; k++) {
+      const a = q[i * n + k], b = q[j * n + k], u = v[i * n + k] / frame, w = v[j * n + k] / frame;
+      rates[k] = h > 0 ? 6 * s * r * (b - a) / h + r * (1 - 3 * s) * u + s * (3 * s - 2) * w : u;
+    }
+    return {q: this.pose(t).slice(), v: rates};
   }
 
   /** The interval that holds t, and where in it t is, from 0 to 1. */
@@ -88,7 +104,7 @@ export class Run {
   trace() {
     if (!this.paths) {
       const first = this.ts[0], last = this.ts[this.ts.length - 1];
-      const count = clamp(4 * this.ts.length, 2, 3000);
+      const count = clamp(this.fine * this.ts.length, 2, 3000);
       this.paths = {first, last, count, lines: this.traces.map(() => new Float64Array(2 * count))};
       for (let i = 0; i < count; i++) {
         const pose = this.pose(first + (last - first) * i / (count - 1));

@@ -28,6 +28,7 @@ export function mount(element, data, options = {}) {
       const {clientWidth, clientHeight} = player.panels[panel].canvas, view = player.view(clientWidth, clientHeight);
       return [view.x + view.scale * x, view.y - view.scale * y];
     },
+    get live() { return player.live; },
     on: listener => player.on(() => listener(handle)),
     destroy: () => player.destroy(),
   };

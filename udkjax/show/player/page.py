@@ -9,7 +9,12 @@ from string import Template
 
 from udkjax.show.player.packing import Json
 
-MODULES = ("motion", "painter", "symbols", "strip", "style", "elements", "pointers", "player", "mount")  # after those they import
+LIVE_MODULES = "engine", "follow", "hand", "sliders", "live"
+MODULES = (  # after those they import
+    *("motion", "painter", "symbols", "strip", "style", "elements", "pointers"),
+    *LIVE_MODULES,
+    *("player", "mount"),
+)
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 

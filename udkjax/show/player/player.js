@@ -1,10 +1,12 @@
 // The player's elements, what they do, and how they look.
 
-import {HELP, SPEEDS, icon, make} from "./elements.js";
+import {HELP, LIVE_HELP, SPEEDS, icon, make} from "./elements.js";
+import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES} from "./painter.js";
 import {followPointers} from "./pointers.js";
 import {drawStrip} from "./strip.js";
+import {LIVE_STYLE} from "./sliders.js";
 import {STYLE} from "./style.js";
 import {SymbolPainter} from "./symbols.js";
 
@@ -55,10 +57,12 @@ export class Player {
     this.buttons.names = toggle("names", "Names", "N");
     this.panels = this.runs.map((run, k) => this.panel(run, k));
     this.stage = make("div", {class: "stage"}, ...this.panels.map(p => p.figure));
+    this.live = data.live ? new Live(this, data) : null;
+    const middle = this.live ? make("div", {class: "middle"}, this.stage, this.live.panel.element) : this.stage;
     this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
-      make("dl", {}, ...HELP.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
+      make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
     const groups = [this.playButton, this.timeLabel, this.scrub, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
-      ...Object.values(this.buttons))];
+      ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button))];
     if (this.modes) {
       const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
         oninput: () => { this.amplitude = +range.value; this.draw(); }});
@@ -68,9 +72,9 @@ export class Player {
       make("header", {}, make("h1", {title: data.title}, data.title),
         this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
         this.button("?", "keys", () => this.toggleHelp(), "icon")),
-      this.stage, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+      middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
-    shadow.replaceChildren(make("style", {}, STYLE), this.root);
+    shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);
     this.setPlaying(false);
   }
@@ -111,6 +115,7 @@ export class Player {
 
   whole() {
     this.zoom = {factor: 1, x: 0, y: 0};
+    this.live?.fit();
     this.draw();
   }
 
@@ -163,6 +168,12 @@ export class Player {
     this.tell();
   }
 
+  /** The end of the timeline. */
+  setEnd(end) {
+    this.data.end = end;
+    this.t = Math.min(this.t, end);
+  }
+
   advance(seconds) {
     const {start, end} = this.data;
     let t = this.t + seconds * this.speed;
@@ -209,7 +220,7 @@ export class Player {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+    if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.composedPath()[0].tagName) && event.composedPath()[0] !== this.scrub) return;
     const {start, end} = this.data, step = event.shiftKey ? (end - start) / 20 : this.speed / 30;
     const speeds = [...this.speedSelect.options].map(o => +o.value), at = speeds.indexOf(this.speed);
     const actions = {
@@ -217,7 +228,7 @@ export class Player {
       Home: () => this.seek(start), End: () => this.seek(end), 0: () => this.whole(), "?": () => this.toggleHelp(),
       "+": () => this.setSpeed(speeds[Math.min(at + 1, speeds.length - 1)]), "-": () => this.setSpeed(speeds[Math.max(at - 1, 0)]),
       t: () => this.toggle("traces"), n: () => this.toggle("names"), r: () => this.toggle("reactions"), l: () => this.toggle("loop"),
-      d: () => this.switchTheme(), Escape: () => { this.help.hidden = true; },
+      d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), Escape: () => { this.help.hidden = true; },
     };
     const action = actions[event.key] ?? actions[event.key.toLowerCase()];
     if (!action || (event.key === " " && event.target.tagName === "BUTTON")) return;  // a button takes the space bar itself
@@ -261,18 +272,24 @@ export class Player {
     return {scale, x: width / 2 - scale * (left + right) / 2 + this.zoom.x, y: height / 2 + scale * (bottom + top) / 2 + this.zoom.y};
   }
 
+  /** What paints on a panel's canvas. */
+  painter(canvas, context = null) {
+    const {clientWidth: width, clientHeight: height} = canvas, pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
+    return new SymbolPainter(context, this.view(width, height), this.theme, pt, null);
+  }
+
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
     for (const {run, canvas} of this.panels) {
       const {context, width, height} = this.context(canvas);
       if (!width || !height) continue;
-      const view = this.view(width, height), pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
-      const painter = new SymbolPainter(context, view, theme, pt, null);
-      const step = painter.grid(width, height);
+      const painter = this.painter(canvas, context), step = painter.grid(width, height);
+      this.live?.paintGhost(painter, context, t);
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
+      this.live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);
       painter.bar(step, height);

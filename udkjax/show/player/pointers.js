@@ -1,21 +1,31 @@
 // Fingers, mouse and wheel on a canvas.
 
-/** Drag moves the view, two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+/** Drag moves the view, or of a live page pulls at the body that is there;
+ *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
 export function followPointers(player, canvas) {
   const down = new Map();
-  let moved = 0;
+  let moved = 0, hand = null;  // the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   canvas.addEventListener("pointerdown", event => {
     canvas.setPointerCapture(event.pointerId);
     down.set(event.pointerId, point(event));
     moved = 0;
+    if (down.size === 1 && event.button === 0 && player.live?.bodyAt(canvas, point(event), event.pointerType)) hand = event.pointerId;
   });
   canvas.addEventListener("pointermove", event => {
-    if (!down.has(event.pointerId)) return;
+    if (!down.has(event.pointerId)) {
+      if (player.live) canvas.classList.toggle("holds", Boolean(player.live.bodyAt(canvas, point(event), event.pointerType)));
+      return;
+    }
     const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
     down.set(event.pointerId, now);
     moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
     if (moved < 4) return;
+    if (hand === event.pointerId) {
+      if (player.live.hand) player.live.move(canvas, now);
+      else if (!player.live.grasp(canvas, old, event.pointerType)) hand = null;
+      return;
+    }
     const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
     const [cx, cy] = centre(before), [nx, ny] = centre(after);
     if (down.size === 2) {
@@ -27,6 +37,7 @@ export function followPointers(player, canvas) {
     player.draw();
   });
   const up = event => {
+    if (hand === event.pointerId) { hand = null; player.live.release(); }
     if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) player.toggle("playing");
   };
   canvas.addEventListener("pointerup", up);

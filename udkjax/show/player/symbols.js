@@ -6,19 +6,40 @@ import {Painter, mix} from "./painter.js";
 /** Draws symbols at a pose. */
 export class SymbolPainter extends Painter {
   draw(symbols) {
-    for (const {frame, radius, points, closed, width, ...look} of symbols) {
-      const [[x0, y0], cos, sin, scale] = this.axes(frame), fill = this.tone(look.fill), stroke = this.tone(look.stroke), {pt} = this;
-      if (radius) {
-        const [metres, units, least] = radius;
-        this.circle([x0, y0], Math.max(this.view.scale * metres + pt * units, pt * least), {fill, stroke, width});
-        continue;
-      }
-      const corners = points.map(([x, y, px = 0, py = 0]) => {
-        const along = scale * x + pt * px, up = scale * y + pt * py;
-        return [x0 + cos * along - sin * up, y0 - sin * along - cos * up];
-      });
-      this.line(corners, width, stroke, {closed, fill});
+    for (const symbol of symbols) {
+      const {centre, size, corners} = this.outline(symbol), fill = this.tone(symbol.fill), stroke = this.tone(symbol.stroke);
+      if (centre) this.circle(centre, size, {fill, stroke, width: symbol.width});
+      else this.line(corners, symbol.width, stroke, {closed: symbol.closed, fill});
     }
+  }
+
+  /** Where a symbol is (px): the centre and the radius of a circle, or the corners of a line. */
+  outline({frame, radius, points}) {
+    const [[x0, y0], cos, sin, scale] = this.axes(frame), {pt} = this;
+    if (radius) {
+      const [metres, units, least] = radius;
+      return {centre: [x0, y0], size: Math.max(this.view.scale * metres + pt * units, pt * least)};
+    }
+    const corners = points.map(([x, y, px = 0, py = 0]) => {
+      const along = scale * x + pt * px, up = scale * y + pt * py;
+      return [x0 + cos * along - sin * up, y0 - sin * along - cos * up];
+    });
+    return {corners};
+  }
+
+  /** Whether a symbol is at a place (px), or nearer than `reach`. */
+  holds(symbol, x, y, reach) {
+    const {centre, size, corners} = this.outline(symbol);
+    if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
+    const ends = symbol.closed ? [...corners, corners[0]] : corners, near = symbol.width * this.pt / 2 + reach;
+    let inside = false;
+    for (let k = 1; k < ends.length; k++) {
+      const [[ax, ay], [bx, by]] = [ends[k - 1], ends[k]], dx = bx - ax, dy = by - ay;
+      const s = Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0), 1);
+      if (Math.hypot(x - ax - s * dx, y - ay - s * dy) <= near) return true;
+      if ((ay > y) !== (by > y) && x < ax + dx * (y - ay) / dy) inside = !inside;
+    }
+    return inside && Boolean(symbol.closed);
   }
 
   /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */

@@ -1,0 +1,111 @@
+"""Live pages as data: sliders, what follows them, and what cannot be live."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.show.player.conftest import Motion
+from udkjax.scene.checks import SceneError
+from udkjax.show.player.followers import followers
+from udkjax.show.player.live_parameters import label_of, section_of, sliders_of, usual_range
+from udkjax.show.player.player_data import run_record
+
+
+@pytest.fixture(scope="module")
+def live(slider_crank, run):
+    return udk.animate(slider_crank, run, live=["motor.motor.speed", "pin.P"])
+
+
+def test_sliders_are_of_the_numbers_that_are_named(live, slider_crank):
+    sliders = live.data["live"]["sliders"]
+    assert [s["name"] for s in sliders] == ["motor.motor.speed", "pin.P[0]", "pin.P[1]"]
+    assert [s["name"] for s in sliders] == [p["name"] for p in live.data["live"]["engine"]["parameters"]]
+    assert [s["unit"] for s in sliders] == ["rad/s", "m", "m"]
+    assert all(s["low"] <= s["value"] <= s["high"] for s in sliders)
+    everything = sliders_of(slider_crank, True)
+    assert {"gravity[1]", "link.rod.mass", "pin.P.velocity[1]"} < {s.name for s in everything}
+    assert not any(s.name.startswith(("body.", "joint.")) for s in everything)  # these follow from the drawing
+
+
+def test_ranges_are_as_wanted_or_by_the_unit(slider_crank):
+    (slider,) = sliders_of(slider_crank, {"motor.motor.speed": (1.0, 9.0)})
+    assert (slider.low, slider.high) == (1.0, 9.0)
+    assert [s.high for s in sliders_of(slider_crank, {"pin.P": (-1.0, 2.5)})] == [2.5, 2.5]
+    with pytest.raises(ValueError, match=r"5 to 9 of motor\.motor\.speed does not hold its value 4"):
+        sliders_of(slider_crank, {"motor.motor.speed": (5.0, 9.0)})
+    assert usual_range("body.a.mass", "kg", 2.0, 1.0, 1.0) == (0.2, 8.0)
+    assert usual_range("joint.a.points[0][1]", "m", 2.0, 1.0, 1.0) == (1.5, 2.5)
+    assert usual_range("force.s.length", "m", 2.0, 1.0, 1.0) == (0.2, 8.0)
+    assert usual_range("body.a.angle", "rad", 0.0, 1.0, 1.0) == (-np.pi, np.pi)
+    assert usual_range("pin.B.velocity[1]", "m/s", 2.5e-16, 2.0, 3.0) == (-6.0, 6.0)  # rounding, of what is zero
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "section"),
+    [
+        ("joint.A.points[1][0]", "A point 2 x", "Joints"),
+        ("gravity[1]", "gravity y", "Gravity"),
+        ("motor.motor.speed", "motor speed", "Motors"),
+        ("body.arm.angular_velocity", "arm angular velocity", "Initial state"),
+        ("joint.mesh.radii[1]", "mesh radii 2", "Joints"),
+        ("pin.B[0]", "B x", "Pins"),
+    ],
+)
+def test_what_a_slider_is_called(name, label, section):
+    assert (label_of(name), section_of(name)) == (label, section)
+
+
+def test_symbols_follow_the_numbers_that_they_are_made_of():
+    """With other numbers every place that follows is where the symbols of the changed mechanism have it."""
+    mechanism = udk.library.four_bar()
+    other = mechanism.with_parameters({"pin.C": [2.9, 1.8]})
+
+    def symbols(m):
+        still = Motion(ts=np.zeros(1), q=np.asarray(m.q0)[None], v=np.zeros((1, len(m.bodies), 3)))
+        record, poses = run_record(m, still, "", (), False, None)
+        return record, udk.animate(m, still, measures=()).data["runs"][0]["symbols"], poses
+
+    (record, before, _), (_, after, _) = symbols(mechanism), symbols(other)
+    rows = followers(mechanism, record, before)
+    numbers = np.concatenate([np.ravel(x) for x in other.numbers])
+    assert len(rows["frames"]) > 10 and len(rows["points"]) > 10
+    for k, which, x, y in rows["frames"]:
+        anchor = after[k]["frame"] if which < 0 else after[k]["frame"][which]
+        np.testing.assert_allclose(anchor[1:3], numbers[[x, y]], atol=1e-12)
+    for k, row, x, y in rows["points"]:
+        np.testing.assert_allclose(after[k]["points"][row], numbers[[x, y]], rtol=1e-6, atol=1e-6)  # seven digits are written
+    links = [k for k, s in enumerate(before) if s["layer"] == "link"]
+    assert {k for k, *_ in rows["points"]} == set(links)  # all of them
+
+
+def test_a_run_that_begins_elsewhere_keeps_its_beginning():
+    pendulum = udk.library.simple_pendulum()
+    run = udk.simulate(pendulum, np.linspace(0.0, 0.5, 6))
+    assert udk.animate(pendulum, run, measures=(), live=["gravity"]).data["live"]["start"] is None
+    later = Motion(ts=np.asarray(run.ts), q=np.asarray(run.q)[[5] * 6], v=np.asarray(run.v)[[5] * 6])
+    start = udk.animate(pendulum, later, measures=(), live=["gravity"]).data["live"]["start"]
+    np.testing.assert_allclose(start["q"], np.ravel(run.q[5]))
+    np.testing.assert_allclose(start["v"], np.ravel(run.v[5]))
+
+
+def test_ten_seconds_are_simulated_where_no_run_is_given():
+    animation = udk.animate(udk.library.simple_pendulum(), live=["gravity[1]"])
+    assert (animation.data["start"], animation.data["end"]) == (0.0, 10.0)
+    assert animation.data["runs"][0]["measures"][0]["name"] == "violation"
+
+
+def test_the_torque_of_a_driver_is_among_its_measures(live):
+    assert "torque of motor" in [m["name"] for m in live.data["runs"][0]["measures"]]
+
+
+def test_what_cannot_be_live_says_why(slider_crank, run):
+    with pytest.raises(SceneError, match=r"pin\.Q"):
+        udk.animate(slider_crank, run, live=["pin.Q"])
+    with pytest.raises(ValueError, match="one mechanism and one solution"):
+        udk.animate(slider_crank, {"one": run, "two": run}, live=True)
+    with_events: Any = SimpleNamespace(ts=run.ts, q=run.q, v=run.v, events=object())
+    with pytest.raises(ValueError, match="events cannot be solved anew"):
+        udk.animate(slider_crank, with_events, live=True)

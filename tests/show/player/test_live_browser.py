@@ -1,0 +1,310 @@
+"""Live pages in headless Chromium: they simulate what Python simulates, and sliders, a hand and addresses do what they say."""
+
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import udkjax as udk
+from tests.show.player.test_browser import HOST, PLAYER, on_screen, picture, plain, ring_centre, until
+from udkjax.show.player.page import as_json, module
+from udkjax.show.player.sketch import THEMES
+
+TS = np.linspace(0.0, 2.0, 41)
+LIVE = f"{PLAYER}.live"
+SCENES = sorted(udk.library.__all__)
+FAST = ("double_pendulum", "slider_crank")
+every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
+
+
+@pytest.fixture(scope="module")
+def opened(browser, tmp_path_factory):
+    """Open an animation: a function of it, with what is behind the address, and of the window's properties."""
+
+    @contextmanager
+    def open_page(animation, address="", script="", width=1000, height=700, **options):
+        path = tmp_path_factory.mktemp("pages") / "page.html"
+        animation.save(path)
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
+        page = context.new_page()
+        problems, requests = [], []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("console", lambda message: problems.append(message.text) if message.type in ("error", "warning") else None)
+        page.on("request", lambda request: requests.append(request.url))
+        if script:
+            page.add_init_script(script)
+        page.goto(path.as_uri() + address)
+        until(page, f"Boolean({PLAYER})")
+        page.evaluate(f"{LIVE}.ready")
+        yield page
+        assert problems == []
+        assert requests == [path.as_uri()]  # the page itself, and nothing else
+        context.close()
+
+    return open_page
+
+
+@pytest.fixture(scope="module")
+def live(slider_crank):
+    names = ["motor.motor.speed", "pin.P", "pin.B", "link.rod.mass"]
+    return udk.animate(slider_crank, udk.simulate(slider_crank, TS), live=names)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    mechanism = udk.library.double_pendulum()
+    return mechanism, udk.animate(mechanism, udk.simulate(mechanism, TS), live=["gravity"], measures=("violation", "energy"))
+
+
+def shown_q(page):
+    return np.array(page.evaluate(f"[...{LIVE}.run.q]")).reshape(len(page.evaluate(f"[...{LIVE}.run.ts]")), -1)
+
+
+def measure(page, name):
+    return np.array(page.evaluate(f"[...{LIVE}.run.measures.find(m => m.name === {name!r}).values]"))
+
+
+def note(page):
+    return page.locator(".note").text_content()
+
+
+def move(page, label, value):
+    """Move a slider as a hand would, and wait for the picture."""
+    number = page.get_by_role("spinbutton", name=f"{label}, number", exact=True)
+    number.fill(str(value))
+    number.press("Enter")
+    page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def show_all(page):
+    for section in page.locator("details:not([open]) summary").all():
+        section.click()
+
+
+@every_scene
+def test_the_motion_is_the_one_that_python_simulates(opened, name):
+    """With other numbers; and its energies and torques, too."""
+    mechanism, ts = getattr(udk.library, name)(), TS * (0.015 if name == "andrews_squeezer" else 1.0)
+    given = {"gravity[1]": -6.0} | ({"motor.motor.speed": 3.0} if name == "slider_crank" else {})
+    animation = udk.animate(mechanism, udk.simulate(mechanism, ts), live=list(given))
+    other = mechanism.with_parameters(given)
+    run = udk.simulate(other, ts)
+    energy, efforts = udk.energy(other, run), udk.efforts(other, run)
+    with opened(animation) as page:
+        page.evaluate(f"{LIVE}.change({given})")
+        length = float(udk.analyse(mechanism).length)
+        assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), rtol=0, atol=1e-7 * max(length, 1.0))
+        unit = max(1.0, float(np.abs(energy.total).max()))
+        assert_allclose(measure(page, "kinetic energy"), energy.kinetic, rtol=0, atol=1e-6 * unit)
+        assert_allclose(measure(page, "potential energy"), energy.potential, rtol=0, atol=1e-6 * unit)
+        assert measure(page, "violation").max() < 1e-9 * max(length, 1.0)
+        for driver, values in efforts.items():
+            shown = measure(page, f"torque of {driver}")
+            assert_allclose(shown, values, rtol=0, atol=1e-6 * max(1.0, float(np.abs(values).max())))
+
+
+def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
+    with opened(live) as page:
+        plain(page)
+        show_all(page)
+        move(page, "P x", 0.3)
+        assert "solved anew" in note(page)
+        other = slider_crank.with_parameters({"pin.P[0]": 0.3})
+        run = udk.simulate(other, TS)
+        assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), atol=1e-7)
+        page.get_by_role("button", name="First motion").click()  # no ghost
+        page.evaluate(f"{PLAYER}.seek({TS[13]})")
+        place = np.asarray(run.q[13, 0])
+        arm = np.asarray(other.joints["P"].points)[other.joints["P"].bodies.index("crank")]
+        turn = np.array([[np.cos(place[2]), -np.sin(place[2])], [np.sin(place[2]), np.cos(place[2])]])
+        expected = on_screen(page, 0, place[:2] + turn @ arm)
+        assert np.abs(ring_centre(picture(page), expected, THEMES["light"]["ink"]) - expected).max() < 0.6
+
+
+def test_a_slider_by_mouse_and_keys(opened, live):
+    with opened(live) as page:
+        slider = page.get_by_role("slider", name="motor speed")
+        box = slider.bounding_box()
+        page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + box["height"] / 2)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + box["height"] / 2, steps=7)
+        page.mouse.up()
+        until(page, f"!{LIVE}.dirty && {LIVE}.changed")
+        speed = page.evaluate(f"{LIVE}.values[0]")
+        assert speed == pytest.approx(-4.0, abs=0.5)
+        assert_allclose(np.diff(shown_q(page)[:, 2]) / np.diff(TS), speed, atol=1e-6)
+        slider.press("ArrowRight")
+        assert page.evaluate(f"{LIVE}.values[0]") > speed
+
+
+def test_loops_that_cannot_be_closed_are_said_and_the_last_motion_stays(opened):
+    mechanism = udk.library.parallelogram()
+    with opened(udk.animate(mechanism, udk.simulate(mechanism, TS), live=["joint.A3.points"], measures=())) as page:
+        before = shown_q(page)
+        move(page, "A3 point 1 x", 9.0)  # the third link is half a metre long
+        assert "do not close" in note(page) and "m. The last motion" in note(page)
+        assert page.locator(".note.bad").count() == 1
+        assert_array_equal(shown_q(page), before)
+        move(page, "A3 point 1 x", 2.0)
+        assert "solved anew" in note(page) and page.locator(".note.bad").count() == 0
+        assert_allclose(shown_q(page), before, atol=1e-4)
+        move(page, "A3 point 2 y", 0.01)  # three unequal links: the constraint that was redundant locks them
+        assert "0 degrees of freedom here, 1 at first" in note(page) or "do not close" in note(page)
+
+
+def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
+    with opened(live) as page:
+        first, values = shown_q(page), page.evaluate(f"[...{LIVE}.values]")
+        symbols = page.evaluate(f"JSON.stringify({LIVE}.run.symbols)")
+        show_all(page)
+        move(page, "P x", 0.4)
+        move(page, "rod mass", 3.0)
+        assert not np.array_equal(shown_q(page), first)
+        page.locator(".panel canvas").press("Backspace")
+        assert_array_equal(shown_q(page), first)
+        assert page.evaluate(f"[...{LIVE}.values]") == values
+        assert page.evaluate(f"JSON.stringify({LIVE}.run.symbols)") == symbols
+        assert page.get_by_role("spinbutton", name="rod mass, number").input_value() == "1.5"
+
+
+def test_the_address_has_the_numbers(opened, live):
+    with opened(live) as page:
+        show_all(page)
+        move(page, "P x", 0.35)
+        page.wait_for_timeout(400)
+        shown, address = shown_q(page), page.evaluate("location.hash")
+        assert "0.35" in address and "rod" not in address
+    with opened(live, address) as page:
+        assert_array_equal(shown_q(page), shown)
+    with opened(live, "#pin.P[0]=nonsense&pin.Q=3&<b>=1") as page:
+        assert not page.evaluate(f"{LIVE}.changed")
+
+
+def test_the_first_motion_is_a_ghost(opened, live):
+    with opened(live) as page:
+        plain(page)
+        show_all(page)
+        page.evaluate(f"{PLAYER}.seek(0)")
+        move(page, "motor speed", -4.0)  # the same place at the start; later, the mirror image
+        page.evaluate(f"{PLAYER}.seek(0.3)")
+        with_ghost = picture(page)[60:560, :690]
+        page.locator(".panel canvas").press("g")
+        without = picture(page)[60:560, :690]
+        assert (np.abs(with_ghost - without).max(axis=2) > 20).sum() > 500
+        assert page.get_by_role("button", name="First motion").get_attribute("aria-pressed") == "false"
+
+
+def drag(page, start, end, hold):
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=6)
+    page.wait_for_timeout(hold)
+
+
+def test_a_hand_pulls_through_the_dynamics(opened, pendulum):
+    mechanism, animation = pendulum
+    with opened(animation) as page:
+        total = measure(page, "kinetic energy") + measure(page, "potential energy")
+        assert np.ptp(total) < 1e-5  # recorded in single precision
+        q = np.array(page.evaluate(f"[...{LIVE}.run.pose(0)]")).reshape(-1, 3)
+        start = on_screen(page, 0, q[1, :2])
+        goal = on_screen(page, 0, (0.5, 0.4))
+        page.mouse.move(*start)
+        assert page.locator(".panel canvas.holds").count() == 1
+        drag(page, start, goal, 1500)
+        held = page.evaluate(f"({{t: {LIVE}.hand.state.t, q: [...{LIVE}.hand.state.q], spring: {LIVE}.hand.spring}})")
+        assert held["t"] > 0.3  # it is in time
+        reached = np.array(held["q"]).reshape(-1, 3)[1, :2]
+        assert np.linalg.norm(reached - [0.5, 0.4]) < 0.5 * np.linalg.norm(q[1, :2] - [0.5, 0.4])
+        page.mouse.up()
+        page.evaluate(f"{PLAYER}.pause()")
+        ts = np.array(page.evaluate(f"[...{LIVE}.run.ts]"))
+        after = ts >= page.evaluate(f"{LIVE}.run.ts[{LIVE}.run.ts.length - 1]") - 1.9
+        total = measure(page, "kinetic energy") + measure(page, "potential energy")
+        assert np.ptp(total[after]) < 1e-5 * max(1.0, np.abs(total).max())  # free again: nothing is added
+        assert measure(page, "violation").max() < 1e-9
+        # The motion behind the hand is that of Python from the same state.
+        k = int(np.flatnonzero(after)[0])
+        states = np.array(page.evaluate(f"[...{LIVE}.run.q]")).reshape(len(ts), -1, 3)
+        rates = np.array(page.evaluate(f"[...{LIVE}.run.v]")).reshape(len(ts), -1, 3)
+        run = udk.simulate(mechanism, ts[k : k + 10], udk.State(states[k], rates[k]))
+        assert_allclose(states[k : k + 10], run.q, atol=1e-6)
+
+
+def test_beside_the_bodies_a_drag_moves_the_view(opened, pendulum):
+    with opened(pendulum[1]) as page:
+        before = on_screen(page, 0, (0, 0))
+        box = page.locator(".panel canvas").bounding_box()
+        drag(page, (box["x"] + 30, box["y"] + 30), (box["x"] + 90, box["y"] + 60), 50)
+        page.mouse.up()
+        assert np.abs(on_screen(page, 0, (0, 0)) - before - [60, 30]).max() < 5
+        assert not page.evaluate(f"{LIVE}.changed")
+
+
+def test_a_finger_pulls(opened, pendulum):
+    with opened(pendulum[1], "", "", 390, 844, has_touch=True, is_mobile=True) as page:
+        q = page.evaluate(f"[...{LIVE}.run.pose(0)]")
+        x, y = on_screen(page, 0, (q[3], q[4]))
+        client = page.context.new_cdp_session(page)
+
+        def touch(kind, *place):
+            points = [{"x": place[0], "y": place[1]}] if place else []
+            client.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        touch("touchStart", x, y)
+        for k in range(1, 6):
+            touch("touchMove", x - 10 * k, y - 10 * k)
+        page.wait_for_timeout(300)
+        assert page.evaluate(f"{LIVE}.hand !== null && {LIVE}.hand.state.t > 0.02")
+        touch("touchEnd")
+        until(page, f"{LIVE}.hand === null && {PLAYER}.playing")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_without_webassembly_it_plays_what_was_recorded(opened, live):
+    with opened(live, script="delete window.WebAssembly") as page:
+        assert "no WebAssembly" in note(page) and "recorded" in note(page)
+        assert page.get_by_role("slider", name="motor speed").is_disabled()
+        page.get_by_role("button", name="play").click()
+        until(page, f"{PLAYER}.time > 0.05")
+
+
+def test_it_is_readable_in_the_dark_and_on_a_telephone(opened, live):
+    for width, height, scheme in ((1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")):
+        with opened(live, width=width, height=height, color_scheme=scheme) as page:
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            canvas, panel = (page.locator(name).bounding_box() for name in (".panel canvas", ".live"))
+            assert canvas["width"] > 300 and canvas["height"] > 200 and panel["height"] > 150
+            colours = [
+                page.locator(".live .name").first.evaluate(f"e => getComputedStyle(e.closest('.player')).{name}")
+                for name in ("color", "backgroundColor")
+            ]
+            assert contrast(*colours) > 7
+            sizes = page.locator(".live *").evaluate_all("all => all.map(e => parseFloat(getComputedStyle(e).fontSize))")
+            assert min(sizes) >= 11
+
+
+def contrast(one, two):
+    """The ratio of the luminances of two colours, as the guidelines for accessible content define it."""
+
+    def luminance(text):
+        parts = np.array([int(part) for part in text[4:-1].split(",")]) / 255
+        return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722]
+
+    dark, bright = sorted(map(luminance, (one, two)))
+    return (bright + 0.05) / (dark + 0.05)
+
+
+def test_the_widget_simulates_without_python(browser, live, tmp_path):
+    path = tmp_path / "host.html"
+    path.write_text(HOST.replace("SOURCE", as_json(module())).replace("DATA", as_json(live.data)), encoding="utf-8")
+    page = browser.new_page()
+    page.goto(path.as_uri())
+    until(page, "Boolean(window.cleanup)")
+    widget = "document.getElementById('one').player"
+    page.evaluate(f"{widget}.live.ready")
+    page.evaluate(f"{widget}.live.change({{'motor.motor.speed': 2.0}})")
+    angle = np.array(page.evaluate(f"[...{widget}.live.run.q]")).reshape(len(TS), -1)[:, 2]
+    assert_allclose(angle, 2.0 * TS, atol=1e-7)
+    page.close()

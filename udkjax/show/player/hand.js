@@ -1,0 +1,55 @@
+// A hand that pulls at a body by a spring, through the mechanism's own dynamics and in time.
+
+const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second of the screen, with half of all masses on it
+const DAMPING = 0.7;  // of the critical one
+const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
+
+/** Pulls while it is held; `live` gives the engine, and shows what comes of it. */
+export class Hand {
+  constructor(live, held, target) {
+    const {engine, values} = live, numbers = engine.numbers(values), {speed} = live.player;
+    const mass = 0.5 * engine.data.masses.reduce((sum, [k]) => sum + numbers[k], 0), rate = SWING / speed;
+    Object.assign(this, {live, held, target});
+    this.spring = {stiffness: mass * rate ** 2, damping: 2 * DAMPING * mass * rate};
+    this.before = null;
+    this.state = live.stateNow();
+    live.begin(this.state);
+    this.request = requestAnimationFrame(now => this.frame(now));
+  }
+
+  frame(now) {
+    this.request = requestAnimationFrame(later => this.frame(later));
+    const seconds = this.before === null ? 0 : Math.min((now - this.before) / 1000, LONGEST_FRAME);
+    this.before = now;
+    if (seconds > 0) this.advance(seconds * this.live.player.speed);
+  }
+
+  advance(step) {
+    const {live, state, held, spring, target} = this, t = state.t + step;
+    const pull = {body: held.body, point: held.point, target, ...spring};
+    const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
+    if (!run.done) return live.say(`the pull is too much: ${run.words}`, true);
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n)};
+    live.append(this.state, run.violation[1]);
+    return null;
+  }
+
+  move(target) { this.target = target; }
+
+  release() {
+    cancelAnimationFrame(this.request);
+    this.live.goOn(this.state);
+  }
+}
+
+/** The body that is drawn at a place of the screen, the uppermost first, and the point in its frame; null where there is none. */
+export function bodyAt(painter, symbols, [x, y], reach) {
+  for (const symbol of [...symbols].reverse()) {
+    const {frame} = symbol;
+    if (frame.length === 2 || frame[0] < 0 || !painter.holds(symbol, x, y, reach)) continue;
+    const body = frame[0], {pose, view} = painter, angle = pose[3 * body + 2];
+    const dx = (x - view.x) / view.scale - pose[3 * body], dy = (view.y - y) / view.scale - pose[3 * body + 1];
+    return {body, point: [Math.cos(angle) * dx + Math.sin(angle) * dy, Math.cos(angle) * dy - Math.sin(angle) * dx]};
+  }
+  return null;
+}

@@ -1,0 +1,310 @@
+// A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motion is closed and solved anew.
+
+import {loadEngine} from "./engine.js";
+import {Follower} from "./follow.js";
+import {Hand, bodyAt} from "./hand.js";
+import {Run, place} from "./motion.js";
+import {SliderPanel} from "./sliders.js";
+
+const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
+const GHOST = 0.28;  // how much one sees of the first motion
+const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
+const FITTED = 300;  // instants that the whole view is fitted to
+const SETTLED = 150;  // ms without a change until the address says the numbers
+
+export class Live {
+  constructor(player, data) {
+    this.player = player;
+    this.data = data.live;
+    this.run = player.runs[0];
+    this.ghost = new Run(data.runs[0]);
+    this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame};
+    this.follower = new Follower(this.run, this.data.follow);
+    this.values = Float64Array.from(this.data.sliders, s => s.value);
+    this.changed = this.dirty = false;
+    this.hand = null;
+    this.solving = 0;  // ms, of the last motion
+    this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
+      ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
+      reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
+      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.share()},
+    });
+    player.show.ghost = true;
+    player.buttons.ghost = this.panel.buttons.ghost;
+    this.panel.enable(false);
+    this.ready = this.load();
+  }
+
+  async load() {
+    try {
+      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
+      this.engine = await loadEngine(this.data.engine);
+    } catch (error) {
+      this.say(`This browser cannot simulate (${error.message}): the page plays what was recorded.`, true);
+      return false;
+    }
+    this.panel.enable(true);
+    this.greet();
+    this.readAddress();
+    return true;
+  }
+
+  keys() {
+    return {g: () => this.player.toggle("ghost"), Backspace: () => this.engine && this.reset()};
+  }
+
+  greet() { this.say("Move a slider, or pull at a body: the motion is solved anew."); }
+
+  say(words, bad = false) { this.panel.say(words, bad); }
+
+  // Numbers
+
+  set(k, value) {
+    this.values[k] = value;
+    this.solveSoon();
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => this.writeAddress(), SETTLED);
+  }
+
+  /** Change numbers by the names of their parameters, and solve at once. */
+  change(numbers) {
+    this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
+    this.panel.show(this.values);
+    this.solve();
+  }
+
+  /** Solve before the next picture, once for all changes until then. */
+  solveSoon() {
+    if (this.dirty) return;
+    this.dirty = true;
+    requestAnimationFrame(() => { if (this.dirty) this.solve(); });
+  }
+
+  reset() {
+    this.drop();
+    this.values = Float64Array.from(this.data.sliders, s => s.value);
+    this.panel.show(this.values);
+    const {ts, q, v, measures, end, frame} = this.first;
+    this.run.replace(ts, q, v, measures, frame);
+    this.follower.follow(this.engine.numbers(null));
+    this.player.setEnd(end);
+    this.changed = this.dirty = false;
+    this.writeAddress();
+    this.greet();
+    this.player.draw();
+  }
+
+  // Motion
+
+  solve() {
+    const start = performance.now(), {engine, first, values} = this;
+    this.dirty = false;
+    this.drop();
+    const state = engine.close(values, {t: first.ts[0], ...this.data.start});
+    if (state.closed) {
+      const run = engine.run(values, state, first.ts);
+      this.follower.follow(engine.numbers(values));
+      this.player.setEnd(first.end);
+      this.show(run);
+      const ended = run.done ? "" : `The motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
+      const freedoms = engine.size - state.rank, usual = engine.size - this.data.engine.rank;
+      const rank = freedoms === usual ? "" : ` ${freedoms} degrees of freedom here, ${usual} at first.`;
+      this.say(ended + rank || this.timing(start, run), !run.done);
+    } else {
+      const gap = this.lengthOf(state.violation);
+      this.say(`The loops do not close with these numbers: they stay open by ${gap}. The last motion that does is shown.`, true);
+    }
+    this.player.draw();
+  }
+
+  timing(start, run) {
+    this.solving = performance.now() - start;
+    const span = run.ts[run.ts.length - 1] - run.ts[0];
+    return `${+span.toPrecision(3)} s solved anew in ${this.solving.toFixed(1)} ms, ${run.steps} steps.`;
+  }
+
+  lengthOf(violation) { return `${(violation * this.data.engine.scales.length).toPrecision(2)} m`; }
+
+  show(run) {
+    const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
+    const part = {...run, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
+    this.run.replace(part.ts, part.q, part.v, this.measures(part), 1);
+    this.changed = true;
+  }
+
+  /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
+  measures(run) {
+    const found = this.engine.measure(this.values, run, true), {length} = this.data.engine.scales;
+    const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
+    const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
+    const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
+      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
+    return this.first.measures.filter(m => m.name in known).map(m => ({...m, values: known[m.name]}));
+  }
+
+  // The hand
+
+  /** The state at the time that is shown. */
+  stateNow() {
+    const t = this.player.t, {q, v} = this.run.state(t);
+    return {...this.engine.close(this.values, {t, q, v}), t};
+  }
+
+  /** What is on a panel's canvas at a place (px), if a hand can grasp it. */
+  bodyAt(canvas, point, pointer = "mouse") {
+    if (!this.engine) return null;
+    const painter = this.player.painter(canvas);
+    painter.pose = this.run.pose(this.player.t);
+    return bodyAt(painter, this.run.symbols, point, REACH[pointer] ?? REACH.touch);
+  }
+
+  grasp(canvas, point, pointer) {
+    const held = this.bodyAt(canvas, point, pointer);
+    if (!held) return false;
+    if (this.dirty) this.solve();
+    this.player.pause();
+    this.hand = new Hand(this, held, this.metres(canvas, point));
+    return true;
+  }
+
+  move(canvas, point) { this.hand?.move(this.metres(canvas, point)); }
+
+  drop() {
+    const {hand} = this;
+    this.hand = null;
+    if (hand) cancelAnimationFrame(hand.request);
+  }
+
+  release() {
+    const {hand} = this;
+    this.hand = null;
+    hand?.release();
+  }
+
+  metres(canvas, [x, y]) {
+    const view = this.player.view(canvas.clientWidth, canvas.clientHeight);
+    return [(x - view.x) / view.scale, (view.y - y) / view.scale];
+  }
+
+  /** Begin a record that a hand goes on with: of what was until now. */
+  begin(state) {
+    const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
+    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.data.engine.scales;
+    this.record = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+    this.append(state, state.violation);
+  }
+
+  /** Add one state to the record, and show it. */
+  append({t, q, v}, violation) {
+    const {record} = this;
+    record.ts.push(t);
+    record.q.push(...q);
+    record.v.push(...v);
+    record.violation.push(violation);
+    this.showRecord();
+    this.player.setEnd(Math.max(t, this.player.data.end));
+    this.player.t = t;
+    this.player.draw();
+  }
+
+  showRecord() {
+    const run = Object.fromEntries(Object.entries(this.record).map(([name, x]) => [name, Float64Array.from(x)]));
+    this.show({...run, count: run.ts.length});
+  }
+
+  /** Solve on from where the hand lets go, for as long as the first motion is. */
+  goOn(state) {
+    const {engine, first, record} = this, n = engine.size, times = first.ts.map(t => t - first.ts[0] + state.t);
+    const run = engine.run(this.values, state, times);
+    for (let k = 1; k < run.count; k++) {
+      record.ts.push(run.ts[k]);
+      record.q.push(...run.q.subarray(k * n, (k + 1) * n));
+      record.v.push(...run.v.subarray(k * n, (k + 1) * n));
+      record.violation.push(run.violation[k]);
+    }
+    this.showRecord();
+    this.player.setEnd(record.ts[record.ts.length - 1]);
+    this.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
+    this.player.play();
+  }
+
+  // Pictures
+
+  paintGhost(painter, context, t) {
+    if (!this.changed || !this.player.show.ghost) return;
+    painter.pose = this.ghost.pose(Math.min(t, this.first.end));
+    context.globalAlpha = GHOST;
+    painter.draw(this.ghost.symbols);
+    context.globalAlpha = 1;
+  }
+
+  paintHand(painter) {
+    const {hand} = this;
+    if (!hand) return;
+    const from = painter.px(place(painter.pose, [hand.held.body, ...hand.held.point])), to = painter.px(hand.target);
+    painter.line([from, to], 1.6, painter.theme.accent, {dash: [5, 3]});
+    painter.circle(from, 3.2 * painter.pt, {fill: painter.theme.accent});
+    painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
+  }
+
+  /** What the whole view shows: all that is drawn of the motion as it is now. */
+  fit() {
+    const {bounds} = this.player.data, run = this.run, box = [Infinity, Infinity, -Infinity, -Infinity];
+    this.first.bounds ??= bounds.slice();
+    const anchors = run.marks.flatMap(m => (m.points ?? [m.at]).filter(Boolean).map(([x, y]) => [m.body ?? -1, x, y]));
+    const stride = Math.max(1, Math.floor(run.ts.length / FITTED));
+    for (let i = 0; i < run.ts.length; i += stride) {
+      const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
+      for (const anchor of anchors) {
+        const [x, y] = place(pose, anchor);
+        box.splice(0, 4, Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y));
+      }
+    }
+    const least = 0.1 * this.data.engine.scales.length;  // a single bar on a line has no height
+    const grow = [0, 1].map(k => Math.max(0, least - (box[k + 2] - box[k]) / 2));
+    const now = [box[0] - grow[0], box[1] - grow[1], box[2] + grow[0], box[3] + grow[1]];
+    bounds.splice(0, 4, ...(this.changed ? now : this.first.bounds));
+  }
+
+  // The address
+
+  numbersInWords() {
+    const pairs = this.data.sliders.map((s, k) => [s.name, this.values[k]]).filter(([, x], k) => x !== this.data.sliders[k].value);
+    return new URLSearchParams(pairs.map(([name, x]) => [name, String(x)])).toString();
+  }
+
+  writeAddress() {
+    if (!this.player.options.fill) return;
+    try {
+      history.replaceState(null, "", `#${this.numbersInWords()}`);
+    } catch { /* a page within another has no address of its own */ }
+  }
+
+  readAddress() {
+    if (!this.player.options.fill) return;
+    const given = new URLSearchParams(location.hash.slice(1));
+    let any = false;
+    this.data.sliders.forEach((slider, k) => {
+      const value = Number(given.get(slider.name));
+      if (!given.has(slider.name) || !Number.isFinite(value)) return;
+      this.values[k] = value;
+      any = true;
+    });
+    if (!any) return;
+    this.panel.show(this.values);
+    this.solve();
+  }
+
+  async share() {
+    const words = this.numbersInWords();
+    this.writeAddress();
+    try {
+      await navigator.clipboard.writeText(this.player.options.fill ? location.href : `#${words}`);
+      this.say("The address with these numbers is copied.");
+    } catch {
+      this.say(this.player.options.fill ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+    }
+  }
+}
+

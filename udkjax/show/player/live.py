@@ -1,0 +1,54 @@
+"""What a live page has besides: the engine of its mechanism, sliders, and how its symbols follow what they change.
+
+live     engine (udkjax/integrate/portable), sliders (live_parameters.py), follow (followers.py), start: the state that closing
+         begins with, or null where that is the scene's own guess; work: the name of the measure of energy
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from udkjax.equations import analyse
+from udkjax.integrate.portable import portable_engine
+from udkjax.scene import Mechanism
+from udkjax.scene.requirements import ArgumentError
+from udkjax.show.player.followers import followers
+from udkjax.show.player.live_parameters import Live, sliders_of
+from udkjax.show.player.measure_curves import ShownMotion
+from udkjax.show.player.packing import Json
+
+SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteristic time: the scene's own initial state
+
+
+def live_data(mechanism: Mechanism, solution: ShownMotion, record: Mapping, symbols: Sequence[Json], live: Live) -> Json:
+    """Return what a live page has besides, as plain data.
+
+    Raises:
+        SceneError: a parameter is unknown.
+        ArgumentError: the mechanism, or the run, is nothing that a page can solve anew; says why.
+    """
+    if getattr(solution, "events", None) is not None:
+        raise ArgumentError("live: a run with events cannot be solved anew in a page; leave out live, or the events")
+    sliders = sliders_of(mechanism, live)
+    engine = portable_engine(mechanism, [slider.name for slider in sliders])
+    if engine.data["why"]:
+        raise ArgumentError(f"live: a page cannot solve the motion anew: {engine.data['why']}")
+    return {
+        "engine": engine.data,
+        "sliders": [slider.data for slider in sliders],
+        "follow": followers(mechanism, record, symbols),
+        "start": _start(mechanism, solution),
+    }
+
+
+def _start(mechanism: Mechanism, solution: ShownMotion) -> Json | None:
+    """Return the initial state of a run that does not begin where the scene says."""
+    from udkjax.integrate.assembly import close
+
+    t = float(np.asarray(solution.ts)[0])
+    q, v = (np.asarray(x, float)[0] for x in (solution.q, solution.v))
+    closed, scales = close(mechanism, t).state, analyse(mechanism).scales
+    length, rate = float(scales.length), float(scales.rate) or 1.0
+    unit = np.array([length, length, 1.0])
+    off = max(np.abs((q - np.asarray(closed.q)) / unit).max(), np.abs((v - np.asarray(closed.v)) / (unit * rate)).max())
+    return None if off < SAME_STATE else {"q": q.ravel().tolist(), "v": v.ravel().tolist()}

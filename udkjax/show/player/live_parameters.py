@@ -1,0 +1,119 @@
+"""Sliders of a live page: which numbers of a scene they change, what they are called, and from where to where they go."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.equations import analyse
+from udkjax.integrate.portable import scalar_parameters
+from udkjax.scene import Mechanism
+from udkjax.scene.units import units_of
+from udkjax.show.player.packing import Json
+
+# Names of parameters, whole or one entry, by themselves or with the range of their sliders; True: all that a scene has.
+Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]
+
+SECTIONS = {
+    "motor": "Motors",
+    "driver": "Drivers",
+    "gravity": "Gravity",
+    "force": "Forces",
+    "load": "Loads",
+    "spring": "Springs",
+    "damper": "Dampers",
+    "pin": "Pins",
+    "joint": "Joints",
+    "body": "Bodies",
+    "link": "Links",
+}  # in their order; all others follow
+NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of what is never negative
+INITIAL = "Initial state"
+INITIAL_FIELDS = ("velocity", "angular_velocity")  # and of bodies their position and angle, which assembly starts from
+SIZES = ("length", "radius", "width", "thickness", "radii")  # lengths that are never negative; all others are places
+ROUNDING = 1e-9  # of the scene's units: a number below it stands for zero
+LARGEST_GRAVITY = 20.0  # m/s2: twice that of the earth
+
+
+class Slider(NamedTuple):
+    """One number that a page changes: its parameter, what it is called and where, its range."""
+
+    name: str
+    label: str
+    section: str
+    unit: str
+    value: float
+    low: float
+    high: float
+
+    @property
+    def data(self) -> Json:
+        """The slider as JSON."""
+        return self._asdict()
+
+
+def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
+    """Return the sliders of the numbers that are wanted.
+
+    Raises:
+        SceneError: A name is no parameter.
+        ValueError: A range does not hold the value that the number has.
+    """
+    wanted = None if isinstance(live, bool) else list(live)
+    ranges = live if isinstance(live, Mapping) else {}
+    scales = analyse(mechanism).scales
+    length, rate = float(scales.length), float(scales.rate) or 1.0
+    found = []
+    for name, value in scalar_parameters(mechanism, wanted).items():
+        given = ranges.get(name) or ranges.get(_base(name))
+        unit = units_of(mechanism, name)
+        low, high = given or usual_range(name, unit, value, length, rate)
+        if not low <= value <= high or not low < high:
+            raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not hold its value {value:g}")
+        found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high)))
+    order = [*dict.fromkeys(SECTIONS.values())]
+    return sorted(found, key=lambda slider: order.index(slider.section) if slider.section in order else len(order))
+
+
+def section_of(name: str) -> str:
+    """Return the title below which a slider stands."""
+    parts = _base(name).split(".")
+    section, field = parts[0], parts[-1]
+    if field in INITIAL_FIELDS or (section == "body" and field in ("position", "angle")):
+        return INITIAL
+    return SECTIONS.get(section, f"{section.capitalize()}s")
+
+
+def label_of(name: str) -> str:
+    """Return what a parameter is called: `joint.A.points[1][0]` is "A point 2 x"."""
+    base, indices = _base(name), [int(k) for k in re.findall(r"\[(\d+)\]", name)]
+    parts = base.split(".")
+    words = parts[1:] if len(parts) > 1 else parts
+    text = " ".join(words).replace("_", " ")
+    if parts[-1] in ("points", "radii", "times", "values") and indices:
+        text = f"{text.removesuffix('s') if parts[-1] == 'points' else text} {indices.pop(0) + 1}"
+    if indices:
+        text += f" {'xy'[indices[-1]]}" if indices[-1] < 2 and len(indices) == 1 else "".join(f" {k + 1}" for k in indices)
+    return " ".join(dict.fromkeys(text.split(" ")))  # "motor speed" of the motor that is called motor
+
+
+def usual_range(name: str, unit: str, value: float, length: float, rate: float) -> tuple[float, float]:
+    """Return the range of a slider: positions go as far as a mechanism is large, other numbers to a few times their values."""
+    by_unit = {"m/s": length * rate, "rad/s": rate, "m": length, "rad": 1.0}
+    size = abs(value) if abs(value) > ROUNDING * by_unit.get(unit, 0.0) else 0.0
+    if unit == "m/s2":
+        return -max(LARGEST_GRAVITY, 2 * size), max(LARGEST_GRAVITY, 2 * size)
+    if unit in NOT_NEGATIVE or (unit == "m" and re.split(r"[.\[]", name)[-2 if "[" in name else -1] in SIZES):
+        return (size / 10, 4 * size) if size else (0.0, length if unit == "m" else 1.0)
+    if unit == "m":
+        return value - 0.5 * length, value + 0.5 * length
+    if unit == "rad":
+        return value - np.pi, value + np.pi
+    reach = 2 * size or by_unit.get(unit, 1.0)
+    return -reach, reach
+
+
+def _base(name: str) -> str:
+    """Return the name of the parameter that an entry is of."""
+    return re.sub(r"(\[\d+\])+$", "", name)
