@@ -27,12 +27,16 @@ BELOW = {
     "integrate": {"native", "equations", "scene", "pinv", "expressions"},
     "study": {"integrate", "equations", "scene", "pinv", "expressions"},
     "show": {"native", "study", "integrate", "equations", "scene", "pinv", "expressions"},
+    "studio": {"show", "native", "study", "integrate", "equations", "scene", "pinv", "expressions"},
 }
 ONLY_IN = {
     "diffrax": {"integrate", "cli"},
     "llvmlite": {"native"},
     "matplotlib": {"show"},
+    "starlette": {"studio"},
+    "tomlkit": {"studio"},
     "tyro": {"cli"},
+    "uvicorn": {"studio"},
     "msgspec": {"scene"},
     "distributed": {"study"},
 }

@@ -16,7 +16,10 @@ EXTRAS = {
     "matplotlib": "plot",
     "optax": "identify",
     "pandas": "io",
+    "starlette": "studio",
+    "tomlkit": "studio",
     "tyro": "cli",
+    "uvicorn": "studio",
     "xarray": "io",
 }
 

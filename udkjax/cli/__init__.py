@@ -15,6 +15,7 @@ COMMANDS = (
     "report",
     "simulate",
     "animate",
+    "studio",
     "sweep",
     "identify",
     "kinematics",

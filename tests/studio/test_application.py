@@ -1,0 +1,207 @@
+"""The five routes: list, open, save, compile, diagnose."""
+
+import math
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.studio.limits import RefusedError
+from udkjax.studio.templates import TEMPLATES
+from udkjax.studio.worker import Worker
+
+SIX_BAR = """format = 2
+name = "six-bar" # of the studio's test
+units = {length = "mm"}
+ground = ["O2", "O4", "O6"]
+motor = [{pin = "O2", speed = "60 rpm"}]
+
+[pins]
+O2 = [0, 0]
+A = [30, 40]
+B = [160, 110]
+C = [110, 160]
+O4 = [180, 0]
+D = [250, 150]
+O6 = [250, 20]
+"""
+for _name, _pins, _width in (
+    ("crank", "O2 A", 15),
+    ("coupler", "A B C", 0),
+    ("rocker", "O4 B", 15),
+    ("floating", "C D", 15),
+    ("output", "O6 D", 15),
+):
+    SIX_BAR += f'\n[[link]]\nname = "{_name}"\npins = {_pins.split()}\ndensity = 7850\nthickness = 5\n'.replace("'", '"')
+    SIX_BAR += f"width = {_width}\n" if _width else ""
+ARMS = """format = 2
+ground = ["O", "C"]
+motor = [{pin = "O", speed = 1}]
+[pins]
+O = [0, 0]
+A = [0, 1]
+B = [1.5, 1.5]
+C = [2, 0]
+[[link]]
+name = "crank"
+pins = ["O", "A"]
+mass = 1
+[[link]]
+name = "coupler"
+pins = ["A", "B"]
+mass = 1
+[[link]]
+name = "rocker"
+pins = ["B", "C"]
+mass = 1
+"""
+
+
+def test_files_and_templates_are_listed(client):
+    (client.folder / "a.toml").write_text(SIX_BAR)
+    found = client.ask("list").json()
+    assert found["files"] == ["a.toml"]
+    assert [t["name"] for t in found["templates"]] == list(TEMPLATES)
+
+
+def test_a_file_is_opened_changed_and_saved(client):
+    (client.folder / "a.toml").write_text(SIX_BAR)
+    opened = client.ask("open", path="a.toml").json()
+    assert opened["text"] == SIX_BAR and opened["problems"] == [] and not opened["drawn"]
+    document = opened["document"]
+    document["pins"]["D"] = [255, 150]
+    compiled = client.ask("compile", text=opened["text"], document=document).json()
+    assert compiled["text"] == SIX_BAR.replace("D = [250, 150]", "D = [255, 150]")
+    assert compiled["problems"] == []
+    saved = client.ask("save", path="a.toml", text=compiled["text"], revision=opened["revision"])
+    assert saved.status_code == 200
+    assert (client.folder / "a.toml").read_text() == compiled["text"]
+    again = client.ask("save", path="a.toml", text=SIX_BAR, revision=opened["revision"])
+    assert again.status_code == 409 and again.json()["revision"] == saved.json()["revision"]
+
+
+def test_a_scene_says_where_its_bodies_are(client):
+    scene = client.ask("compile", text=SIX_BAR).json()["scene"]
+    mechanism = udk.loads(SIX_BAR)
+    assert scene["bodies"] == list(mechanism.bodies)
+    frames = [[*np.asarray(b.position), float(b.angle)] for b in mechanism.bodies.values()]
+    np.testing.assert_array_equal(scene["frames"], frames)
+    assert scene["duration"] == 2.0  # two turns at 60 rpm
+
+
+def test_a_recorded_motion_is_that_of_the_engine(client):
+    motion = client.ask("compile", text=SIX_BAR, engine="recorded").json()["motion"]
+    run = udk.simulate(udk.loads(SIX_BAR), np.array(motion["times"]), rtol=1e-8, atol=1e-8)
+    np.testing.assert_array_equal(np.reshape(motion["q"], run.q.shape), np.asarray(run.q))
+
+
+def test_mistakes_come_with_the_drawing(client):
+    answer = client.ask("compile", text=SIX_BAR.replace('"C", "D"', '"C"').replace("width = 15", ""), document=None).json()
+    assert answer["document"]["name"] == "six-bar" and answer["scene"] is None
+    assert any("width" in problem for problem in answer["problems"])
+    broken = client.ask("compile", text="format = ").json()
+    assert broken["document"] is None and "TOML" in broken["problems"][0]
+
+
+def test_numbers_that_are_none_are_named(client):
+    answer = client.ask("compile", text=SIX_BAR.replace("D = [250, 150]", "D = [nan, inf]"))
+    assert answer.status_code == 200
+    assert answer.json()["scene"] is None and "D" in answer.json()["problems"][0]
+    assert answer.json()["document"]["pins"]["D"] == ["nan", "inf"]
+
+
+def test_a_hundred_thousand_pins_are_refused_at_once(client):
+    text = "format = 2\n[pins]\n" + "".join(f"p{k}=[{k},0]\n" for k in range(100_000))
+    for route in ("compile", "diagnose"):
+        answer = client.ask(route, text=text)
+        assert answer.status_code == 413 and "characters" in answer.json()["problem"]
+    document = {"format": 2, "pins": {f"p{k}": [k, 0] for k in range(2_000)}}
+    assert client.ask("compile", text="", document=document).status_code == 413
+
+
+def test_files_of_format_1_are_drawn_anew(client):
+    (client.folder / "old.toml").write_text(udk.dumps(udk.library.parallelogram()))
+    opened = client.ask("open", path="old.toml").json()
+    assert opened["drawn"] and opened["document"]["format"] == 2
+
+
+def test_the_paper_linkage_is_diagnosed(client):
+    text = client.ask("open", template="parallelogram").json()["text"]
+    found = client.ask("diagnose", text=text).json()
+    assert (found["freedoms"], found["redundant"]) == (1, 1)
+    assert found["sets"][0]["constraints"] == ["A1", "A2", "A3", "B1", "B2", "B3"]
+    assert {fix["constraint"] for fix in found["sets"][0]["fixes"]} == {"A1", "A2", "A3", "B1", "B2", "B3"}
+    assert set(found["loose"]) == {"A1", "A2", "A3", "B1", "B2", "B3"}
+    assert "gravity" in found["motion"]
+
+
+def test_a_triangle_is_said_not_to_move(client):
+    text = (
+        ARMS.replace('motor = [{pin = "O", speed = 1}]', "")
+        .replace('["B", "C"]', '["B", "C"]')
+        .replace('ground = ["O", "C"]', 'ground = ["O", "C", "A"]')
+    )
+    found = client.ask("diagnose", text=text).json()
+    assert found["freedoms"] == 0 and "cannot move" in found["motion"]
+
+
+@pytest.mark.slow
+def test_a_motor_is_said_where_it_stops_and_what_is_in_line_there(client):
+    text = ARMS.replace("A = [0, 1]", "A = [0, 2]")
+    (found,) = client.ask("diagnose", text=text, about="travel").json()["travel"]
+    # Crank and ground are 2 long, coupler and rocker the root of 2.5: in line where A is the root of 10 away from C.
+    expected = math.acos((4 + 4 - 10) / 8) - math.pi / 2
+    (end,) = [end for end in found["ends"] if end["value"] > 0]
+    assert found["motor"] == "motor1"
+    assert math.isclose(end["value"], expected, abs_tol=1e-12)
+    assert end["in_line"] == [["A", "B", "C"]]
+
+
+@pytest.mark.slow
+def test_curves_need_forces(client):
+    found = client.ask("diagnose", text=SIX_BAR, about="dynamics").json()
+    names = {curve["name"] for curve in found["curves"]}
+    assert {"motor1: effort", "motor1: power", "kinetic energy", "violation", "B: force on rocker"} <= names
+    curves = {curve["name"]: np.array(curve["values"]) for curve in found["curves"]}
+    work = np.concatenate(
+        [[0], np.cumsum(np.diff(found["times"]) * (curves["motor1: power"][1:] + curves["motor1: power"][:-1]) / 2)]
+    )
+    change = curves["work of drivers and loads"]
+    assert np.abs(work - change).max() < 1e-3 * np.abs(change).max()  # of the trapezoidal rule at 401 instants
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["html", "svg", "csv", "py", "gif", "dxf", "png"])
+def test_exports_are_written_into_the_folder(client, suffix):
+    answer = client.ask("save", path=f"out.{suffix}", text=SIX_BAR, revision=None, export=True)
+    assert answer.status_code == 200, answer.text
+    data = (client.folder / f"out.{suffix}").read_bytes()
+    assert len(data) == answer.json()["bytes"] > 500
+
+
+def test_an_exported_script_holds_the_drawing():
+    from udkjax.studio.exports import script
+
+    hostile = SIX_BAR.replace("six-bar", "a \\\"\\\"\\\" b ''' {x} %s")
+    code = script(udk.loads(hostile), hostile)
+    names = {}
+    exec(compile(code.split("mech = ")[0], "script", "exec"), names)
+    assert names["SCENE"] == hostile
+
+
+def test_templates_that_are_none_are_refused(client):
+    for name in ("nothing", "../four_bar", None, 3, {"a": 1}):
+        assert client.ask("open", template=name).status_code == 404
+
+
+@pytest.mark.slow
+def test_what_takes_too_long_is_stopped_and_the_next_is_served():
+    worker = Worker()
+    try:
+        with pytest.raises(RefusedError, match="longer than"):
+            worker.call("list_templates", {}, 0.001)  # shorter than it takes to import
+        assert worker.call("list_templates", {}, 60.0)["templates"]
+        with pytest.raises(RefusedError, match="no template"):
+            worker.call("open_template", {"name": "nothing"}, 60.0)
+    finally:
+        worker.close()

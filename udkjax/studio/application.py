@@ -1,0 +1,135 @@
+"""The server of the studio: the files of the page, and five routes that take and answer JSON.
+
+    POST /api/list        {}                                          -> {files, templates, folder}
+    POST /api/open        {path} or {template}                        -> {text, document, path, revision, problems}
+    POST /api/save        {path, text, revision, export?}             -> {path, revision}, or 409 with the revision on disk
+    POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
+    POST /api/diagnose    {text, about?}                              -> what the page says of the drawing
+
+Where a request is refused the answer is {problem} and a status that says why.
+"""
+
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp
+
+from udkjax.studio.folder import Folder
+from udkjax.studio.gate import INTERFACE, Gate
+from udkjax.studio.limits import COMPILE_SECONDS, DIAGNOSE_SECONDS, EXPORT_SECONDS, RefusedError, require_size
+from udkjax.studio.worker import Worker
+
+Json = dict[str, Any]
+KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+PLACES = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", "."), "engine/": ("udkjax.native", "wasm")}
+EXPORTS = (".html", ".svg", ".png", ".gif", ".dxf", ".csv", ".py")
+
+
+class Studio:
+    """What the routes do.
+
+    Args:
+        folder: whose files are opened and saved.
+        compiler: the process that reads and compiles.
+        examiner: the one that diagnoses and exports, which takes longer.
+    """
+
+    def __init__(self, folder: Folder, compiler: Worker, examiner: Worker):
+        self.folder, self.compiler, self.examiner = folder, compiler, examiner
+
+    def list(self, request: Json) -> Json:
+        """Return the scene files of the folder, and the templates."""
+        templates = self.compiler.call("list_templates", {}, COMPILE_SECONDS)
+        return {"files": self.folder.list(), "folder": self.folder.root.name, **templates}
+
+    def open(self, request: Json) -> Json:
+        """Return the text of a file or of a template, and its tables."""
+        if "template" in request:
+            opened = self.compiler.call("open_template", {"name": request["template"]}, COMPILE_SECONDS)
+            return {**opened, "path": "", "revision": None}
+        text, revision = self.folder.read(request.get("path"))
+        opened = self.compiler.call("open_text", {"text": text}, COMPILE_SECONDS)
+        return {**opened, "path": request["path"], "revision": revision}
+
+    def save(self, request: Json) -> Json:
+        """Write a drawing, or what is exported of it, unless something else is on disk than the page believes."""
+        text, path, revision = require_size(request.get("text")), request.get("path"), request.get("revision")
+        if not (revision is None or isinstance(revision, str)):
+            raise RefusedError(400, "revision: must be a text, or null for a new file")
+        if not request.get("export"):
+            return {"path": path, "revision": self.folder.write(path, text.encode(), revision)}
+        suffix = self.folder.locate(path, EXPORTS).suffix.lower()
+        made = self.examiner.call("export", {"text": text, "suffix": suffix}, EXPORT_SECONDS)
+        data = bytes.fromhex(made["data"])
+        return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
+
+    def compile(self, request: Json) -> Json:
+        """Return a drawing's text and tables, its mistakes, and what the page needs to move it."""
+        given = {key: request[key] for key in ("text", "document", "engine") if request.get(key) is not None}
+        require_size(given.get("text"))
+        return self.compiler.call("compile_drawing", given, COMPILE_SECONDS)
+
+    def diagnose(self, request: Json) -> Json:
+        """Return freedoms, redundant constraints with their fixes, and what else is found about a drawing."""
+        given = {"text": require_size(request.get("text")), "about": request.get("about", "structure")}
+        return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
+
+
+def application(studio: Studio, port: int, token: str) -> ASGIApp:
+    """Return the server behind its gate.
+
+    Args:
+        studio: what the routes do.
+        port: at which it listens.
+        token: that each request of the interface must carry.
+    """
+    actions = [studio.list, studio.open, studio.save, studio.compile, studio.diagnose]
+    routes = [Route(f"{INTERFACE}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]
+    return Gate(Starlette(routes=[*routes, Route("/{path:path}", _page_file)]), port, token)
+
+
+def _answering(action: Callable[[Json], Json]) -> Callable[[Request], Awaitable[Response]]:
+    async def answer(request: Request) -> Response:
+        try:
+            given = json.loads(await request.body())
+        except (ValueError, RecursionError):
+            given = None
+        if not isinstance(given, dict):
+            return JSONResponse({"problem": "the body must be a JSON object"}, 400)
+        try:
+            return JSONResponse(await run_in_threadpool(partial(action, given)))
+        except RefusedError as error:
+            return JSONResponse({"problem": str(error), **error.details}, error.status)
+
+    return answer
+
+
+async def _page_file(request: Request) -> Response:
+    """Return a file of the page: one of those that the package has, and none else."""
+    content = page_files().get(request.path_params["path"] or "index.html")
+    if content is None:
+        return JSONResponse({"problem": "there is no such file"}, 404)
+    data, kind = content
+    return Response(data, media_type=kind)
+
+
+def page_files() -> Mapping[str, tuple[bytes, str]]:
+    """Return the files of the page by their addresses, with their kinds."""
+    found = {}
+    for prefix, (package, folder) in PLACES.items():
+        root = files(package).joinpath(folder)
+        if root.is_dir():
+            for entry in root.iterdir():
+                suffix = Path(entry.name).suffix
+                if suffix in KINDS and entry.is_file() and (not prefix or suffix == ".js"):
+                    found[prefix + entry.name] = (entry.read_bytes(), KINDS[suffix])
+    return found

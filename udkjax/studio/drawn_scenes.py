@@ -1,0 +1,230 @@
+"""Mechanisms of bodies and joints, drawn: the same motion from pins in world coordinates and links through them.
+
+Each revolute joint becomes a pin, each body a link of its mass, inertia and centre; slots, slides, gears, springs, motors and
+loads become what drawings have for them. Distances, and drivers of them, stay as in format 1, with points in the links' frames.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from udkjax.integrate.assembly import assemble
+from udkjax.scene import (
+    GROUND,
+    Body,
+    Distance,
+    Driver,
+    ForceElement,
+    Gear,
+    Joint,
+    Mechanism,
+    Polynomial,
+    Prismatic,
+    Revolute,
+    SceneError,
+    Slot,
+    Spring,
+    Torque,
+    TorsionSpring,
+    dumps,
+)
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.drawn_forces import shift_motion
+
+GROUND = GROUND
+SAME_PLACE = 1e-9  # of the extent: joints that are closer share a pin
+Place = np.ndarray
+
+
+def drawing_text_of(mechanism: Mechanism) -> str:
+    """Return a mechanism as the text of a drawing; raise `SceneError` where it cannot be drawn."""
+    if isinstance(mechanism.drawing, Drawing) and not mechanism.changed:
+        return dumps(mechanism)
+    return dumps(_Draft(mechanism).drawing())
+
+
+class _Draft:
+    """A drawing in the making: pins by name with their places, and the pins of each link."""
+
+    def __init__(self, mechanism: Mechanism):
+        self.mechanism = mechanism
+        state = assemble(mechanism)
+        q, v = np.asarray(state.q), np.asarray(state.v)
+        self.frames = dict(zip(mechanism.bodies, q, strict=True)) | {GROUND: np.zeros(3)}
+        self.rates = dict(zip(mechanism.bodies, v, strict=True)) | {GROUND: np.zeros(3)}
+        self.places: dict[str, Place] = {}
+        self.members: dict[str, list[str]] = {}  # of each pin
+        self.elements: dict[str, dict[str, Any]] = {}
+        held = [p for e in mechanism.constraints.values() for p in np.ravel(np.asarray(getattr(e, "points", 0.0), float))]
+        self.kept: list[tuple[str, str, Any]] = []  # of format 1
+        self.near = SAME_PLACE * max([1e-300, *map(abs, map(float, held)), *np.abs(q[:, :2]).ravel().tolist()])
+
+    def drawing(self) -> Drawing:
+        """Return the finished drawing."""
+        mechanism = self.mechanism
+        for name, joint in mechanism.joints.items():
+            if isinstance(joint, Revolute):
+                self.pin(name, joint.bodies, self.place(joint.bodies[0], joint.points[0]))
+        for name, joint in mechanism.joints.items():
+            self.joint(name, joint)
+        for name, driver in mechanism.drivers.items():
+            self.driver(name, driver)
+        for name, force in mechanism.forces.items():
+            self.force(name, force)
+        for name in mechanism.bodies:  # a link of one pin has a place, but cannot say how fast it turns
+            centre = self.frames[name][:2]
+            if not self.pins_of(name):
+                self.pin(f"{name}'", [name], centre)
+            if len(self.pins_of(name)) == 1 and self.rates[name][2]:
+                body = mechanism.bodies[name]
+                self.pin(f"{name}'", [name], centre + [np.sqrt(float(body.inertia / body.mass)), 0.0])
+        for section, name, element in self.kept:
+            self.add(section, name, self.in_links(element))
+        links = {name: self.link(name, body) for name, body in mechanism.bodies.items()}
+        ground = [pin for pin, members in self.members.items() if GROUND in members]
+        velocities = {pin: self.velocity(pin) for pin, members in self.members.items() if GROUND not in members}
+        fastest = max((float(np.abs(v).max()) for v in velocities.values()), default=0.0)
+        moving = {pin: v for pin, v in velocities.items() if np.abs(v).max() > SAME_PLACE * fastest}
+        return Drawing(
+            pins={name: place.tolist() for name, place in self.places.items()},
+            links=links,
+            ground=ground,
+            velocities=moving,
+            gravity=mechanism.gravity,
+            name=mechanism.name,
+            **{f"{section}s": group for section, group in self.elements.items()},
+        )
+
+    def place(self, body: str, point: Any) -> Place:
+        """Return where a point of a body is (m)."""
+        x, y, angle = self.frames[body]
+        px, py = np.asarray(point, float)
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([x + c * px - s * py, y + s * px + c * py])
+
+    def pin(self, name: str, bodies: Sequence[str], place: Place) -> str:
+        """Return the pin of bodies at a place, made or found."""
+        for pin, other in self.places.items():
+            if np.abs(place - other).max() <= self.near and set(bodies) & set(self.members[pin]):
+                self.members[pin] += [body for body in bodies if body not in self.members[pin]]
+                return pin
+        fresh = name
+        while fresh in self.places:
+            fresh += "'"
+        self.places[fresh], self.members[fresh] = place, list(bodies)
+        return fresh
+
+    def add(self, section: str, name: str, element: Any) -> None:
+        """Add an element to a section."""
+        self.elements.setdefault(section, {})[name] = element
+
+    def angle(self, bodies: Sequence[str]) -> float:
+        """Return the angle of the second body on the first one (rad)."""
+        return float(self.frames[bodies[1]][2] - self.frames[bodies[0]][2])
+
+    def joint(self, name: str, joint: Joint) -> None:
+        """Draw a joint that is no pin."""
+        match joint:
+            case Revolute():
+                return
+            case Slot():
+                one, two = joint.bodies
+                pin = self.pin(name, [two], self.place(two, joint.points[1]))
+                self.add("slot", name, {"pin": pin, "direction": self.world(one, joint.axis), "on": one, "link": two})
+            case Prismatic():
+                one, two = joint.bodies
+                self.pin(f"{two}'", [two], self.place(two, joint.points[1]))
+                self.add("slide", name, {"link": two, "direction": self.world(one, joint.axis), "on": one})
+            case Gear() if all(self.centre(body, joint.carrier) for body in joint.bodies):
+                gear = {"links": list(joint.bodies), "radii": np.asarray(joint.radii), "internal": joint.internal}
+                self.add("gear", name, gear | {"carrier": joint.carrier})
+            case _:
+                self.by_hand("joint", name, joint)
+
+    def centre(self, wheel: str, carrier: str) -> bool:
+        """Tell whether a wheel turns on its carrier at one pin."""
+        return sum(wheel in members and carrier in members for members in self.members.values()) == 1
+
+    def world(self, body: str, axis: Any) -> list[float]:
+        """Return the direction of an axis of a body in world coordinates."""
+        angle = float(axis) + float(self.frames[body][2])
+        return [float(np.cos(angle)), float(np.sin(angle))]
+
+    def pin_between(self, bodies: Sequence[str]) -> str:
+        """Return the pin at which two bodies turn on each other, or an empty text."""
+        return next((pin for pin, members in self.members.items() if set(bodies) <= set(members)), "")
+
+    def driver(self, name: str, driver: Driver) -> None:
+        """Draw a driver: a motor where it turns two links at their pin."""
+        pin = self.pin_between(driver.bodies)
+        if driver.coordinate == "angle" and pin:
+            motion = driver.motion
+            if isinstance(motion, Polynomial) and len(motion.coefficients) == 2:
+                law: dict[str, Any] = {"speed": float(motion.coefficients[1])}
+            else:
+                law = {"motion": shift_motion(motion, jnp.asarray(-self.angle(driver.bodies)))}
+            self.add("motor", name, {"pin": pin, "of": list(driver.bodies), **law})
+        else:
+            self.by_hand("driver", name, driver)
+
+    def force(self, name: str, force: ForceElement) -> None:
+        """Draw a force element."""
+        match force:
+            case Spring():
+                ends = [
+                    self.pin(f"{name}{k + 1}", [body], self.place(body, point))
+                    for k, (body, point) in enumerate(zip(force.bodies, np.asarray(force.points), strict=True))
+                ]
+                spring = {"between": ends, "stiffness": force.stiffness, "length": force.length, "damping": force.damping}
+                self.add("spring", name, {key: value for key, value in spring.items() if value is not None})
+            case TorsionSpring(angle=angle) if self.pin_between(force.bodies) and eqx.is_array(angle):
+                pin, free = self.pin_between(force.bodies), float(np.asarray(angle)) - self.angle(force.bodies)
+                spring = {"pin": pin, "of": list(force.bodies), "stiffness": force.stiffness, "damping": force.damping}
+                self.add("spring", name, {key: value for key, value in spring.items() if value is not None} | {"angle": free})
+            case Torque(value=value) if force.bodies[0] == GROUND and eqx.is_array(value):
+                self.add("load", name, {"link": force.bodies[1], "torque": value})
+            case _:
+                self.by_hand("force", name, force)
+
+    def by_hand(self, section: str, name: str, element: Any) -> None:
+        """Keep a distance, or a driver of one, as it is: its points go into the frames that the links will have."""
+        distance = isinstance(element, Distance) or getattr(element, "coordinate", "") == "distance"
+        if not distance:
+            cure = "draw it with the pins, slots, slides, gears and motors of format 2"
+            raise SceneError([f"{section} {name!r}: the studio cannot draw one of class {type(element).__name__}; {cure}"])
+        for k, (body, point) in enumerate(zip(element.bodies, np.asarray(element.points), strict=True)):
+            if body != GROUND:
+                self.pin(f"{name}{k + 1}", [body], self.place(body, point))
+        self.kept.append((section, name, element))
+
+    def in_links(self, element: Any) -> Any:
+        """Return an element with its points in the frames of the links: centres of mass, x from the first pin to the second."""
+        moved = []
+        for body, point in zip(element.bodies, np.asarray(element.points), strict=True):
+            place = self.place(body, point)
+            if body != GROUND:
+                pins = [self.places[pin] for pin in self.pins_of(body)]
+                way = pins[1] - pins[0] if len(pins) > 1 else np.array([1.0, 0.0])
+                c, s = way / np.linalg.norm(way)
+                place = np.array([[c, s], [-s, c]]) @ (place - self.frames[body][:2])
+            moved.append(place)
+        return eqx.tree_at(lambda e: e.points, element, jnp.asarray(moved))
+
+    def pins_of(self, body: str) -> list[str]:
+        """Return the pins of a body, at least one."""
+        return [pin for pin, members in self.members.items() if body in members]
+
+    def link(self, name: str, body: Body) -> dict[str, Any]:
+        """Return the table of a link."""
+        x, y, _ = self.frames[name]
+        return {"pins": self.pins_of(name), "mass": body.mass, "inertia": body.inertia, "centre": [float(x), float(y)]}
+
+    def velocity(self, pin: str) -> Place:
+        """Return the velocity of a pin (m/s)."""
+        body = next(body for body in self.members[pin] if body != GROUND)
+        vx, vy, rate = self.rates[body]
+        arm = self.places[pin] - self.frames[body][:2]
+        return np.array([vx - rate * arm[1], vy + rate * arm[0]])

@@ -1,0 +1,65 @@
+"""A drawing in other forms: a page, pictures, a film, a table of its motion, a script."""
+
+import csv
+import io
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from udkjax.integrate import Solution
+from udkjax.scene import Mechanism
+from udkjax.show.player import animate
+from udkjax.studio.shown_runs import INSTANTS, duration_of, shown_run
+
+SCRIPT = '''"""{title}, drawn in the studio of udkjax."""
+
+import numpy as np
+
+import udkjax as udk
+
+SCENE = {scene}
+
+mech = udk.loads(SCENE)
+print(udk.diagnose(mech))
+sol = udk.simulate(mech, np.linspace(0.0, {duration!r}, {instants}))
+print(sol)
+udk.animate(mech, sol).save("motion.html")
+'''
+
+
+def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
+    """Return a drawing in the form that an ending names.
+
+    Args:
+        mechanism: that is drawn.
+        text: its file.
+        suffix: .html, .svg, .png, .gif, .dxf (as `animate` saves them), .csv (positions over time), or .py.
+    """
+    if suffix == ".py":
+        return script(mechanism, text).encode()
+    run = shown_run(mechanism)
+    if suffix == ".csv":
+        return table(mechanism, run).encode()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"drawing{suffix}"
+        animate(mechanism, run).save(path)
+        return path.read_bytes()
+
+
+def script(mechanism: Mechanism, text: str) -> str:
+    """Return a Python script that simulates and shows a drawing."""
+    title = " ".join(mechanism.name.split()).replace("\\", "").replace('"', "'") or "A mechanism"
+    lines = "".join(f"    {line!r}\n" for line in text.splitlines(keepends=True))
+    return SCRIPT.format(title=title, scene=f"(\n{lines})", duration=duration_of(mechanism), instants=INSTANTS)
+
+
+def table(mechanism: Mechanism, run: Solution) -> str:
+    """Return the motion of all bodies as comma-separated values, a line an instant."""
+    q = np.asarray(run.q).reshape(len(run.ts), -1)
+    units = ("x (m)", "y (m)", "angle (rad)")
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["time (s)", *(f"{body} {unit}" for body in mechanism.bodies for unit in units)])
+    writer.writerows([repr(float(t)), *map(repr, row)] for t, row in zip(np.asarray(run.ts), q.tolist(), strict=True))
+    return out.getvalue()

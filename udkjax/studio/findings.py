@@ -1,0 +1,133 @@
+"""What the page says of a drawing: freedoms, redundancy and its cure, unique reactions, how far a motor turns."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from udkjax.integrate import SimulationError
+from udkjax.integrate.assembly import AssemblyError
+from udkjax.scene import Mechanism, SceneError
+from udkjax.scene.joints import Revolute
+from udkjax.studio.limits import RefusedError
+from udkjax.studio.shown_runs import force_curves
+from udkjax.study.diagnosis import Diagnosis, diagnose
+from udkjax.study.kinematics import travel
+from udkjax.study.report import plural
+
+Json = dict[str, Any]
+MOST_FIXES = 8
+IN_LINE = 1e-4  # rad: of a toggle that is found to rounding, whose angle errs by the root of that
+
+
+def examine(mechanism: Mechanism, about: str) -> Json:
+    """Return what is found about a subject.
+
+    Args:
+        mechanism: the drawing's.
+        about: "structure" (freedoms, redundancy, reactions), "travel" (how far each motor turns), "dynamics" (curves).
+    """
+    subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves}
+    if about not in subjects:
+        raise RefusedError(400, f"about: must be one of {', '.join(subjects)}")
+    try:
+        return subjects[about](mechanism) | {"problems": []}
+    except (AssemblyError, SimulationError) as error:
+        return {"problems": [str(error)]}
+
+
+def structure(mechanism: Mechanism) -> Json:
+    """Return freedoms, sets of redundant constraints with what mends them, and which reactions are unique."""
+    found = diagnose(mechanism, walk=False)
+    loose = {
+        name: {"components": [bool(x) for x in forces.unique], "direction": forces.direction}
+        for name, forces in found.forces.items()
+        if not all(forces.unique)
+    }
+    return {
+        "freedoms": found.degrees_of_freedom,
+        "joint_freedoms": found.joint_mobility,
+        "gruebler": found.gruebler,
+        "redundant": found.rows - found.ordinary_rank,
+        "singular": bool(found.is_singular),
+        "motion": _why(found, mechanism),
+        "sets": [
+            {
+                "constraints": list(r.constraints),
+                "count": r.count,
+                "permanent": r.permanent,
+                "fixes": [{"constraint": fix.constraint, "change": fix.change} for fix in r.fixes[:MOST_FIXES]],
+            }
+            for r in found.redundancies
+        ],
+        "loose": loose,
+        "text": str(found),
+    }
+
+
+def _why(found: Diagnosis, mechanism: Mechanism) -> str:
+    """Say what moves the mechanism, or why it does not move."""
+    drivers = list(mechanism.drivers)
+    if found.joint_mobility <= 0:
+        if found.is_singular:
+            return "it cannot move: it gives way to first order only"
+        return f"it cannot move: its joints hold all {found.coordinates} coordinates of its bodies. Take a joint or a link away"
+    if drivers and found.mobility == 0 and not found.is_singular:
+        return f"{_names(drivers)} {'moves' if len(drivers) == 1 else 'move'} all of it"
+    if len(drivers) > found.joint_mobility:
+        return f"{plural(len(drivers), 'motor')} for {plural(found.joint_mobility, 'freedom')}: they must agree with each other"
+    free = plural(found.degrees_of_freedom, "freedom")
+    if drivers:
+        return f"{_names(drivers)} and the loads move it; {free} left to the loads"
+    if mechanism.forces or np.any(np.asarray(mechanism.gravity)):
+        return f"{free}: loads and gravity move it; a motor would drive it"
+    return f"{free}, and nothing that drives it: add a motor or a load"
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(names)
+
+
+def motor_travel(mechanism: Mechanism) -> Json:
+    """Return how far each motor can turn from the drawn position, where the others hold, and what is in line at its limits."""
+    found = []
+    for name, driver in mechanism.drivers.items():
+        if driver.coordinate != "angle" and driver.coordinate != "x":
+            continue
+        try:
+            ends_of = travel(mechanism, name)
+        except SceneError:
+            continue  # positions do not follow from this motor
+        start = float(np.asarray(driver.motion(0.0)))
+        ends = []
+        for limit, q in ((ends_of.lower, ends_of.lower_q), (ends_of.upper, ends_of.upper_q)):
+            if np.isfinite(float(limit)):
+                ends.append({"value": float(limit) - start, "in_line": pins_in_line(mechanism, np.asarray(q))})
+        found.append({"motor": name, "unit": ends_of.unit, "ends": ends})
+    return {"travel": found}
+
+
+def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
+    """Return the triples of pins, two links that share the middle one, that are in line in a position."""
+    frames = dict(zip(mechanism.bodies, q, strict=True))
+    pins = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Revolute)}
+    places = {}
+    for name, joint in pins.items():
+        body = joint.bodies[0] if joint.bodies[0] in frames else joint.bodies[1]
+        point = np.asarray(joint.points)[joint.bodies.index(body)]
+        x, y, angle = frames[body]
+        c, s = math.cos(angle), math.sin(angle)
+        places[name] = np.array([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
+    found = []
+    for middle, joint in pins.items():
+        one, two = joint.bodies
+        if "ground" in (one, two):
+            continue
+        for a, other in pins.items():
+            for c, last in pins.items():
+                if len({a, middle, c}) == 3 and one in other.bodies and two in last.bodies:
+                    u, w = places[a] - places[middle], places[c] - places[middle]
+                    size = np.linalg.norm(u) * np.linalg.norm(w)
+                    if size > 0 and abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE * size:
+                        found.append([a, middle, c])
+    return found

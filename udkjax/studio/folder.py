@@ -1,0 +1,128 @@
+"""Files of one folder: listed, read, and written whole or not at all, never over what changed on disk meanwhile."""
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from udkjax.studio.limits import MOST_FOLDERS_DEEP, MOST_LISTED, MOST_TEXT_CHARACTERS, RefusedError
+
+SCENE_SUFFIX = ".toml"
+MOST_CHARACTERS_OF_A_PATH = 200
+
+
+class Folder:
+    """The folder in which the studio was started. No path leads out of it, neither by `..` nor by a link.
+
+    Args:
+        root: the folder.
+    """
+
+    def __init__(self, root: Path):
+        self.root = root.resolve(strict=True)
+
+    def list(self) -> list[str]:
+        """Return the scene files below the folder, at most `MOST_LISTED`, in order."""
+        return sorted(self._walk(self.root, MOST_FOLDERS_DEEP))
+
+    def _walk(self, folder: Path, deep: int) -> Iterator[str]:
+        count = 0
+        with contextlib.suppress(OSError):
+            for entry in sorted(os.scandir(folder), key=lambda e: e.name):
+                if entry.name.startswith(".") or entry.is_symlink():
+                    continue
+                if entry.is_dir(follow_symlinks=False) and deep > 1 and not (Path(entry.path) / "pyvenv.cfg").exists():
+                    found = self._walk(Path(entry.path), deep - 1)
+                elif entry.is_file(follow_symlinks=False) and entry.name.endswith(SCENE_SUFFIX):
+                    found = iter([Path(entry.path).relative_to(self.root).as_posix()])
+                else:
+                    continue
+                for name in found:
+                    count += 1
+                    if count > MOST_LISTED:
+                        return
+                    yield name
+
+    def locate(self, name: object, suffixes: tuple[str, ...]) -> Path:
+        """Return the file of a relative path; raise `RefusedError` where it is none inside the folder."""
+        if not isinstance(name, str) or not 0 < len(name) <= MOST_CHARACTERS_OF_A_PATH:
+            raise RefusedError(400, "path: must be the path of a file in the studio's folder")
+        parts = PurePosixPath(name).parts
+        wrong = any(not c.isprintable() or c in '\\:*?"<>|' for c in name)
+        if wrong or name.startswith("/") or any(part.startswith(".") for part in parts):
+            raise RefusedError(400, f"path: {name!r} is no plain path in the studio's folder")
+        if not name.lower().endswith(suffixes):
+            raise RefusedError(400, f"path: {name!r} must end in {' or '.join(suffixes)}")
+        path = self.root.joinpath(*parts)
+        try:
+            inside = path.parent.resolve(strict=True).is_relative_to(self.root)
+        except OSError:
+            raise RefusedError(404, f"there is no folder {PurePosixPath(*parts[:-1]).as_posix()!r}") from None
+        if not inside or path.is_symlink() or (path.exists() and not path.is_file()):
+            raise RefusedError(403, f"path: {name!r} leads out of the studio's folder, or is no plain file")
+        return path
+
+    def read(self, name: object) -> tuple[str, str]:
+        """Return the text of a scene file, and its revision."""
+        path = self.locate(name, (SCENE_SUFFIX,))
+        try:
+            if path.stat().st_size > 4 * MOST_TEXT_CHARACTERS:
+                raise RefusedError(413, f"{name} is longer than the {MOST_TEXT_CHARACTERS} characters that the studio takes")
+            data = path.read_bytes()
+            return data.decode("utf-8"), revision_of(data)
+        except UnicodeDecodeError as error:
+            raise RefusedError(422, f"{name} is not a text file in UTF-8 ({error})") from None
+        except OSError as error:
+            raise RefusedError(404, f"cannot read {name}: {error.strerror}") from None
+
+    def write(self, name: object, data: bytes, revision: str | None, suffixes: tuple[str, ...] = (SCENE_SUFFIX,)) -> str:
+        """Write a file, whole or not at all, and return its new revision.
+
+        Args:
+            name: its path.
+            data: its content.
+            revision: what the page believes to be on disk; None where it believes that there is no such file.
+            suffixes: the endings that it may have.
+
+        Raises:
+            RefusedError: something else is on disk (status 409, with its revision), or it cannot be written.
+        """
+        path = self.locate(name, suffixes)
+        present = revision_of(path.read_bytes()) if path.exists() else None
+        if present != revision:
+            found = "is not there any more" if present is None else "was made or changed by someone else"
+            raise RefusedError(409, f"{name} {found} since it was opened here", revision=present)
+        try:
+            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".studio-")
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+                if present is None:
+                    os.chmod(temporary, 0o666 & ~_umask())
+                    os.link(temporary, path)  # fails where a file appeared meanwhile
+                else:
+                    os.chmod(temporary, path.stat().st_mode & 0o7777)
+                    os.replace(temporary, path)
+            finally:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(temporary)
+        except FileExistsError:
+            raise RefusedError(409, f"{name} was made by someone else meanwhile", revision=None) from None
+        except OSError as error:
+            raise RefusedError(500, f"cannot write {name}: {error.strerror}") from None
+        return revision_of(data)
+
+
+def revision_of(data: bytes) -> str:
+    """Return what names a content of a file."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

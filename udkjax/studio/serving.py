@@ -1,0 +1,53 @@
+"""Serving the studio on this machine: a socket of the loopback interface alone, a token, and the address that opens it."""
+
+import secrets
+import socket
+import webbrowser
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import quote
+
+from udkjax.extras import OptionalImport
+from udkjax.studio.folder import Folder
+
+with OptionalImport():
+    import tomlkit as tomlkit
+    import uvicorn
+
+    from udkjax.studio.application import Studio, application
+from udkjax.studio.worker import Worker
+
+LOOPBACK = "127.0.0.1"
+TOKEN_BYTES = 32
+
+
+def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say: Callable[[str], None] = print) -> None:
+    """Serve the studio until it is interrupted.
+
+    Args:
+        root: the folder whose files may be opened and saved.
+        opened: the path of a file in it that the page opens, or empty.
+        port: at which it listens; 0 for one that is free.
+        browse: whether to open a browser.
+        say: takes the address.
+    """
+    token = secrets.token_urlsafe(TOKEN_BYTES)
+    workers = Worker(), Worker()
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((LOOPBACK, port))
+        bound = listener.getsockname()[1]
+        app = application(Studio(Folder(root), *workers), bound, token)
+        address = f"http://{LOOPBACK}:{bound}/#t={token}" + (f"&f={quote(opened)}" if opened else "")
+        config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, lifespan="off", ws="none")
+        try:
+            workers[0].start()
+            workers[1].start()
+            say(address)
+            if browse:
+                webbrowser.open(address)
+            uvicorn.Server(config).run([listener])
+        finally:
+            for worker in workers:
+                worker.close()

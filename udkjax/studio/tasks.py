@@ -1,0 +1,113 @@
+"""Tasks of the studio's second processes: read, compile, diagnose and export drawings. Arguments and results are plain data."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from udkjax.equations import analyse
+from udkjax.scene import Mechanism, SceneError, loads
+from udkjax.scene.drawing import Drawing
+from udkjax.studio.drawn_scenes import drawing_text_of
+from udkjax.studio.exports import exported
+from udkjax.studio.findings import examine
+from udkjax.studio.limits import RefusedError, require_few, require_size
+from udkjax.studio.shown_runs import duration_of, recorded_motion
+from udkjax.studio.templates import TEMPLATES, template_text
+from udkjax.studio.text_edits import merge_document, read_document
+
+Json = dict[str, Any]
+
+
+def list_templates() -> Json:
+    """Return the names and titles of the drawings that one may start from."""
+    return {"templates": [{"name": name, "title": title} for name, (title, _) in TEMPLATES.items()]}
+
+
+def open_template(name: str) -> Json:
+    """Return the text and tables of a template."""
+    if not isinstance(name, str) or name not in TEMPLATES:
+        raise RefusedError(404, f"there is no template {name!r}")
+    return open_text(template_text(name))
+
+
+def open_text(text: str) -> Json:
+    """Return the text of a scene file as a drawing, with its tables; one of bodies and joints is drawn anew."""
+    problems: list[str] = []
+    drawn = text
+    try:
+        document = read_document(text)
+        if document.get("format") == 1:
+            drawn = drawing_text_of(loads(text))
+            document = read_document(drawn)
+    except SceneError as error:
+        return {"text": text, "document": None, "problems": list(error.problems), "drawn": False}
+    return {"text": drawn, "document": document, "problems": problems, "drawn": drawn != text}
+
+
+def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, engine: str = "") -> Json:
+    """Return the text and tables of a drawing, its mistakes, and what the page needs to move it.
+
+    Args:
+        text: of the file; where a document is given, that which the document came from.
+        document: the tables as they were changed in the page.
+        engine: "recorded" asks for a motion that is computed here.
+    """
+    require_size(text)
+    try:
+        if document is not None:
+            text = merge_document(text, document)
+        found = read_document(text)
+        mechanism = loads(text)
+        if not isinstance(mechanism.drawing, Drawing):
+            raise SceneError(["format: the studio draws files of format 2"])
+    except SceneError as error:
+        return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None, "motion": None}
+    scene = scene_of(mechanism)
+    motion = recorded_motion(mechanism) if engine == "recorded" else None
+    return {"text": text, "document": found, "problems": [], "scene": scene, "motion": motion}
+
+
+def _read(text: str) -> Json | None:
+    try:
+        return read_document(text)
+    except SceneError:
+        return None
+
+
+def scene_of(mechanism: Mechanism) -> Json:
+    """Return what the page needs to show a mechanism's positions and energies."""
+    analysis = analyse(mechanism)
+    bodies = mechanism.bodies.values()
+    return {
+        "bodies": list(mechanism.bodies),
+        "frames": [[*np.asarray(body.position).tolist(), float(body.angle)] for body in bodies],
+        "masses": [float(body.mass) for body in bodies],
+        "inertias": [float(body.inertia) for body in bodies],
+        "gravity": np.asarray(mechanism.gravity).tolist(),
+        "length": float(analysis.length),
+        "duration": duration_of(mechanism),
+        "drivers": list(mechanism.drivers),
+    }
+
+
+def diagnose_drawing(text: str, about: str = "structure") -> Json:
+    """Return what is found about a drawing; `about` is one of the subjects of findings.py."""
+    try:
+        require_few(read_document(text))
+        return examine(loads(text), about)
+    except SceneError as error:
+        return {"problems": list(error.problems)}
+
+
+def export(text: str, suffix: str) -> Json:
+    """Return a drawing in another form, as hexadecimal bytes."""
+    try:
+        require_few(read_document(text))
+        mechanism = loads(text)
+        data = exported(mechanism, text, suffix)
+        return {"data": data.hex()}
+    except SceneError as error:
+        raise RefusedError(422, "; ".join(error.problems)) from None
+    except ImportError as error:
+        raise RefusedError(422, str(error)) from None

@@ -1,0 +1,95 @@
+"""A second process that reads, compiles and diagnoses drawings: what takes too long ends with it, and the page stays served.
+
+Requests and answers are JSON, so that nothing of a scene is ever unpickled.
+"""
+
+import json
+import multiprocessing
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from multiprocessing.connection import Connection
+from typing import Any
+
+from udkjax.studio.limits import RefusedError
+
+TASKS = "udkjax.studio.tasks"
+END_SECONDS = 5.0  # that a process has to end by itself
+
+
+class Worker:
+    """Runs the functions of `tasks.py` one at a time in a process of its own, which is replaced where it takes too long."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: Any = None
+        self._connection: Connection | None = None
+
+    def start(self) -> None:
+        """Start the process, so that it has imported what it needs when it is asked for the first time."""
+        with self._lock:
+            self._ensure()
+
+    def call(self, name: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+        """Return what a task answers; raise `RefusedError` where it refuses, fails, or takes longer than so many seconds."""
+        with self._lock:
+            connection = self._ensure()
+            try:
+                connection.send_bytes(json.dumps({"name": name, "arguments": arguments}).encode())
+                if not connection.poll(seconds):
+                    self._stop()
+                    raise RefusedError(504, f"it took longer than {seconds:g} s, and was stopped: draw something smaller")
+                answer = json.loads(connection.recv_bytes())
+            except (EOFError, OSError):
+                self._stop()
+                raise RefusedError(500, "the process that compiles ended unexpectedly; it is started again") from None
+        if "problem" in answer:
+            raise RefusedError(answer["status"], answer["problem"], **answer["details"])
+        return answer["result"]
+
+    def close(self) -> None:
+        """End the process."""
+        with self._lock:
+            self._stop()
+
+    def _ensure(self) -> Connection:
+        if self._process is None or not self._process.is_alive() or self._connection is None:
+            self._stop()
+            context = multiprocessing.get_context("spawn")
+            self._connection, other = context.Pipe()
+            self._process = context.Process(target=_serve, args=(other,), daemon=True, name="udkjax studio")
+            self._process.start()
+            other.close()
+        return self._connection
+
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.join(END_SECONDS)
+        if self._connection is not None:
+            self._connection.close()
+        self._process = self._connection = None
+
+
+def _serve(connection: Connection) -> None:
+    """Answer requests until the other side ends."""
+    tasks = import_module(TASKS)
+    while True:
+        try:
+            request = json.loads(connection.recv_bytes())
+        except (EOFError, OSError, KeyboardInterrupt):
+            return
+        task: Callable[..., dict[str, Any]] = getattr(tasks, request["name"])
+        try:
+            answer = {"result": task(**request["arguments"])}
+            data = json.dumps(answer, allow_nan=False).encode()
+        except KeyboardInterrupt:
+            return
+        except RefusedError as error:
+            data = json.dumps({"problem": str(error), "status": error.status, "details": error.details}).encode()
+        except Exception as error:  # a defect of ours: said in the terminal, and in a line on the page
+            traceback.print_exc()
+            problem = f"{type(error).__name__}: {error}"
+            data = json.dumps({"problem": problem, "status": 500, "details": {}}).encode()
+        connection.send_bytes(data)
