@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from udkjax.equations import analyse
+from udkjax.integrate.portable import portable_engine
+from udkjax.native.program import UnsupportedError
 from udkjax.scene import Mechanism, SceneError, loads
 from udkjax.scene.drawing import Drawing
 from udkjax.studio.drawn_scenes import drawing_text_of
@@ -51,7 +53,8 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
     Args:
         text: of the file; where a document is given, that which the document came from.
         document: the tables as they were changed in the page.
-        engine: "recorded" asks for a motion that is computed here.
+        engine: "wasm" asks for the engine as data for the page, with the places of pins as parameters; "recorded" for a motion
+            that is computed here, for a browser without WebAssembly.
     """
     require_size(text)
     try:
@@ -62,10 +65,27 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
         if not isinstance(mechanism.drawing, Drawing):
             raise SceneError(["format: the studio draws files of format 2"])
     except SceneError as error:
-        return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None, "motion": None}
-    scene = scene_of(mechanism)
-    motion = recorded_motion(mechanism) if engine == "recorded" else None
-    return {"text": text, "document": found, "problems": [], "scene": scene, "motion": motion}
+        return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None}
+    moving = engine_of(mechanism, found) if engine == "wasm" else {}
+    if engine == "recorded" or moving.get("why"):
+        moving |= {"motion": recorded_motion(mechanism)}
+    return {"text": text, "document": found, "problems": [], "scene": scene_of(mechanism), **moving}
+
+
+def engine_of(mechanism: Mechanism, document: Json) -> Json:
+    """Return the engine of a drawing for the page, and that of a hand, which nothing drives; or `why` there is none."""
+    pins = list(document.get("pins", {}))
+    names = [f"pin.{pin}" for pin in pins]
+    try:
+        engine = portable_engine(mechanism, names, pull=False).data
+        hand = None
+        if mechanism.drivers:
+            free = {**document, "motor": [m for m in document.get("motor", []) if "torque" in m], "driver": []}
+            hand = portable_engine(loads(merge_document("", free)), names, pull=False).data
+            hand = {**hand, "modules": {name: code for name, code in hand["modules"].items() if name != "run"}}
+    except (UnsupportedError, SceneError) as error:
+        return {"why": str(error)}
+    return {"engine": engine, "hand": hand, "pins": pins, "why": engine["why"]}
 
 
 def _read(text: str) -> Json | None:

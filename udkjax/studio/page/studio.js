@@ -1,0 +1,217 @@
+// The studio: one state, what changes it, and the parts of the page that show it.
+
+import {askedFile} from "./api.js";
+import {DrawingCanvas} from "./canvas.js";
+import {CurvesPanel} from "./curves.js";
+import {EMPTY, list, members, placeOf, pinsOf} from "./document.js";
+import {FileActions} from "./files.js";
+import {FindingsPanel} from "./findings.js";
+import {Gestures} from "./gestures.js";
+import {History} from "./history.js";
+import {followKeys} from "./keys.js";
+import {buildPage} from "./layout.js";
+import {Motion} from "./motion.js";
+import {PropertiesPanel} from "./properties.js";
+import {SourcePanel} from "./source.js";
+import {Sync} from "./sync.js";
+import {toolOf} from "./tools.js";
+import {lengthUnit, niceBelow, tidy} from "./units.js";
+import {fit} from "./view.js";
+import {THEMES} from "./player/painter.js";
+
+const NEW_SIZE = 0.25;  // m: the view of a new drawing
+const SNAP_PIXELS = 8;  // at least between two places that are snapped to
+const LINK_PIXELS = 26;  // the width of a new link
+
+const text = state => JSON.stringify(state.document);
+
+class Studio {
+  constructor(root) {
+    this.history = new History({document: EMPTY, text: ""});
+    Object.assign(this, {selection: [], hovered: null, tool: "select", preview: null, hand: null, marked: new Map(), paths: [], picture: null});
+    this.show = {grid: true, names: true, paths: true, snap: true};
+    this.view = fit([], 800, 600, NEW_SIZE);
+    this.proposed = null;
+    this.media = matchMedia("(prefers-color-scheme: dark)");
+    this.chosenTheme = null;
+    this.parts = buildPage(this, root);
+    this.canvas = new DrawingCanvas(this.parts.canvas);
+    this.motion = new Motion(this);
+    this.curves = new CurvesPanel(this, this.parts);
+    this.findings = new FindingsPanel(this, this.parts.findings);
+    this.properties = new PropertiesPanel(this, this.parts.properties);
+    this.source = new SourcePanel(this, this.parts.source);
+    this.files = new FileActions(this);
+    this.sync = new Sync(this);
+    this.gestures = new Gestures(this, this.parts.canvas);
+    followKeys(this);
+    this.media.addEventListener("change", () => this.retheme());
+    new ResizeObserver(() => this.redraw()).observe(this.parts.canvas);
+    this.retheme();
+    this.shown();
+  }
+
+  // The state
+
+  get document() { return this.proposed ?? this.history.state.document; }
+  get state() { return this.history.state; }
+  get theme() { return this.chosenTheme ?? (this.media.matches ? "dark" : "light"); }
+  get motions() { return this.motion.motions; }
+  get isMoved() { return this.motion.isMoved; }
+
+  /** Show another drawing: what was undone, or could be, is forgotten. */
+  load(state) {
+    this.proposed = null;
+    this.history.reset(state);
+    this.selection = [];
+    this.motion.forget();
+    this.gestures.cancel();
+    this.isFresh = Object.keys(pinsOf(state.document)).length > 0;
+    this.fit();
+    this.changed();
+  }
+
+  /** Show a document while a gesture changes it; `commit` makes it an entry of undo. */
+  propose(document) {
+    this.proposed = document === this.history.state.document ? null : document;
+    this.motion.follow(this.document);
+    this.redraw();
+  }
+
+  /** Take a document as the next state, and tell whether it says anything new. `source` is its text, where that is known. */
+  commit(document, select = null, source = null) {
+    this.proposed = null;
+    const base = this.state.text ?? this.state.base;
+    const isNew = this.history.push({document, text: source, base}, (a, b) => text(a) === text(b));
+    if (select) this.selection = select;
+    if (isNew) this.changed(); else this.shown();
+    return isNew;
+  }
+
+  /** Take what a tool made, or say why it made nothing. */
+  apply({document, select, problem}) {
+    if (problem) return this.say(problem);
+    this.say("");
+    this.commit(document, select);
+    return undefined;
+  }
+
+  undo() { this.travel(this.history.canUndo, () => this.history.undo()); }
+  redo() { this.travel(this.history.canRedo, () => this.history.redo()); }
+
+  travel(isPossible, step) {
+    this.gestures.cancel();
+    if (!isPossible) return;
+    step();
+    this.selection = this.selection.filter(item => (item.kind === "pin" ? item.name in pinsOf(this.document) : item.index < list(this.document, item.kind).length));
+    this.changed();
+  }
+
+  /** The drawing is another one: show it, and let the server and the engine follow. */
+  changed() {
+    this.rewind();
+    this.shown();
+    this.sync.follow();
+  }
+
+  select(items) {
+    this.selection = items;
+    this.shown();
+  }
+
+  setTool(name) {
+    this.gestures.cancel();
+    this.tool = name;
+    this.say(name === "select" ? "" : toolOf(name).title);
+    this.shown();
+  }
+
+  say(words, isBad = false) {
+    this.parts.status.textContent = words;
+    this.parts.status.classList.toggle("bad", isBad);
+  }
+
+  // The view
+
+  setView(view) {
+    this.view = view;
+    this.redraw();
+  }
+
+  pan(dx, dy) { this.setView({...this.view, x: this.view.x + dx, y: this.view.y + dy}); }
+
+  fit() {
+    const places = Object.keys(pinsOf(this.document)).map(pin => placeOf(this.document, pin)).filter(Boolean);
+    for (const {line} of this.paths) for (let k = 0; k < line.length; k += 2) places.push([line[k], line[k + 1]]);
+    const {width, height} = this.canvas;
+    this.setView(fit(places, width || 800, height || 600, NEW_SIZE));
+  }
+
+  /** A place on the grid, unless Alt is held. */
+  snap(place, event) {
+    if (!this.show.snap || event.altKey) return place;
+    const unit = lengthUnit(this.document), step = niceBelow(2 * SNAP_PIXELS / this.view.scale / unit);
+    return place.map(x => tidy(Math.round(x / unit / step) * step) * unit);
+  }
+
+  /** The width (m) that suits a new link in this view. */
+  usualSize() { return LINK_PIXELS / this.view.scale; }
+
+  hover(item, preview) {
+    const before = this.hovered;
+    this.hovered = item;
+    if (preview) this.preview = preview;
+    this.parts.canvas.classList.toggle("over", Boolean(item));
+    if (preview || before?.kind !== item?.kind || before?.name !== item?.name || before?.index !== item?.index) this.redraw();
+  }
+
+  retheme() {
+    const {back, panel, ink, soft, line, accent, onAccent, force} = THEMES[this.theme], root = document.documentElement;
+    for (const [name, value] of Object.entries({back, panel, ink, soft, line, accent, force, "on-accent": onAccent})) root.style.setProperty(`--${name}`, value);
+    root.style.colorScheme = this.theme;
+    this.redraw();
+  }
+
+  switchTheme() {
+    this.chosenTheme = this.theme === "dark" ? "light" : "dark";
+    this.retheme();
+  }
+
+  // Motion
+
+  rewind() { this.motion.rewind(); }
+
+  canPull(item) { return this.motion.canMove && (item.kind === "link" || (item.kind === "pin" && members(this.document, item.name).some(name => name !== "ground") && this.canvas.carrier(this.document, item.name) >= 0)); }
+
+  beginPull(item, at) { this.motion.beginPull(item, at); }
+  pullTo(at) { this.motion.pullTo(at); }
+  endPull() { this.motion.endPull(); }
+
+  // What is shown
+
+  /** Show what depends on more than the picture. */
+  shown() {
+    for (const button of this.parts.tools) button.setAttribute("aria-pressed", button.dataset.tool === this.tool);
+    this.parts.canvas.dataset.tool = this.tool;
+    this.parts.undo.disabled = !this.history.canUndo;
+    this.parts.redo.disabled = !this.history.canRedo;
+    this.properties.show();
+    this.source.show();
+    this.files.showTitle();
+    this.redraw();
+  }
+
+  redraw() {
+    if (this.frame) return;
+    this.frame = requestAnimationFrame(() => {
+      this.frame = null;
+      this.canvas.draw(this);
+      this.curves.draw();
+      this.motion.showTime();
+    });
+  }
+}
+
+const studio = new Studio(document.getElementById("studio"));
+window.studio = studio;
+if (askedFile) studio.files.openFile(askedFile, true); else studio.files.showStart();

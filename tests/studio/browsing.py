@@ -1,0 +1,124 @@
+"""A studio in headless Chromium, operated by mouse and keyboard."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+COMMAND = "from udkjax.cli import main; main()"
+PATIENCE = 60.0  # s for the server to compile and diagnose, on a machine that others use as well
+
+
+class StudioPage:
+    """The page of a studio, whose drawing is in millimetres."""
+
+    def __init__(self, page, address, folder):
+        self.page, self.folder, self.problems, self.requests = page, folder, [], []
+        page.on("pageerror", lambda error: self.problems.append(f"{error} {error.stack}"))
+        page.on("console", lambda m: self.problems.append(m.text) if m.type in ("error", "warning") else None)
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.goto(address)
+        self.until("window.studio !== undefined")
+        self.settle()
+
+    def js(self, code):
+        return self.page.evaluate(code)
+
+    def until(self, condition):
+        """Wait for a condition; Playwright's own way evaluates text, which the page forbids."""
+        for _ in range(int(PATIENCE / 0.05)):
+            if self.page.evaluate(condition):
+                return
+            self.page.wait_for_timeout(50)
+        raise AssertionError(f"{condition} did not come true; {self.problems}; {self.status()}")
+
+    def settle(self):
+        """Wait until text, engine and findings are those of the drawing."""
+        self.page.evaluate("studio.sync.settled()")
+        self.page.wait_for_timeout(60)  # a frame or two
+
+    def status(self):
+        return self.js("studio.parts.status.textContent + ' | ' + studio.parts.loops.textContent")
+
+    @property
+    def document(self):
+        return self.js("studio.state.document")
+
+    @property
+    def findings(self):
+        return self.page.locator(".findings .body").inner_text()
+
+    def pixel(self, x, y):
+        """Return where a place (mm) of the drawing is on the screen."""
+        box = self.page.locator("main canvas").bounding_box()
+        view = self.js("studio.view")
+        return box["x"] + view["x"] + view["scale"] * x / 1e3, box["y"] + view["y"] - view["scale"] * y / 1e3
+
+    def pin(self, name):
+        """Return where a pin is on the screen now."""
+        box = self.page.locator("main canvas").bounding_box()
+        x, y = self.js(f"studio.canvas.places.get({json.dumps(name)})")
+        return box["x"] + x, box["y"] + y
+
+    def click(self, x, y):
+        self.page.mouse.click(*self.pixel(x, y))
+        self.page.wait_for_timeout(30)
+
+    def drag(self, start, end, steps=6, pixels=False):
+        (x0, y0), (x1, y1) = (start, end) if pixels else (self.pixel(*start), self.pixel(*end))
+        self.page.mouse.move(x0, y0)
+        self.page.mouse.down()
+        for k in range(1, steps + 1):
+            self.page.mouse.move(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps)
+        self.page.mouse.up()
+        self.page.wait_for_timeout(30)
+
+    def tool(self, key):
+        self.page.keyboard.press(key)
+
+    def link(self, start, end):
+        self.tool("l")
+        self.drag(start, end)
+
+    def run(self):
+        """Return the motion that the page computed: times and coordinates of all bodies."""
+        run = "const {run, mover} = studio.motion"
+        return self.js(f"(() => {{ {run}; return {{ts: [...run.ts], q: [...run.q], bodies: mover.scene.bodies}}; }})()")
+
+
+@contextmanager
+def served(folder: Path, opened: str = ""):
+    """Serve a studio in a folder; gives its address."""
+    command = [sys.executable, "-c", COMMAND, "studio", str(folder / opened), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
+        try:
+            assert process.stdout is not None
+            address = process.stdout.readline().strip()
+            assert re.match(r"http://127\.0\.0\.1:\d+/#t=", address), "the studio did not start"
+            yield address
+        finally:
+            process.terminate()
+
+
+@contextmanager
+def studio_page(browser, address, folder, width=1280, height=800, **options):
+    """Open the page of a studio, and hold that it said no error and asked nobody else."""
+    context = browser.new_context(viewport={"width": width, "height": height}, **options)
+    try:
+        found = StudioPage(context.new_page(), address, folder)
+        yield found
+        assert found.problems == []
+        origin = address.partition("/#")[0]
+        assert all(url.startswith((origin, "data:", "blob:")) for url in found.requests)
+    finally:
+        context.close()
+
+
+def chromium():
+    """Return Playwright's way to the system's Chromium, or skip."""
+    return pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")

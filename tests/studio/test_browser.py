@@ -1,0 +1,431 @@
+"""The studio in headless Chromium: mechanisms are drawn by mouse and keyboard, move, are diagnosed, saved and simulated."""
+
+import json
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.studio.browsing import PATIENCE, chromium, served, studio_page
+
+CHROMIUM = "/usr/bin/chromium"
+TOLERANCE = 1e-8  # of the page's runs
+RECORD_FRAMES = """(() => {
+    const {motion, parts} = studio, pull = motion.pullTo.bind(motion);
+    window.frames = [];
+    motion.pullTo = hand => { pull(hand); frames.push([motion.posed.violation, parts.status.textContent]); };
+})()"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from pathlib import Path
+
+    sync_api = chromium()
+    if not Path(CHROMIUM).exists():
+        pytest.skip("there is no Chromium: apt-get install chromium")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drawings")
+    with served(folder) as address:
+        yield address, folder
+
+
+@pytest.fixture
+def studio(browser, server):
+    with studio_page(browser, *server) as page:
+        yield page
+
+
+def draw_five_bar(studio):
+    """The paper's parallelogram: three equal cranks carry a coupler, one of them at its middle."""
+    studio.link((30, 150), (80, 100))
+    studio.link((190, 150), (240, 100))
+    studio.link((80, 100), (240, 100))
+    studio.link((110, 150), (160, 100))  # which ends on the coupler
+    studio.tool("g")
+    for x in (30, 110, 190):
+        studio.click(x, 150)
+
+
+def assert_moves_as_simulated(studio, text, atol=1e-9):
+    """Hold the page's motion against `simulate` of the text."""
+    mechanism, run = udk.loads(text), studio.run()
+    q = np.array(run["q"]).reshape(len(run["ts"]), -1, 3)
+    sol = udk.simulate(mechanism, np.array(run["ts"]), rtol=TOLERANCE, atol=TOLERANCE)
+    order = [run["bodies"].index(body) for body in mechanism.bodies]
+    assert np.ptp(q, axis=0).max() > 0.01
+    np.testing.assert_allclose(q[:, order], np.asarray(sol.q), rtol=0, atol=atol)
+
+
+def test_the_paper_five_bar_is_drawn_diagnosed_moved_and_saved(studio):
+    draw_five_bar(studio)
+    studio.settle()
+    assert [link["pins"] for link in studio.document["link"]] == [["A", "B"], ["C", "D"], ["B", "F", "D"], ["E", "F"]]
+    found = studio.findings
+    assert "1 freedom · 1 redundant constraint" in found
+    assert "A, B, C, D, E, F: 1 redundant row, everywhere. Free one pin:" in found
+    for pin in "ABCDEF":
+        assert f"{pin}: make it a slot" in found
+    assert "not unique at A (x, y)" in found
+    before = studio.pin("B")
+    studio.page.keyboard.press(" ")
+    studio.until("studio.motion.t > 0.2")
+    studio.page.keyboard.press(" ")
+    assert np.hypot(*np.subtract(studio.pin("B"), before)) > 10  # px
+    studio.page.keyboard.press("Control+s")
+    studio.page.keyboard.type("five_bar")
+    studio.page.keyboard.press("Enter")
+    studio.until("studio.files.path === 'five_bar.toml'")
+    file = studio.folder / "five_bar.toml"
+    assert_moves_as_simulated(studio, file.read_text())
+    found = udk.diagnose(udk.load(file))
+    assert (found.degrees_of_freedom, found.redundant) == (1, 1)
+
+
+@pytest.mark.slow
+def test_fifty_undos_return_to_the_first_state_to_the_bit_and_fifty_redos_to_the_last(studio):
+    states = [studio.js("JSON.stringify(studio.state)")]
+    draw_five_bar(studio)
+    studio.tool("v")
+    for k in range(43):  # to and fro
+        ends = [(80, 100), (90, 100)] if k % 2 == 0 else [(90, 100), (80, 100)]
+        studio.drag(*ends, steps=2)
+    assert studio.js("studio.history.at") == 50
+    studio.settle()
+    last = studio.js("JSON.stringify([studio.state.document, studio.state.text])")
+    for _ in range(50):
+        studio.page.keyboard.press("Control+z")
+    studio.settle()
+    assert studio.js("JSON.stringify(studio.state)") == states[0]
+    assert studio.js("studio.motion.mover") is None
+    assert studio.js("[studio.marked.size, studio.paths.length]") == [0, 0]
+    for k in range(50):
+        studio.page.keyboard.press("Control+y" if k % 2 else "Control+Shift+z")
+    studio.settle()
+    assert studio.js("JSON.stringify([studio.state.document, studio.state.text])") == last
+    assert "1 redundant constraint" not in studio.findings  # one crank was made longer
+    assert_moves_as_simulated(studio, studio.js("studio.state.text")) if "1 freedom" in studio.findings else None
+
+
+@pytest.mark.slow
+def test_a_slider_crank_is_drawn_and_its_text_is_edited_beside_it(studio):
+    studio.link((40, 100), (70, 140))
+    studio.link((70, 140), (190, 100))
+    studio.tool("g")
+    studio.click(40, 100)
+    studio.tool("s")
+    studio.drag((190, 100), (230, 100))
+    studio.tool("m")
+    studio.click(40, 100)
+    studio.settle()
+    assert studio.document["slide"] == [{"name": "slide1", "link": "slider1", "direction": [1, 0]}]
+    assert "1 freedom, 0 with its motors held · nothing redundant" in studio.findings
+    assert "motor1 turns all the way round" in studio.findings
+    assert_moves_as_simulated(studio, studio.js("studio.state.text"))
+    text = studio.js("studio.state.text")
+    area = studio.page.locator("textarea")
+    area.fill(text.replace('"60 rpm"', '"30 rpm" # half of what it was'))
+    studio.until("studio.document.motor[0].speed === '30 rpm'")
+    studio.settle()
+    assert studio.js("studio.motion.end") == 4.0  # two turns
+    studio.tool("Escape")
+    studio.page.locator("main canvas").focus()
+    studio.tool("v")
+    studio.drag((70, 140), (60, 150))
+    studio.settle()
+    assert studio.document["pins"]["B"] == [60, 150]
+    changed = studio.js("studio.state.text")
+    assert changed == text.replace('"60 rpm"', '"30 rpm" # half of what it was').replace("B = [70, 140]", "B = [60, 150]")
+    assert area.input_value() == changed
+    assert_moves_as_simulated(studio, changed)
+
+
+@pytest.mark.slow
+def test_a_cam_lifts_a_follower_on_a_spring(studio):
+    studio.tool("b")
+    studio.drag((100, 60), (120, 60))
+    studio.tool("g")
+    studio.click(100, 60)
+    studio.link((100, 90), (100, 150))
+    studio.tool("s")
+    studio.drag((100, 120), (100, 150))
+    studio.tool("c")
+    studio.drag((100, 60), (100, 90))
+    studio.tool("m")
+    studio.click(100, 60)
+    studio.tool("r")
+    studio.drag((100, 150), (100, 200))
+    studio.settle()
+    assert {key for key, value in studio.document.items() if isinstance(value, list) and key != "ground"} == {
+        "link",
+        "slide",
+        "cam",
+        "motor",
+        "spring",
+    }
+    assert "1 freedom, 0 with its motors held" in studio.findings
+    assert_moves_as_simulated(studio, studio.js("studio.state.text"))
+
+
+@pytest.mark.slow
+def test_the_six_bar_of_seven_pins_is_drawn(studio):
+    studio.link((40, 100), (60, 130))
+    studio.tool("a")
+    for place in ((60, 130), (140, 170), (110, 210), (60, 130)):
+        studio.click(*place)
+    for ends in (((160, 100), (140, 170)), ((110, 210), (210, 190)), ((210, 100), (210, 190))):
+        studio.link(*ends)
+    studio.tool("g")
+    for x in (40, 160, 210):
+        studio.click(x, 100)
+    studio.tool("m")
+    studio.click(40, 100)
+    studio.settle()
+    assert len(studio.document["pins"]) == 7 and len(studio.document["link"]) == 5
+    assert "motor1 moves all of it" in studio.findings
+    assert_moves_as_simulated(studio, studio.js("studio.state.text"))
+
+
+@pytest.mark.slow
+def test_a_drag_that_moves_nothing_is_no_entry_of_undo(studio):
+    draw_five_bar(studio)
+    studio.tool("v")
+    entries = studio.js("studio.history.states.length")
+    studio.click(80, 100)
+    studio.drag((80, 100), (80.3, 100))
+    studio.drag((80, 100), (80, 100))
+    x, y = studio.pixel(80, 100)
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(x + 60, y)
+    studio.page.mouse.move(x, y)  # and back
+    studio.page.mouse.up()
+    assert studio.js("studio.history.states.length") == entries
+
+
+@pytest.mark.slow
+def test_a_drag_released_over_a_panel_has_ended_and_escape_takes_one_away(studio):
+    draw_five_bar(studio)
+    studio.tool("v")
+    x, y = studio.pixel(80, 100)
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(1100, 400)
+    studio.page.mouse.up()
+    place = studio.document["pins"]["B"]
+    studio.page.mouse.move(400, 400)
+    assert studio.document["pins"]["B"] == place != [80, 100]
+    studio.page.keyboard.press("Control+z")
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(x + 80, y)
+    studio.page.keyboard.press("Escape")
+    studio.page.mouse.up()
+    assert studio.js("studio.document.pins.B") == [80, 100]
+
+
+@pytest.mark.slow
+def test_a_pin_dropped_on_a_pin_merges_and_delete_takes_what_hangs_on_it(studio):
+    studio.link((40, 100), (60, 130))
+    studio.link((70, 130), (140, 100))
+    studio.tool("g")
+    studio.click(40, 100)
+    studio.click(140, 100)
+    studio.tool("m")
+    studio.click(40, 100)
+    studio.tool("v")
+    studio.drag((70, 130), (60.5, 130.2))
+    assert studio.document["link"][1]["pins"] == ["B", "D"] and list(studio.document["pins"]) == ["A", "B", "D"]
+    studio.click(50, 115)
+    studio.page.keyboard.press("Delete")
+    assert studio.document["pins"].keys() == {"B", "D"} and "motor" not in studio.document and studio.document["ground"] == ["D"]
+
+
+@pytest.mark.slow
+def test_the_ground_pans_the_wheel_zooms_about_the_cursor_and_f_fits(studio):
+    draw_five_bar(studio)
+    studio.tool("v")
+    before = studio.js("studio.view")
+    studio.drag((600, 500), (640, 460), pixels=True)
+    after = studio.js("studio.view")
+    assert [after[key] - before[key] for key in ("scale", "x", "y")] == [0, 40, -40]
+    box = studio.page.locator("main canvas").bounding_box()
+    studio.page.mouse.move(500, 350)
+    studio.page.mouse.wheel(0, -100)
+    studio.until(f"studio.view.scale !== {after['scale']}")
+    zoomed = studio.js("studio.view")
+    assert zoomed["scale"] / after["scale"] == pytest.approx(1.12)
+    for key, pixel in (("x", 500 - box["x"]), ("y", 350 - box["y"])):  # what is there stays there
+        assert (pixel - zoomed[key]) / zoomed["scale"] == pytest.approx((pixel - after[key]) / after["scale"], abs=1e-12)
+    studio.page.keyboard.press("f")
+    for name in "ABCDEF":
+        studio.page.wait_for_timeout(50)
+        px, py = studio.pin(name)
+        assert box["x"] < px < box["x"] + box["width"] and box["y"] < py < box["y"] + box["height"]
+
+
+@pytest.mark.slow
+def test_ctrl_d_duplicates_and_names_and_numbers_are_edited_in_fields(studio):
+    studio.link((40, 100), (60, 130))
+    studio.tool("v")
+    studio.click(50, 115)
+    studio.page.keyboard.press("Control+d")
+    assert [link["name"] for link in studio.document["link"]] == ["link1", "link2"] and len(studio.document["pins"]) == 4
+    studio.page.get_by_label("width", exact=True).fill("12 mm")
+    studio.page.keyboard.press("Enter")
+    assert studio.document["link"][1]["width"] == "12 mm"
+    studio.page.get_by_label("name", exact=True).fill("crank")
+    studio.page.keyboard.press("Enter")
+    assert studio.document["link"][1]["name"] == "crank"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("template", ["parallelogram", "slider_crank", "every"])
+def test_a_pin_that_is_pulled_takes_the_mechanism_along_and_loops_stay_closed(studio, template):
+    from udkjax.studio.templates import TEMPLATES
+
+    for name in TEMPLATES if template == "every" else [template]:
+        studio.js(f"studio.files.openTemplate({json.dumps(name)})")
+        studio.settle()
+        assert studio.js("studio.motion.mover !== null"), (name, studio.findings)
+        studio.tool("h")
+        moving = studio.js(
+            "Object.keys(studio.document.pins).filter(p => studio.canvas.carrier(studio.document, p) >= 0 && studio.canvas.places.has(p))"
+        )
+        assert moving, name
+        # Each frame: the closed state's violation, in units of the scene, or a reason that is shown.
+        studio.js(RECORD_FRAMES)
+        x, y = studio.pin(moving[0])
+        studio.page.mouse.move(x, y)
+        studio.page.mouse.down()
+        steps = 200 if template == "every" else 40
+        for k in range(steps):
+            angle = 4 * np.pi * k / steps
+            studio.page.mouse.move(x + 90 * np.sin(angle), y + 60 * (1 - np.cos(angle)))
+        studio.page.mouse.up()
+        frames = studio.js("frames")
+        assert len(frames) > steps / 4, name
+        assert max(violation for violation, _ in frames) < 1e-9, (name, frames)
+        assert studio.js("Math.max(...studio.motion.motions.map(Math.abs))") > 0 or any(words for _, words in frames), name
+        studio.js("studio.motion.pullTo = Object.getPrototypeOf(studio.motion).pullTo")
+
+
+@pytest.mark.slow
+def test_hostile_names_are_texts(studio):
+    evil = "<img src=x onerror=hit=1>"
+    text = f"""format = 2
+name = "{evil}"
+ground = ["</script><script>hit=2</script>"]
+[pins]
+"</script><script>hit=2</script>" = [0, 0]
+"__proto__" = [0.1, 0]
+"constructor" = [0.2, 0.1]
+[[link]]
+name = "{evil}"
+pins = ["</script><script>hit=2</script>", "__proto__"]
+mass = 1
+[[link]]
+name = "toString"
+pins = ["__proto__", "constructor"]
+mass = 1
+"""
+    (studio.folder / "evil.toml").write_text(text)
+    studio.js("studio.files.openFile('evil.toml')")
+    studio.settle()
+    assert "2 freedoms" in studio.findings
+    studio.tool("v")
+    for name in ("__proto__", "constructor"):
+        studio.page.mouse.click(*studio.pin(name))
+        assert studio.page.locator(".properties h3").inner_text() == f"pin {name}"
+    assert studio.js("window.hit") is None
+    assert studio.js("document.querySelectorAll('img, script:not([src])').length") == 0
+    assert_moves_as_simulated(studio, text)
+
+
+@pytest.mark.slow
+def test_a_drawing_without_numbers_is_said_to_be_one(studio):
+    (studio.folder / "nan.toml").write_text(
+        'format = 2\n[pins]\nA = [nan, inf]\nB = [0, 0]\n[[link]]\nname = "a"\npins = ["A", "B"]\nmass = 1\n'
+    )
+    studio.js("studio.files.openFile('nan.toml')")
+    studio.settle()
+    assert "missing before it can move" in studio.findings and "pins.A" in studio.findings
+    assert "nan" in studio.page.locator("textarea").input_value()
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_pins_are_refused_and_the_page_goes_on(studio):
+    (studio.folder / "huge.toml").write_text("format = 2\n[pins]\n" + "".join(f"p{k}=[{k},0]\n" for k in range(100_000)))
+    studio.js("studio.files.openFile('huge.toml')")
+    studio.until("studio.parts.status.textContent.includes('characters')")
+    studio.problems[:] = [words for words in studio.problems if "413" not in words]  # the browser says that a request was refused
+    studio.link((40, 100), (60, 130))
+    assert len(studio.document["link"]) == 1
+
+
+@pytest.mark.slow
+def test_what_changed_on_disk_is_not_overwritten_unasked(studio):
+    file = studio.folder / "shared.toml"
+    text = 'format = 2\nground = ["A"]\n[pins]\nA = [0, 0]\nB = [0.1, 0]\n[[link]]\nname = "a"\npins = ["A", "B"]\nmass = 1\n'
+    file.write_text(text)
+    studio.js("studio.files.openFile('shared.toml')")
+    studio.settle()
+    studio.tool("v")
+    studio.page.mouse.click(*studio.pin("B"))
+    studio.page.get_by_label("x", exact=True).fill("0.2")
+    studio.page.keyboard.press("Enter")
+    theirs = text + "# by another editor\n"
+    file.write_text(theirs)
+    studio.page.locator("main canvas").focus()
+    studio.page.keyboard.press("Control+s")
+    studio.until("document.querySelector('dialog[open] h2')?.textContent === 'Changed on disk'")
+    studio.problems[:] = [words for words in studio.problems if "409" not in words]
+    assert file.read_text() == theirs
+    studio.page.get_by_role("button", name="Overwrite it").click()
+    studio.until("studio.files.isChanged === false")
+    assert file.read_text() == text.replace("B = [0.1, 0]", "B = [0.2, 0]")
+
+
+@pytest.mark.slow
+def test_a_finger_drags_and_two_zoom(browser, server):
+    with studio_page(browser, *server, width=390, height=844, has_touch=True) as studio:
+        studio.js("studio.files.openTemplate('four_bar')")
+        studio.settle()
+        cdp = studio.page.context.new_cdp_session(studio.page)
+
+        def touch(kind, *points):
+            cdp.send(
+                "Input.dispatchTouchEvent",
+                {"type": kind, "touchPoints": [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]},
+            )
+
+        name = studio.js("Object.keys(studio.document.pins)[1]")
+        x, y = studio.pin(name)
+        before = studio.document["pins"][name]
+        touch("touchStart", (x, y))
+        for k in range(1, 6):
+            touch("touchMove", (x + 8 * k, y))
+        touch("touchEnd")
+        studio.settle()
+        assert studio.document["pins"][name] != before
+        scale = studio.js("studio.view.scale")
+        box = studio.page.locator("main canvas").bounding_box()
+        cx, cy = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        touch("touchStart", (cx - 30, cy), (cx + 30, cy))
+        for k in range(1, 6):
+            touch("touchMove", (cx - 30 - 6 * k, cy), (cx + 30 + 6 * k, cy))
+        touch("touchEnd")
+        assert studio.js("studio.view.scale") / scale == pytest.approx(2.0, rel=0.05)
+
+
+def test_the_patience_of_these_tests_is_longer_than_what_the_server_allows_itself():
+    from udkjax.studio.limits import COMPILE_SECONDS
+
+    assert PATIENCE >= COMPILE_SECONDS

@@ -1,0 +1,244 @@
+// What the drawing tools make: each takes a document and targets, and returns {document, select} or {problem}.
+//
+// A target is where a gesture begins or ends: {place} in metres, with the `pin` or the `link` (its index) that is there.
+
+import {addPin, freshName, groundOf, list, members, nameOf, placeOf, project, movePin, withElement, withEntry, withKey, toggleGround} from "./document.js";
+import {centrePin, corners, linkShape} from "./shapes.js";
+import {angleUnit, lengthUnit, niceBelow, tidy, written} from "./units.js";
+
+const STEEL = {density: 7850};  // kg/m^3
+const PIXELS_PER_NEWTON = 5;
+const TEETH = 20;
+const LIFT = 0.4, CAM_POINTS = 12;  // of the radius where the follower stands
+
+const last = (document, section) => ({kind: section, index: list(document, section).length - 1});
+
+/** The document with a pin at a target, and its name. */
+export function pinFor(document, {pin, link, place}) {
+  if (pin !== undefined && pin !== null) return [document, pin];
+  if (link !== undefined && link !== null) return addPinToLink(document, link, place);
+  return addPin(document, place);
+}
+
+/** The document with a pin more on a link: on the line of a bar, in the order of a plate's corners. */
+export function addPinToLink(document, index, place) {
+  const link = list(document, "link")[index], shape = linkShape(document, link), pins = [...link.pins];
+  let at = pins.length, foot = place;
+  if (shape?.kind === "line" && pins.length > 1) {
+    const ends = [placeOf(document, pins[0]), placeOf(document, pins.at(-1))];
+    foot = project(place, ...ends);
+    if (link.inertia === undefined) at = pins.length - 1;  // a bar ends at its last pin
+  } else if (shape?.kind === "plate" && link.inertia === undefined && !link.outline) {
+    const places = pins.map(pin => placeOf(document, pin));
+    let least = Infinity;
+    places.forEach((a, k) => {
+      const b = places[(k + 1) % places.length], f = project(place, a, b), away = Math.hypot(f[0] - place[0], f[1] - place[1])
+        + Math.max(0, Math.hypot(f[0] - (a[0] + b[0]) / 2, f[1] - (a[1] + b[1]) / 2) - Math.hypot(a[0] - b[0], a[1] - b[1]) / 2);
+      if (away < least) [least, at] = [away, k + 1];
+    });
+  }
+  const [found, name] = addPin(document, foot);
+  pins.splice(at, 0, name);
+  return [withKey(found, "link", index, "pins", pins), name];
+}
+
+/** Width and thickness of a new link: those of the last one, or what suits the view. */
+function section(document, size) {
+  const old = list(document, "link").filter(link => link.density !== undefined && link.thickness !== undefined && link.pins.length > 1).at(-1);
+  const unit = lengthUnit(document), width = old?.width ?? tidy(niceBelow(size) / unit);
+  return {density: old?.density ?? STEEL.density, width, thickness: old?.thickness ?? tidy(niceBelow(size / 3) / unit)};
+}
+
+export function drawLink(document, from, to, {size}) {
+  let [found, a] = pinFor(document, from), b;
+  [found, b] = pinFor(found, to);
+  if (a === b) return {problem: "a link needs two pins: drag from one place to another"};
+  if (list(document, "link").some(link => link.pins.length === 2 && link.pins.includes(a) && link.pins.includes(b))) {
+    return {problem: `there is a link between ${a} and ${b} already`};
+  }
+  found = withElement(found, "link", {name: freshName(found, "link"), pins: [a, b], ...section(document, size)});
+  return {document: found, select: [last(found, "link")]};
+}
+
+export function drawPlate(document, targets, {size}) {
+  let found = document, pin;
+  const pins = [];
+  for (const target of targets) {
+    [found, pin] = pinFor(found, target);
+    if (!pins.includes(pin)) pins.push(pin);
+  }
+  if (pins.length < 3 || !corners(pins.map(name => placeOf(found, name)))[1]) return {problem: "a plate needs three pins that are not in line"};
+  const {width, ...rest} = section(document, size);
+  found = withElement(found, "link", {name: freshName(found, "link"), pins, ...rest});
+  return {document: found, select: [last(found, "link")]};
+}
+
+export function drawDisc(document, from, to, {size}) {
+  const [found, pin] = pinFor(document, from), centre = placeOf(found, pin);
+  const radius = Math.hypot(to.place[0] - centre[0], to.place[1] - centre[1]) || 2 * size;
+  const width = written(2 * radius, document), thickness = tidy(niceBelow(size / 2) / lengthUnit(document));
+  const made = withElement(found, "link", {name: freshName(found, "disc"), pins: [pin], ...STEEL, width, thickness});
+  return {document: made, select: [last(made, "link")]};
+}
+
+export function drawGround(document, {pin, link, place}) {
+  if (pin === undefined || pin === null) {
+    if (link === undefined || link === null) return {problem: "the ground holds pins: click one"};
+    const [found, name] = addPinToLink(document, link, place);
+    return {document: toggleGround(found, name), select: [{kind: "pin", name}]};
+  }
+  return {document: toggleGround(document, pin), select: [{kind: "pin", name: pin}]};
+}
+
+/** The two members that an element at a pin is between, as `of`; a problem where there are fewer than two. */
+function pairAt(document, pin, what) {
+  const met = members(document, pin);
+  if (met.length < 2) return {problem: `${what} acts between two links, or a link and the ground; at ${pin} there is ${met[0] ?? "nothing"} alone: ground the pin (G)`};
+  return met.length > 2 ? {of: met.slice(0, 2)} : {};
+}
+
+export function drawMotor(document, {pin, link, place}) {
+  const slide = list(document, "slide").findIndex(entry => entry.link === list(document, "link")[link]?.name);
+  const blocked = pin && list(document, "slide").findIndex(e => list(document, "link").find(l => l.name === e.link)?.pins?.[0] === pin && members(document, pin).length < 2);
+  const moved = slide >= 0 ? slide : blocked >= 0 && blocked !== null && pin ? blocked : -1;
+  if (moved >= 0) {
+    const made = withElement(document, "motor", {slide: nameOf(document, "slide", moved), speed: "0.1 m/s"});
+    return {document: made, select: [last(made, "motor")]};
+  }
+  if (!pin) return {problem: "a motor turns at a pin: click one"};
+  const present = list(document, "motor").findIndex(motor => motor.pin === pin);
+  if (present >= 0) return {document, select: [{kind: "motor", index: present}]};
+  const pair = pairAt(document, pin, "a motor");
+  if (pair.problem) return pair;
+  const made = withElement(document, "motor", {pin, speed: "60 rpm", ...pair});
+  return {document: made, select: [last(made, "motor")], place};
+}
+
+const vector = angle => [Math.cos(angle), Math.sin(angle)].map(x => tidy(Math.round(x * 1e9) / 1e9));
+const wayOf = (from, to) => {
+  const dx = to.place[0] - from.place[0], dy = to.place[1] - from.place[1];
+  if (Math.hypot(dx, dy) === 0) return [1, 0];
+  const angle = Math.round(Math.atan2(dy, dx) / (Math.PI / 36)) * (Math.PI / 36);  // five degrees
+  return vector(angle);
+};
+
+export function drawSlide(document, from, to) {
+  const links = list(document, "link");
+  let found = document, name = links[from.link]?.name;
+  if (from.pin) {
+    const single = links.find(link => link.pins.length === 1 && link.pins[0] === from.pin);
+    if (single) name = single.name;
+    else {
+      const size = written(0.05, document);
+      name = freshName(document, "slider");
+      found = withElement(found, "link", {name, pins: [from.pin], mass: "0.5 kg", width: size});
+    }
+  }
+  if (!name) return {problem: "a slide guides a link: drag from a pin or a link along the line"};
+  if (list(document, "slide").some(slide => slide.link === name)) return {problem: `${name} slides already`};
+  const on = to.link !== undefined && to.link !== null && links[to.link].name !== name ? links[to.link] : null;
+  const line = on && on.pins.length > 1 ? {along: [on.pins[0], on.pins.at(-1)], on: on.name} : {direction: wayOf(from, to)};
+  found = withElement(found, "slide", {name: freshName(found, "slide"), link: name, ...line});
+  return {document: found, select: [last(found, "slide")]};
+}
+
+export function drawSlot(document, from, to) {
+  if (!from.pin) return {problem: "a slot guides a pin: drag from one along the line, or onto the link that has the slot"};
+  const on = to.link !== undefined && to.link !== null ? list(document, "link")[to.link] : null;
+  let found = document, line;
+  const own = members(document, from.pin).filter(name => name !== "ground");
+  if (on && on.pins.length > 1 && !on.pins.includes(from.pin)) {
+    const along = [on.pins[0], on.pins.at(-1)], ends = along.map(pin => placeOf(document, pin));
+    if (own.some(name => list(document, "link").find(l => l.name === name)?.pins.length)) found = movePin(found, from.pin, project(placeOf(document, from.pin), ...ends));
+    line = {along, on: on.name};
+  } else line = {direction: wayOf(from, to)};
+  if (!own.length) return {problem: `a slot guides a pin of a link; ${from.pin} is on none`};
+  if (groundOf(document).includes(from.pin) && !line.on) return {problem: `${from.pin} is fixed: free it first (G)`};
+  found = withElement(found, "slot", {pin: from.pin, ...line});
+  return {document: found, select: [last(found, "slot")]};
+}
+
+export function drawGear(document, from, to) {
+  const links = list(document, "link");
+  const pick = target => links[target.link]?.name ?? (target.pin ? wheelAt(document, target.pin) : undefined);
+  const names = [pick(from), pick(to)];
+  if (!names[0] || !names[1] || names[0] === names[1]) return {problem: "gears join two links that turn on the ground: drag from one to the other"};
+  const pins = names.map(name => centrePin(document, name));
+  const loose = names.find((_, k) => pins[k] === null);
+  if (loose) return {problem: `${loose} must turn on the ground at one pin, its centre`};
+  const widths = names.map(name => parseFloat(links.find(link => link.name === name).width));
+  const discs = names.every(name => links.find(link => link.name === name).pins.length === 1) && widths.every(w => w > 0);
+  const teeth = discs ? [TEETH, Math.max(4, Math.round(TEETH * widths[1] / widths[0]))] : [TEETH, TEETH];
+  const made = withElement(document, "gear", {links: names, teeth});
+  return {document: made, select: [last(made, "gear")]};
+}
+
+function wheelAt(document, pin) {
+  const found = members(document, pin).filter(name => name !== "ground");
+  const disc = found.find(name => list(document, "link").find(link => link.name === name)?.pins.length === 1);
+  return disc ?? (found.length === 1 ? found[0] : undefined);
+}
+
+export function drawCam(document, from, to) {
+  const links = list(document, "link");
+  const centre = from.pin ?? (links[from.link]?.pins.length === 1 ? links[from.link].pins[0] : undefined);
+  if (!centre || !to.pin || centre === to.pin) return {problem: "a cam turns at a pin and lifts another one: drag from its centre to the follower's pin"};
+  const cam = wheelAt(document, centre), follower = members(document, to.pin).filter(name => name !== "ground");
+  if (!cam) return {problem: `at ${centre} there must be the cam's own link: draw a disc there (B)`};
+  if (!follower.length || follower.includes(cam)) return {problem: `${to.pin} must be a pin of the link that follows`};
+  const [c, p] = [placeOf(document, centre), placeOf(document, to.pin)], pins = links.find(link => link.name === cam).pins;
+  const [a, b] = pins.map(pin => placeOf(document, pin)), turned = b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : 0;
+  const radius = Math.hypot(p[0] - c[0], p[1] - c[1]), stands = Math.atan2(p[1] - c[1], p[0] - c[0]) - turned;
+  const angles = Array.from({length: CAM_POINTS}, (_, k) => 2 * Math.PI * k / CAM_POINTS);
+  const first = ((stands % (2 * Math.PI)) + 2 * Math.PI) % (2 * Math.PI) % (2 * Math.PI / CAM_POINTS);  // the follower stands at a knot
+  const profile = {
+    angle: angles.map(x => tidy(Math.round((x + first) / angleUnit(document) * 1e9) / 1e9)),
+    radius: angles.map(x => written(radius * (1 + LIFT * (1 - Math.cos(x + first - stands)) / 2), document)),
+  };
+  const many = follower.length > 1 || members(document, centre).filter(name => name !== "ground").length > 1;
+  const made = withElement(document, "cam", {pins: [centre, to.pin], profile, ...(many ? {links: [cam, follower[0]]} : {})});
+  return {document: made, select: [last(made, "cam")]};
+}
+
+/** A spring or a damper between two pins; at one pin it turns. A pin that is made here is fixed. */
+function drawBetween(document, from, to, kind, law, turning) {
+  if (from.pin && (to.pin === from.pin || to.isClick)) {
+    const pair = pairAt(document, from.pin, `a ${kind} that turns`);
+    if (pair.problem) return pair;
+    const made = withElement(document, kind, {pin: from.pin, ...pair, ...turning});
+    return {document: made, select: [last(made, kind)]};
+  }
+  let found = document, pin;
+  const between = [];
+  for (const target of [from, to]) {
+    const isNew = !target.pin && (target.link === undefined || target.link === null);
+    [found, pin] = pinFor(found, target);
+    if (isNew) found = toggleGround(found, pin);
+    between.push(pin);
+  }
+  if (between[0] === between[1]) return {problem: `a ${kind} needs two pins`};
+  const shared = members(found, between[0]).filter(name => members(found, between[1]).includes(name));
+  if (shared.length) return {problem: `both ends are on ${shared[0]}: their distance never changes`};
+  found = withElement(found, kind, {between, ...law});
+  return {document: found, select: [last(found, kind)]};
+}
+
+export const drawSpring = (document, from, to) => drawBetween(document, from, to, "spring", {stiffness: "1 N/mm"}, {stiffness: "10 N m/rad"});
+export const drawDamper = (document, from, to) => drawBetween(document, from, to, "damper", {damping: "10 N s/m"}, {damping: "0.1 N m s/rad"});
+
+export function drawLoad(document, from, to, {scale}) {
+  const way = [to.place[0] - from.place[0], to.place[1] - from.place[1]].map(x => Math.round(x * scale / PIXELS_PER_NEWTON));
+  const force = way[0] || way[1] ? way : [0, -10];
+  let found = document, target = {};
+  if (from.pin) target = {pin: from.pin};
+  else if (from.link !== undefined && from.link !== null) {
+    const [made, pin] = addPinToLink(document, from.link, from.place);
+    [found, target] = [made, {pin}];
+  } else return {problem: "a load pulls at a pin or a link: drag from one in the direction of the force"};
+  if (!members(found, target.pin).some(name => name !== "ground")) return {problem: `no link is at ${target.pin}`};
+  found = withElement(found, "load", {...target, force: force.map(x => `${x} N`)});
+  return {document: found, select: [last(found, "load")]};
+}
+
+/** The document with the order of two links that a motor turns reversed. */
+export const swapPair = (document, section, index) => withEntry(document, section, index, entry => ({...entry, of: [...entry.of].reverse()}));

@@ -1,0 +1,31 @@
+// Requests to the studio's server, which carry the token that stands in the fragment of the page's address.
+
+const fragment = new URLSearchParams(location.hash.slice(1));
+const token = fragment.get("t") ?? "";
+
+/** The file that the address asks for. */
+export const askedFile = fragment.get("f") ?? "";
+
+/** A request that was not served: `status` and `details` are those of the answer. */
+export class RequestError extends Error {
+  constructor(status, details) {
+    super(details.problem ?? `the server answered ${status}`);
+    Object.assign(this, {status, details});
+  }
+}
+
+/** Ask one of the routes list, open, save, compile, diagnose. */
+export async function ask(route, request = {}, signal = undefined) {
+  let answer;
+  try {
+    answer = await fetch(`api/${route}`, {
+      method: "POST", headers: {"Content-Type": "application/json", "X-Studio-Token": token}, body: JSON.stringify(request), signal,
+    });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new RequestError(0, {problem: "the studio's server does not answer: is `udkjax studio` still running?"});
+  }
+  const found = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new RequestError(answer.status, found);
+  return found;
+}

@@ -1,0 +1,181 @@
+// The drawing on its canvas: grid, picture, paths, symbols, marks of what is selected or redundant, names, and gestures under way.
+
+import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
+import {middle, symbolsOf} from "./drawn_symbols.js";
+import {carry} from "./mover.js";
+import {THEMES} from "./player/painter.js";
+import {SymbolPainter} from "./player/symbols.js";
+import {angleUnit, lengthUnit, shown} from "./units.js";
+import {toPixels} from "./view.js";
+
+const HALO = 7;  // px around what is selected
+const LABEL = 12;  // px
+
+export class DrawingCanvas {
+  constructor(element) {
+    Object.assign(this, {element, places: new Map(), outlines: [], symbols: []});
+  }
+
+  get width() { return this.element.clientWidth; }
+  get height() { return this.element.clientHeight; }
+
+  context() {
+    const ratio = window.devicePixelRatio || 1, wide = Math.round(this.width * ratio), high = Math.round(this.height * ratio);
+    if (this.element.width !== wide || this.element.height !== high) [this.element.width, this.element.height] = [wide, high];
+    const context = this.element.getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, this.width, this.height);
+    context.lineCap = context.lineJoin = "round";
+    return context;
+  }
+
+  /** The link that carries a pin, or -1 for the ground. */
+  carrier(document, pin) {
+    if (groundOf(document).includes(pin)) return -1;
+    return list(document, "link").findIndex(link => link.pins?.includes(pin));
+  }
+
+  /** The pixels of all pins, except some. */
+  placesOf(document, except = []) {
+    const {view, motions} = this.studio, found = new Map();
+    for (const name of Object.keys(pinsOf(document))) {
+      const place = placeOf(document, name);
+      if (place && !except.includes(name)) found.set(name, toPixels(view, carry(motions, this.carrier(document, name), place)));
+    }
+    return found;
+  }
+
+  draw(studio) {
+    this.studio = studio;
+    const {document, view, motions} = studio, {width, height} = this;
+    if (!width || !height) return;
+    const theme = THEMES[studio.theme], painter = new SymbolPainter(this.context(), view, theme, 1, motions);
+    this.painter = painter;
+    if (studio.picture) this.picture(studio.picture, view);
+    if (studio.show.grid) studio.gridStep = painter.grid(width, height);
+    const key = `${view.scale}`;
+    if (this.drawn !== document || this.key !== key) {
+      this.symbols = symbolsOf(document, 1 / view.scale);
+      [this.drawn, this.key] = [document, key];
+    }
+    this.paths(studio, painter);
+    this.outlines = this.symbols.map(symbol => this.outline(symbol, painter));
+    this.halos(studio, painter, theme);
+    painter.draw(this.symbols);
+    this.places = this.placesOf(document);
+    this.marks(studio, painter, theme);
+    this.labels(studio, painter, theme);
+    this.preview(studio, painter, theme);
+    if (studio.show.grid) painter.bar(studio.gridStep, height);
+  }
+
+  picture({image, x, y, width: wide, opacity}, view) {
+    const c = this.painter.context, [left, top] = toPixels(view, [x, y]), across = wide * view.scale;
+    c.globalAlpha = opacity;
+    c.drawImage(image, left, top - across * image.height / image.width, across, across * image.height / image.width);
+    c.globalAlpha = 1;
+  }
+
+  /** A symbol in pixels, to be picked. */
+  outline({of, frame, radius, points, closed, width}, painter) {
+    const [[x0, y0], c, s, scale] = painter.axes(frame);
+    if (radius) return {of, points: [[x0, y0]], radius: Math.max(painter.view.scale * radius[0] + radius[1], radius[2]), width};
+    return {of, closed, width, points: points.map(([x, y, px = 0, py = 0]) => {
+      const along = scale * x + px, up = scale * y + py;
+      return [x0 + c * along - s * up, y0 - s * along - c * up];
+    })};
+  }
+
+  paths({paths, show}, painter) {
+    if (!show.paths) return;
+    const c = painter.context;
+    for (const {line, link} of paths) {
+      c.beginPath();
+      for (let k = 0; k < line.length; k += 2) {
+        const [x, y] = painter.px([line[k], line[k + 1]]);
+        if (k) c.lineTo(x, y); else c.moveTo(x, y);
+      }
+      c.globalAlpha = 0.5;
+      c.lineWidth = 1.2;
+      c.strokeStyle = painter.colour(link);
+      c.stroke();
+      c.globalAlpha = 1;
+    }
+  }
+
+  halos({selection, hovered}, painter, theme) {
+    for (const [items, alpha] of [[hovered ? [hovered] : [], 0.22], [selection, 0.5]]) {
+      painter.context.globalAlpha = alpha;
+      for (const {of, points, radius, closed, width} of this.outlines) {
+        if (of.kind === "pin" && radius === undefined) continue;  // its support
+        if (!items.some(item => item.kind === of.kind && item.index === of.index && item.name === of.name)) continue;
+        if (radius !== undefined) painter.circle(points[0], radius + HALO / 2, {stroke: theme.accent, width: HALO});
+        else painter.line(points, width + HALO, theme.accent, {closed});
+      }
+      painter.context.globalAlpha = 1;
+    }
+  }
+
+  /** What the findings speak of: pins of redundant sets, each with a sign. */
+  marks({marked, preview}, painter, theme) {
+    for (const [name, {sign, strong}] of marked) {
+      const place = this.places.get(name);
+      if (!place) continue;
+      painter.circle(place, 10, {stroke: theme.force, width: strong ? 2.6 : 1.3});
+      painter.text(sign, [place[0] + 13, place[1] + 11], theme.force, {size: 12, weight: 700});
+    }
+    if (preview?.onto) {
+      const place = this.places.get(preview.onto);
+      if (place) painter.circle(place, 13, {stroke: theme.accent, width: 2.4});
+    }
+  }
+
+  labels({document, show, selection, motions}, painter, theme) {
+    for (const [name, [x, y]] of this.places) {
+      const chosen = selection.some(item => item.kind === "pin" && item.name === name);
+      if (show.names || chosen) painter.text(name, [x + 9, y - 12], theme.ink, {size: LABEL, weight: chosen ? 700 : 400});
+    }
+    list(document, "link").forEach((link, k) => {
+      const chosen = selection.some(item => item.kind === "link" && item.index === k);
+      const place = middle(link, document);
+      if ((show.names || chosen) && place && (link.pins?.length > 1 || chosen)) {
+        const [x, y] = toPixels(painter.view, carry(motions, k, place));
+        painter.text(link.name ?? "", [x, y + 17], painter.colour(k), {size: LABEL, weight: chosen ? 700 : 500, align: "center"});
+      }
+    });
+    for (const section of ["motor", "spring", "damper", "load", "gear", "cam"]) {
+      list(document, section).forEach((entry, k) => {
+        if (!selection.some(item => item.kind === section && item.index === k)) return;
+        const outline = this.outlines.find(({of}) => of.kind === section && of.index === k);
+        if (outline) painter.text(nameOf(document, section, k), [outline.points[0][0] + 14, outline.points[0][1] - 18], theme.accent, {size: LABEL, weight: 700});
+      });
+    }
+  }
+
+  preview({preview, document, view, hand}, painter, theme) {
+    const at = target => (target.pin !== null && this.places.get(target.pin)) || toPixels(view, target.place);
+    if (hand) {
+      const place = toPixels(view, hand.to);
+      painter.line([toPixels(view, hand.at), place], 1.5, theme.accent, {dash: [4, 4]});
+      painter.circle(place, 5, {stroke: theme.accent, width: 2});
+    }
+    if (!preview) return;
+    if (preview.area) {
+      const [[x0, y0], [x1, y1]] = preview.area;
+      painter.line([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], 1.2, theme.accent, {closed: true, dash: [4, 3]});
+    }
+    if (preview.corners) painter.line(preview.corners.map(at), 2, theme.accent, {dash: [6, 4]});
+    for (const target of preview.corners ?? []) painter.circle(at(target), 5, {stroke: theme.accent, width: 2});
+    if (preview.from) {
+      const [a, b] = [at(preview.from), at(preview.to)];
+      painter.line([a, b], 2.4, theme.accent, {dash: [6, 4]});
+      for (const place of [a, b]) painter.circle(place, 5, {fill: theme.back, stroke: theme.accent, width: 2});
+      const [dx, dy] = [0, 1].map(k => preview.to.place[k] - preview.from.place[k]), away = Math.hypot(dx, dy);
+      if (away > 0) {
+        const words = `${shown(away / lengthUnit(document), document.units?.length ?? "m")}  ${shown(Math.atan2(dy, dx) / angleUnit(document), document.units?.angle ?? "rad")}`;
+        painter.text(words, [(a[0] + b[0]) / 2 + 10, (a[1] + b[1]) / 2 - 14], theme.accent, {size: LABEL, weight: 600});
+      }
+    }
+    if (preview.to && members(document, preview.to.pin ?? "").length) painter.circle(at(preview.to), 12, {stroke: theme.accent, width: 2});
+  }
+}

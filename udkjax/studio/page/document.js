@@ -1,0 +1,241 @@
+// Drawings as plain data, the tables of their file, and the changes that the editor makes to them. A document is never changed:
+// each function returns a new one that shares what stays.
+
+import {length, point, written} from "./units.js";
+
+export const LISTS = ["link", "slide", "slot", "gear", "cam", "motor", "spring", "damper", "load", "body", "joint", "driver", "force"];
+// Keys of tables that name pins and links.
+const PIN_KEYS = ["pin", "pins", "along", "between"], LINK_KEYS = ["link", "on", "links", "of", "carrier", "bodies", "body"];
+const GROUND = "ground";
+
+export const EMPTY = {format: 2, units: {length: "mm", angle: "deg"}, ground: [], pins: {}};
+
+export const list = (document, section) => (Array.isArray(document[section]) ? document[section] : []);
+export const pinsOf = document => document.pins ?? {};
+export const groundOf = document => document.ground ?? [];
+export const placeOf = (document, pin) => point(pinsOf(document)[pin], document);
+
+/** The name of an element: its own, or the section's with its number. */
+export const nameOf = (document, section, index) => list(document, section)[index]?.name ?? `${section}${index + 1}`;
+
+/** The document with a section in place of the old one; an empty one is left out. */
+export function withSection(document, section, entries) {
+  const {[section]: _, ...rest} = document;
+  const order = Object.keys(document);
+  if (!entries.length) return rest;
+  return order.includes(section) ? {...document, [section]: entries} : {...rest, [section]: entries};
+}
+
+/** The document with one key of an element changed, or left out where the value is undefined. */
+export function withKey(document, section, index, key, value) {
+  return withEntry(document, section, index, entry => {
+    const {[key]: _, ...rest} = entry;
+    return value === undefined ? rest : key in entry ? {...entry, [key]: value} : {...rest, [key]: value};
+  });
+}
+
+export function withEntry(document, section, index, change) {
+  return withSection(document, section, list(document, section).map((entry, k) => (k === index ? change(entry) : entry)));
+}
+
+/** The document with an element more. */
+export const withElement = (document, section, entry) => withSection(document, section, [...list(document, section), entry]);
+
+/** The members of a pin: the ground where it is fixed, and the names of the links that share it. */
+export function members(document, pin) {
+  const links = list(document, "link").filter(link => link.pins?.includes(pin)).map(link => link.name);
+  return groundOf(document).includes(pin) ? [GROUND, ...links] : links;
+}
+
+/** A name that no pin has: A, B, ..., Z, A1, ... */
+export function freshPin(document) {
+  const taken = new Set([...Object.keys(pinsOf(document)), ...LISTS.flatMap(s => list(document, s).map((_, k) => nameOf(document, s, k)))]);
+  for (let k = 0; ; k++) {
+    const name = String.fromCharCode(65 + (k % 26)) + (k < 26 ? "" : Math.floor(k / 26));
+    if (!taken.has(name)) return name;
+  }
+}
+
+/** A name that no element has: link1, link2, ... */
+export function freshName(document, base) {
+  const taken = new Set([...Object.keys(pinsOf(document)), ...LISTS.flatMap(s => list(document, s).map((_, k) => nameOf(document, s, k)))]);
+  for (let k = 1; ; k++) if (!taken.has(`${base}${k}`)) return `${base}${k}`;
+}
+
+/** The document with a pin more at a place (m), and the pin's name. */
+export function addPin(document, place) {
+  const name = freshPin(document);
+  return [movePin(document, name, place), name];
+}
+
+/** The document with a pin at another place (m). */
+export function movePin(document, name, place) {
+  const old = pinsOf(document)[name], value = place.map((x, k) => written(x, document, old?.[k]));
+  return {...document, pins: {...pinsOf(document), [name]: value}};
+}
+
+/** The document whose pins are moved by (dx, dy) metres; slots with lines through pins keep their pins on these. */
+export function shiftPins(document, names, dx, dy) {
+  let found = document;
+  for (const name of names) {
+    const place = placeOf(document, name);
+    if (place) found = movePin(found, name, [place[0] + dx, place[1] + dy]);
+  }
+  return found;
+}
+
+/** The document with the pins of slots put onto their lines: those through two pins, which may have moved. */
+export function settleSlots(document) {
+  let found = document;
+  for (const slot of list(document, "slot")) {
+    const ends = (slot.along ?? []).map(pin => placeOf(found, pin)), at = placeOf(found, slot.pin);
+    if (ends.length !== 2 || !ends.every(Boolean) || !at) continue;
+    const foot = project(at, ...ends);
+    if (Math.hypot(foot[0] - at[0], foot[1] - at[1]) > 1e-9 * Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1])) {
+      found = movePin(found, slot.pin, foot);
+    }
+  }
+  return found;
+}
+
+/** The point of the line through a and b that is nearest to p. */
+export function project(p, a, b) {
+  const dx = b[0] - a[0], dy = b[1] - a[1], square = dx * dx + dy * dy;
+  const s = square > 0 ? ((p[0] - a[0]) * dx + (p[1] - a[1]) * dy) / square : 0;
+  return [a[0] + s * dx, a[1] + s * dy];
+}
+
+/** A value whose names are changed; a list loses those that become the same. */
+function renamed(value, names) {
+  if (Array.isArray(value)) return [...new Set(value.map(x => names.get(x) ?? x))];
+  return names.get(value) ?? value;
+}
+
+function renameKeys(document, keys, names) {
+  let found = document;
+  for (const section of LISTS) {
+    const entries = list(found, section).map(entry => {
+      const changed = Object.fromEntries(keys.filter(key => key in entry).map(key => [key, renamed(entry[key], names)]));
+      return keys.some(key => key in entry && JSON.stringify(changed[key]) !== JSON.stringify(entry[key])) ? {...entry, ...changed} : entry;
+    });
+    if (entries.some((entry, k) => entry !== list(found, section)[k])) found = {...found, [section]: entries};
+  }
+  return found;
+}
+
+/** The document with a pin under another name; a name that is taken, or none, changes nothing. */
+export function renamePin(document, old, name) {
+  if (!name || name === old || Object.hasOwn(pinsOf(document), name)) return document;
+  const swap = key => (key === old ? name : key), again = table => Object.fromEntries(Object.entries(table).map(([k, v]) => [swap(k), v]));
+  const found = {...document, pins: again(pinsOf(document)), ground: groundOf(document).map(swap)};
+  if (document.velocities) found.velocities = again(document.velocities);
+  return renameKeys(found, PIN_KEYS, new Map([[old, name]]));
+}
+
+/** The document with an element under another name; links keep what refers to them. */
+export function renameElement(document, section, index, name) {
+  const old = nameOf(document, section, index), taken = list(document, section).some((_, k) => nameOf(document, section, k) === name);
+  if (!name || name === old || taken) return document;
+  const found = withEntry(document, section, index, entry => ({name, ...entry, ...{name}}));
+  const keys = section === "link" ? LINK_KEYS : section === "slide" ? ["slide"] : [];
+  return renameKeys(found, keys, new Map([[old, name]]));
+}
+
+/** The document with one pin in place of two: all that was at the first is at the second. Links that lose their length go. */
+export function mergePins(document, from, into) {
+  if (from === into) return document;
+  const {[from]: _, ...pins} = pinsOf(document);
+  const found = {...document, pins, ground: [...new Set(groundOf(document).map(pin => (pin === from ? into : pin)))]};
+  if (document.velocities) found.velocities = Object.fromEntries(Object.entries(document.velocities).filter(([pin]) => pin !== from));
+  const merged = renameKeys(found, PIN_KEYS, new Map([[from, into]]));
+  const gone = list(merged, "link").flatMap((link, k) => (link.pins.length < list(document, "link")[k].pins.length && link.pins.length < 2 ? [k] : []));
+  return removeElements(merged, gone.map(index => ({kind: "link", index})));
+}
+
+/** The document with the ground at a pin, or without it. */
+export function toggleGround(document, pin) {
+  const ground = groundOf(document);
+  return {...document, ground: ground.includes(pin) ? ground.filter(name => name !== pin) : [...ground, pin]};
+}
+
+/** The document without pins and elements {kind: "pin", name} or {kind: section, index}, and without what hangs on them. */
+export function removeElements(document, items) {
+  const names = new Set(items.filter(item => item.kind === "pin").map(item => item.name));
+  let found = document;
+  if (names.size) {
+    const links = list(found, "link").map(link => (link.pins?.some(p => names.has(p)) ? {...link, pins: link.pins.filter(p => !names.has(p))} : link));
+    const before = list(found, "link");
+    const dead = new Set(before.flatMap((link, k) => (links[k] !== link && links[k].pins.length < Math.min(2, link.pins.length) ? [k] : [])));
+    items = [...items, ...[...dead].map(index => ({kind: "link", index}))];
+    found = {...found, link: links};
+  }
+  const gone = Object.fromEntries(LISTS.map(s => [s, new Set(items.filter(item => item.kind === s).map(item => item.index))]));
+  const lost = new Set([...gone.link].map(index => list(document, "link")[index]?.name));
+  const slides = new Set([...gone.slide].map(index => nameOf(document, "slide", index)));
+  for (const section of LISTS) {
+    const refers = entry => section !== "link" && (PIN_KEYS.some(key => [entry[key]].flat().some(x => names.has(x)))
+      || LINK_KEYS.some(key => [entry[key]].flat().some(x => lost.has(x))));
+    list(document, section).forEach((entry, k) => { if (refers(entry)) gone[section].add(k); });
+  }
+  gone.slide.forEach(index => slides.add(nameOf(document, "slide", index)));
+  list(document, "motor").forEach((motor, k) => { if (slides.has(motor.slide)) gone.motor.add(k); });
+  for (const section of LISTS) {
+    if (gone[section].size) found = withSection(found, section, list(found, section).filter((_, k) => !gone[section].has(k)));
+  }
+  found = dropAlone(document, found);
+  const before = usedPins(document), after = usedPins(found);
+  return dropPins(found, pin => names.has(pin) || (before.has(pin) && !after.has(pin)));
+}
+
+/** The document without what turned or pulled at pins where, other than before, no two members meet, or no link is. */
+function dropAlone(before, document) {
+  let found = document;
+  for (const section of ["motor", "spring", "damper", "load"]) {
+    const least = section === "load" ? 1 : 2, met = (doc, pin) => members(doc, pin).filter(name => least === 2 || name !== GROUND).length;
+    const kept = list(found, section).filter(entry => entry.pin === undefined || met(before, entry.pin) < least || met(document, entry.pin) >= least);
+    if (kept.length < list(found, section).length) found = withSection(found, section, kept);
+  }
+  return found;
+}
+
+/** The names of pins that tables refer to. */
+const usedPins = document => new Set(LISTS.flatMap(s => list(document, s).flatMap(entry => PIN_KEYS.flatMap(key => [entry[key]].flat()))));
+
+function dropPins(document, isDropped) {
+  const keep = pin => !isDropped(pin), only = table => Object.fromEntries(Object.entries(table ?? {}).filter(([pin]) => keep(pin)));
+  const found = {...document, pins: only(document.pins), ground: groundOf(document).filter(keep)};
+  if (document.velocities) found.velocities = only(document.velocities);
+  return found;
+}
+
+/** The pins of what is selected. */
+export function pinsOfItems(document, items) {
+  return [...new Set(items.flatMap(item => (item.kind === "pin" ? [item.name]
+    : item.kind === "link" ? list(document, "link")[item.index]?.pins ?? [] : [])))];
+}
+
+/** The document with copies of links and of what lies between them, (dx, dy) metres away; and the copies. */
+export function duplicate(document, items, dx, dy) {
+  const links = items.filter(item => item.kind === "link").map(item => item.index);
+  let found = document;
+  const copies = new Map();
+  for (const pin of pinsOfItems(document, items.filter(item => item.kind === "link"))) {
+    const place = placeOf(document, pin);
+    const [next, name] = addPin(found, place ? [place[0] + dx, place[1] + dy] : [0, 0]);
+    found = groundOf(document).includes(pin) ? toggleGround(next, name) : next;
+    copies.set(pin, name);
+  }
+  const made = [];
+  for (const index of links) {
+    const {name, ...link} = list(document, "link")[index];
+    const shifted = Object.fromEntries(["centre", "outline"].filter(key => key in link).map(key => [key, shiftedPoints(link[key], document, dx, dy)]));
+    found = withElement(found, "link", {name: freshName(found, "link"), ...link, ...shifted, pins: link.pins.map(pin => copies.get(pin))});
+    made.push({kind: "link", index: list(found, "link").length - 1});
+  }
+  return [found, made];
+}
+
+function shiftedPoints(value, document, dx, dy) {
+  if (Array.isArray(value[0])) return value.map(p => shiftedPoints(p, document, dx, dy));
+  return value.map((x, k) => written(length(x, document) + (k ? dy : dx), document, x));
+}

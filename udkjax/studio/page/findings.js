@@ -1,0 +1,99 @@
+// What is found about the drawing, always in view: mistakes; freedoms; redundant constraints with what frees them; what moves it or
+// why nothing does; which reactions are unique; how far motors turn.
+
+import {list, nameOf, LISTS, pinsOf} from "./document.js";
+import {make} from "./player/elements.js";
+
+const COMPONENTS = ["x", "y", "torque"];
+
+export class FindingsPanel {
+  constructor(studio, element) {
+    Object.assign(this, {studio, element, travel: null, structure: null});
+  }
+
+  mark(entries) {
+    this.studio.marked = new Map(entries);
+    this.studio.redraw();
+  }
+
+  showEmpty() {
+    this.structure = this.travel = null;
+    this.mark([]);
+    this.element.replaceChildren(
+      make("p", {class: "lead"}, "Draw a mechanism"),
+      make("p", {}, "Press L and drag links from pin to pin; G fixes a pin to the ground; M puts a motor on one. Or open a template."));
+  }
+
+  /** Mistakes, as the reader of files names them; each leads to its element. */
+  showProblems(problems) {
+    if (!problems.length) return;
+    this.structure = this.travel = null;
+    this.mark([]);
+    this.element.replaceChildren(make("p", {class: "lead"}, problems.length === 1 ? "One thing is missing before it can move" : `${problems.length} things are missing before it can move`),
+      make("ul", {class: "problems"}, ...problems.slice(0, 30).map(problem => {
+        const item = itemOf(this.studio.document, problem);
+        return make("li", {}, item ? make("button", {type: "button", class: "link", onclick: () => this.studio.select([item])}, problem) : problem);
+      })));
+  }
+
+  showStructure(found) {
+    if (found.problems.length) return this.showProblems(found.problems);
+    this.structure = found;
+    this.travel = null;
+    return this.show();
+  }
+
+  showTravel(found) {
+    this.travel = found.travel ?? [];
+    this.show();
+  }
+
+  show() {
+    const {structure: s} = this, pins = pinsOf(this.studio.document), plural = (n, word) => `${n} ${word}${n === 1 ? "" : "s"}`;
+    if (!s) return;
+    const driven = s.joint_freedoms !== s.freedoms ? `, ${s.freedoms} with its motors held` : "";
+    const rows = [make("p", {class: "lead"}, make("b", {}, plural(s.joint_freedoms, "freedom")), driven, " · ",
+      make("b", {class: s.redundant ? "bad" : ""}, s.redundant ? plural(s.redundant, "redundant constraint") : "nothing redundant")),
+    make("p", {}, s.motion, ".")];
+    for (const {motor, unit, ends} of this.travel ?? []) rows.push(make("p", {class: ends.length ? "warn" : ""}, travelWords(motor, unit, ends)));
+    for (const set of s.sets) rows.push(this.set(set, pins));
+    const loose = Object.entries(s.loose);
+    rows.push(make("p", {}, make("b", {}, "Reactions: "), loose.length
+      ? `not unique at ${loose.map(([name, {components}]) => `${name} (${components.flatMap((known, k) => (known ? [] : [COMPONENTS[k] ?? k])).join(", ")})`).join(", ")}: redundant constraints share them as their stiffness decides`
+      : "all unique"));
+    rows.push(make("details", {class: "more"}, make("summary", {}, "The diagnosis in full"), make("pre", {}, s.text)));
+    const again = this.element.querySelector("details.more")?.open;
+    this.element.replaceChildren(...rows);
+    this.element.querySelector("details.more").open = Boolean(again);
+    this.mark(s.sets.flatMap(set => set.constraints.map(pinOf(pins)).filter(Boolean).map(pin => [pin, {sign: "R", strong: false}])));
+  }
+
+  set({constraints, count, permanent, fixes}, pins) {
+    const toPin = pinOf(pins), names = constraints.join(", ");
+    return make("div", {class: "set"},
+      make("p", {}, make("b", {class: "bad"}, "R "), `${names}: ${count} redundant row${count === 1 ? "" : "s"}, ${permanent ? "everywhere" : "in this position only"}.`,
+        fixes.length ? " Free one pin:" : permanent ? " No single change of a joint was found that mends it." : ""),
+      make("ul", {}, ...fixes.map(fix => make("li", {}, make("button", {type: "button", class: "link",
+        onclick: () => this.studio.select([{kind: "pin", name: toPin(fix.constraint)}].filter(item => item.name)),
+        onmouseenter: () => this.mark([...constraints.map(toPin).filter(Boolean).map(pin => [pin, {sign: "R", strong: pin === toPin(fix.constraint)}])]),
+      }, make("b", {}, fix.constraint), `: ${fix.change}`)))));
+  }
+}
+
+const pinOf = pins => name => (Object.hasOwn(pins, name) ? name : Object.keys(pins).find(pin => name.startsWith(`${pin}-`)));
+
+function travelWords(motor, unit, ends) {
+  const value = x => (unit === "rad" ? `${(x * 180 / Math.PI).toFixed(1)}°` : `${+(1e3 * x).toPrecision(4)} mm`).replace("-", "−");
+  if (!ends.length) return `${motor} turns all the way round.`;
+  const line = triples => (triples.length ? `: ${triples.map(names => names.join(", ")).join("; ")} in line` : "");
+  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(", and at ")}.`;
+}
+
+/** The element that a mistake is about. */
+export function itemOf(document, problem) {
+  const pin = /^pins\.([^:]+?)(?:\[\d+\])?:/.exec(problem)?.[1];
+  if (pin !== undefined && Object.hasOwn(pinsOf(document), pin)) return {kind: "pin", name: pin};
+  const found = /\(([a-z]+)\[(\d+)\]\)/.exec(problem);
+  if (!found || !LISTS.includes(found[1]) || +found[2] >= list(document, found[1]).length) return null;
+  return nameOf(document, found[1], +found[2]) === undefined ? null : {kind: found[1], index: +found[2]};
+}

@@ -1,0 +1,30 @@
+// Undo and redo. A state is never changed, so an entry is the state itself: what comes back is what was there, to the bit.
+
+const MOST_ENTRIES = 1000;
+
+export class History {
+  constructor(state) { this.reset(state); }
+
+  reset(state) {
+    this.states = [state];
+    this.at = 0;
+  }
+
+  get state() { return this.states[this.at]; }
+  get canUndo() { return this.at > 0; }
+  get canRedo() { return this.at < this.states.length - 1; }
+
+  /** Add a state; what was undone before is forgotten. A state that says the same adds nothing. */
+  push(state, same = (a, b) => a === b) {
+    if (same(state, this.state)) return false;
+    this.states = [...this.states.slice(Math.max(0, this.at + 2 - MOST_ENTRIES), this.at + 1), state];
+    this.at = this.states.length - 1;
+    return true;
+  }
+
+  /** Put another state in place of this one, where it says more of the same. */
+  amend(state) { this.states[this.at] = state; }
+
+  undo() { if (this.canUndo) this.at--; return this.state; }
+  redo() { if (this.canRedo) this.at++; return this.state; }
+}

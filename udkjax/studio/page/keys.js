@@ -1,0 +1,53 @@
+// The keyboard: what users of drawing programs expect.
+
+import {duplicate, removeElements} from "./document.js";
+import {TOOLS} from "./tools.js";
+
+const COPY_PIXELS = 24;  // between what is duplicated and its copy
+const typing = target => ["INPUT", "TEXTAREA", "SELECT"].includes(target.tagName) && target.type !== "range" && target.type !== "checkbox";
+
+export function followKeys(studio) {
+  window.addEventListener("keydown", event => {
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, command = event.ctrlKey || event.metaKey;
+    const action = command ? commands(studio, event)[key] : plain(studio)[key];
+    if (!action || event.altKey || document.querySelector("dialog[open]")) return;
+    if (typing(event.target) && !(command && "sn".includes(key))) return;
+    if (key === " " && event.target.tagName === "BUTTON") return;  // a button takes the space bar itself
+    event.preventDefault();
+    action();
+  });
+}
+
+const commands = (studio, event) => ({
+  z: () => (event.shiftKey ? studio.redo() : studio.undo()),
+  y: () => studio.redo(),
+  s: () => studio.files.save(event.shiftKey),
+  n: () => studio.files.startNew(),
+  o: () => studio.files.showOpen(),
+  d: () => copy(studio),
+  a: () => studio.select(Object.keys(studio.document.pins ?? {}).map(name => ({kind: "pin", name}))),
+});
+
+const plain = studio => ({
+  Delete: () => remove(studio),
+  Backspace: () => remove(studio),
+  Escape: () => { if (!studio.gestures.cancel()) { if (studio.tool !== "select") studio.setTool("select"); else studio.select([]); } },
+  Enter: () => studio.gestures.finish(),
+  Home: () => studio.rewind(),
+  " ": () => studio.motion.toggle(),
+  f: () => studio.fit(),
+  "?": () => studio.parts.help.showModal(),
+  ...Object.fromEntries(TOOLS.map(tool => [tool.key, () => studio.setTool(tool.name)])),
+});
+
+export function remove(studio) {
+  if (studio.selection.length) studio.commit(removeElements(studio.document, studio.selection), []);
+}
+
+export function copy(studio) {
+  const away = COPY_PIXELS / studio.view.scale, [dx, dy] = studio.snap([away, -away], {altKey: false});
+  const links = studio.selection.filter(item => item.kind === "link");
+  if (!links.length) return studio.say("select a link to duplicate it");
+  const [found, copies] = duplicate(studio.document, links, dx || away, dy || -away);
+  return studio.commit(found, copies);
+}

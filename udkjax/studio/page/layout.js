@@ -1,0 +1,82 @@
+// The page: its bars, the drawing, and the panels beside it.
+
+import {KEYS, TOOLS} from "./tools.js";
+import {make, icon} from "./player/elements.js";
+
+export function svgIcon(path, stroke = false) {
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), line = document.createElementNS(svg.namespaceURI, "path");
+  svg.setAttribute("viewBox", "0 0 24 24");
+  svg.setAttribute("aria-hidden", "true");
+  if (stroke) svg.classList.add("stroke");
+  line.setAttribute("d", path);
+  line.setAttribute("fill-rule", "evenodd");
+  svg.append(line);
+  return svg;
+}
+
+const ICONS = {
+  undo: "M9 5L4 10l5 5v-3.5h5a3.5 3.5 0 0 1 0 7H9v2h5a5.5 5.5 0 0 0 0-11H9z", redo: "M15 5l5 5-5 5v-3.5h-5a3.5 3.5 0 0 0 0 7h5v2h-5a5.5 5.5 0 0 1 0-11h5z",
+  fit: "M4 4h6v2H6v4H4zM14 4h6v6h-2V6h-4zM4 14h2v4h4v2H4zM18 14h2v6h-6v-2h4z", home: "M6 5h2.5v14H6zM19 5v14L9 12z",
+};
+
+/** Build the page in an element; returns its parts by name. */
+export function buildPage(studio, root) {
+  const parts = {};
+  const button = (content, title, action, kind = "") => make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
+  const section = (title, part, open = true) => {
+    const found = make("details", {class: `panel ${part}`}, make("summary", {}, title), parts[part] = make("div", {class: "body"}));
+    found.open = open;
+    return found;
+  };
+  parts.title = make("h1", {}, "untitled");
+  parts.undo = button(svgIcon(ICONS.undo), "undo (Ctrl+Z)", () => studio.undo(), "icon");
+  parts.redo = button(svgIcon(ICONS.redo), "redo (Ctrl+Y)", () => studio.redo(), "icon");
+  const files = make("nav", {class: "group", "aria-label": "file"},
+    button("New", "new drawing (Ctrl+N)", () => studio.files.startNew()), button("Open", "open a file or a template (Ctrl+O)", () => studio.files.showOpen()),
+    button("Save", "save (Ctrl+S)", () => studio.files.save(false)), button("Export", "export as page, picture, film, table or script", () => studio.files.showExport()));
+  const header = make("header", {}, parts.title, files, make("div", {class: "group"}, parts.undo, parts.redo,
+    button(svgIcon(ICONS.fit), "fit (F)", () => studio.fit(), "icon")), make("div", {class: "group end"},
+    button(icon("theme"), "dark or light", () => studio.switchTheme(), "icon"), button("?", "keys (?)", () => parts.help.showModal(), "icon")));
+  parts.tools = TOOLS.map(tool => {
+    const found = button(make("span", {}, tool.name), `${tool.title} (${tool.key.toUpperCase()})`, () => studio.setTool(tool.name), "tool");
+    found.dataset.tool = tool.name;
+    found.prepend(svgIcon(tool.icon, tool.stroke));
+    return found;
+  });
+  parts.canvas = make("canvas", {tabindex: 0, role: "application", "aria-label": "drawing"});
+  parts.status = make("p", {class: "status", role: "status"});
+  const toggles = [["grid", "grid"], ["snap", "snap to the grid (Alt: not)"], ["names", "names"], ["paths", "paths of pins"]].map(([name, title]) => {
+    const found = button(name, title, () => {
+      studio.show[name] = !studio.show[name];
+      found.setAttribute("aria-pressed", studio.show[name]);
+      studio.redraw();
+    });
+    found.setAttribute("aria-pressed", studio.show[name]);
+    return found;
+  });
+  parts.picture = make("div", {class: "group"});
+  const stage = make("main", {}, parts.canvas, make("div", {class: "toggles group"}, ...toggles, parts.picture), parts.status);
+  parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
+  parts.home = button(svgIcon(ICONS.home), "as drawn (Home)", () => studio.rewind(), "icon");
+  parts.scrub = make("input", {type: "range", min: 0, max: 10000, step: 1, "aria-label": "time", oninput: () => {
+    studio.motion.pause();
+    studio.motion.seek(studio.motion.end * parts.scrub.value / 10000);
+  }});
+  parts.time = make("span", {class: "time"});
+  parts.speed = make("select", {"aria-label": "speed", title: "speed", onchange: () => { studio.motion.speed = +parts.speed.value; }},
+    ...[0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10].map(x => make("option", {value: x}, `${x} ×`)));
+  parts.speed.value = 1;
+  parts.loops = make("span", {class: "loops", role: "status"});
+  parts.curveSelect = make("select", {"aria-label": "curve"});
+  parts.curveCanvas = make("canvas", {"aria-hidden": "true"});
+  parts.forces = button("Forces", "compute forces at pins, powers and energies", () => studio.curves.askForces());
+  const strip = make("div", {class: "strip"}, parts.curveCanvas, make("div", {class: "group over-strip"}, parts.curveSelect, parts.forces));
+  const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.scrub, parts.speed, parts.loops);
+  const side = make("aside", {}, section("Findings", "findings"), section("Selection", "properties"), section("Text (TOML)", "source"));
+  parts.help = make("dialog", {class: "help", "aria-label": "keys"}, make("h2", {}, "Keys"),
+    make("dl", {}, ...KEYS.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])),
+    make("form", {method: "dialog"}, make("button", {class: "strong"}, "Close")));
+  parts.dialog = make("dialog", {class: "sheet"});
+  root.replaceChildren(header, make("div", {class: "tools", role: "toolbar", "aria-label": "tools"}, ...parts.tools), stage, side, strip, transport, parts.help, parts.dialog);
+  return parts;
+}

@@ -1,0 +1,122 @@
+// The engine in the page: the motion of the drawing, its closed positions, and a hand that pulls it. WebAssembly computes; here
+// its bodies are matched to the links of the document, whose frames are that of the ground while they stand as drawn.
+
+import {list, placeOf} from "./document.js";
+
+const INSTANTS = 401;
+const PULLS = 12;  // closings of one frame, each nearer to the hand
+const LONGEST_PULL = 0.08;  // characteristic lengths in one closing, so that no branch is jumped to
+const NEAR = 1e-4;  // characteristic lengths of the hand: near enough
+
+/** Turn frames x, y, angle of bodies and those that they are drawn in into motions of the ground: place p goes to t + R p. */
+export function motionsOf(q, drawn, order) {
+  const found = new Float64Array(3 * order.length);
+  order.forEach((body, k) => {
+    if (body < 0) return;
+    const angle = q[3 * body + 2] - drawn[3 * body + 2], c = Math.cos(angle), s = Math.sin(angle);
+    const x = drawn[3 * body], y = drawn[3 * body + 1];
+    found.set([q[3 * body] - c * x + s * y, q[3 * body + 1] - s * x - c * y, angle], 3 * k);
+  });
+  return found;
+}
+
+/** Where a motion brings a place of the drawing. */
+export function carry(motions, k, [x, y]) {
+  if (k < 0) return [x, y];
+  const c = Math.cos(motions[3 * k + 2]), s = Math.sin(motions[3 * k + 2]);
+  return [motions[3 * k] + c * x - s * y, motions[3 * k + 1] + s * x + c * y];
+}
+
+/** The state of a run at a time: cubic between its instants, whose rates are known. */
+export function stateAt({ts, q, v, count}, t, size) {
+  let low = 0, high = count - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (ts[middle] <= t) low = middle; else high = middle;
+  }
+  const h = ts[high] - ts[low], s = h > 0 ? Math.min(Math.max((t - ts[low]) / h, 0), 1) : 0, r = 1 - s;
+  const found = {t, q: new Float64Array(size), v: new Float64Array(size)};
+  for (let k = 0; k < size; k++) {
+    const i = low * size + k, j = high * size + k;
+    found.q[k] = q[i] * r * r * (1 + 2 * s) + q[j] * s * s * (3 - 2 * s) + h * s * r * (v[i] * r - v[j] * s);
+    found.v[k] = h > 0 ? 6 * s * r * (q[j] - q[i]) / h + v[i] * r * (1 - 3 * s) + v[j] * s * (3 * s - 2) : v[i];
+  }
+  return found;
+}
+
+export class Mover {
+  /** `compiled` is the answer of the compile route for `document`; `loadEngine` makes its engines. */
+  static async load(document, compiled, loadEngine) {
+    const found = new Mover();
+    found.scene = compiled.scene;
+    found.recorded = compiled.motion;
+    found.size = 3 * found.scene.bodies.length;
+    found.order = list(document, "link").map(link => found.scene.bodies.indexOf(link.name));
+    if (compiled.engine) {
+      found.engine = await loadEngine(compiled.engine);
+      found.hand = compiled.hand ? await loadEngine(compiled.hand) : found.engine;
+      found.pins = compiled.pins;
+    }
+    found.follow(document);
+    return found;
+  }
+
+  /** Take the places of pins from a document of the same structure; tells whether they are numbers. */
+  follow(document) {
+    this.drawn = Float64Array.from(this.scene.frames.flat());
+    if (!this.engine) return true;
+    const places = this.pins.map(name => placeOf(document, name));
+    if (!places.every(Boolean)) return false;
+    this.parameters = Float64Array.from(places.flat());
+    this.drawn = this.engine.guess(this.engine.numbers(this.parameters)).q;
+    return true;
+  }
+
+  get duration() { return this.scene.duration; }
+
+  /** The closed state as drawn; `closed` says whether the loops close. */
+  start() {
+    if (!this.engine) return {t: 0, q: this.recorded.q.slice(0, this.size), v: this.recorded.v.slice(0, this.size), closed: true, violation: 0};
+    return this.engine.close(this.parameters);
+  }
+
+  /** The motion from the drawn position, or from a state. */
+  run(from = null) {
+    if (!this.engine) {
+      const {times, q, v, cause} = this.recorded;
+      return {ts: times, q, v, count: times.length, done: !cause, words: cause, violation: []};
+    }
+    const state = from ?? this.start();
+    if (!state.closed) return {ts: [0], q: state.q, v: state.v, count: 1, done: false, words: "the loops do not close as drawn", violation: [state.violation]};
+    const times = Float64Array.from({length: INSTANTS}, (_, k) => this.duration * k / (INSTANTS - 1));
+    const found = this.engine.run(this.parameters, state, times);
+    return found.count ? found : {...found, ts: [0], q: state.q, v: state.v, count: 1};
+  }
+
+  /** The state nearest to one in which a place of a link (m, as drawn) is at the hand: closed, without what drives it. */
+  pull(state, link, place, hand) {
+    const body = this.order[link], {length} = this.scene;
+    let best = state;
+    for (let i = 0; i < PULLS; i++) {
+      const motions = motionsOf(best.q, this.drawn, this.order), at = carry(motions, link, place);
+      const way = [hand[0] - at[0], hand[1] - at[1]], away = Math.hypot(...way);
+      if (away <= NEAR * length) break;
+      const share = Math.min(1, LONGEST_PULL * length / away), q = Float64Array.from(best.q);
+      q[3 * body] += share * way[0];
+      q[3 * body + 1] += share * way[1];
+      const found = this.hand.close(this.parameters, {t: state.t, q, v: new Float64Array(this.size)});
+      if (!found.closed) return {...best, words: "it cannot follow any farther: the loops would open"};
+      const reached = carry(motionsOf(found.q, this.drawn, this.order), link, place);
+      if (Math.hypot(hand[0] - reached[0], hand[1] - reached[1]) >= away - 1e-9 * length) return {...best, words: "it gets no nearer to the hand"};
+      best = found;
+    }
+    return {...best, words: ""};
+  }
+
+  motions(q) { return motionsOf(q, this.drawn, this.order); }
+
+  /** Energies (J) over a run. */
+  energies(run) {
+    return this.engine && run.count > 1 ? this.engine.measure(this.parameters, run, true) : null;
+  }
+}

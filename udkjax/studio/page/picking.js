@@ -1,0 +1,63 @@
+// What is under the cursor: the nearest pin, else the topmost symbol that the cursor is near.
+
+import {list} from "./document.js";
+
+const PIN_REACH = 11, SYMBOL_REACH = 7, TOUCH = 1.8;  // px; fingers reach farther
+
+/** The distance of a point from the segment from a to b. */
+export function distance([x, y], [ax, ay], [bx, by]) {
+  const dx = bx - ax, dy = by - ay, square = dx * dx + dy * dy;
+  const s = square > 0 ? Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / square, 0), 1) : 0;
+  return Math.hypot(x - ax - s * dx, y - ay - s * dy);
+}
+
+/** Tell whether a point is inside a polygon. */
+export function inside([x, y], points) {
+  let found = false;
+  points.forEach(([ax, ay], k) => {
+    const [bx, by] = points[(k + 1) % points.length];
+    if ((ay > y) !== (by > y) && x < ax + (bx - ax) * (y - ay) / (by - ay)) found = !found;
+  });
+  return found;
+}
+
+/** The pin nearest to a pixel, within reach, or null. `places` are the pixels of the pins. */
+export function pinAt(places, pixel, touch = false, except = null) {
+  let best = null, least = PIN_REACH * (touch ? TOUCH : 1);
+  for (const [name, place] of places) {
+    const away = Math.hypot(place[0] - pixel[0], place[1] - pixel[1]);
+    if (name !== except && away < least) [best, least] = [name, away];
+  }
+  return best;
+}
+
+/** What is at a pixel: {kind, name or index}, or null. `outlines` are the symbols in pixels, the topmost last. */
+export function itemAt(outlines, places, pixel, touch = false, kinds = null) {
+  const reach = SYMBOL_REACH * (touch ? TOUCH : 1), fits = of => !kinds || kinds.includes(of.kind);
+  const pin = fits({kind: "pin"}) ? pinAt(places, pixel, touch) : null;
+  if (pin !== null) return {kind: "pin", name: pin};
+  for (let k = outlines.length - 1; k >= 0; k--) {
+    const {of, points, radius, closed, width} = outlines[k];
+    if (!of || of.kind === "pin" || !fits(of)) continue;
+    if (radius !== undefined) {
+      if (Math.hypot(points[0][0] - pixel[0], points[0][1] - pixel[1]) <= Math.max(radius, reach)) return of;
+      continue;
+    }
+    const near = Math.max(reach, width / 2 + 2);
+    if (closed && inside(pixel, points)) return of;
+    const last = closed ? points.length : points.length - 1;
+    for (let i = 0; i < last; i++) if (distance(pixel, points[i], points[(i + 1) % points.length]) <= near) return of;
+  }
+  return null;
+}
+
+/** The items within a rectangle of pixels. */
+export function itemsWithin(document, places, [x0, y0], [x1, y1]) {
+  const holds = ([x, y]) => x >= Math.min(x0, x1) && x <= Math.max(x0, x1) && y >= Math.min(y0, y1) && y <= Math.max(y0, y1);
+  const pins = new Set([...places].filter(([, place]) => holds(place)).map(([name]) => name));
+  const links = list(document, "link").flatMap((link, index) => (link.pins?.every(pin => pins.has(pin)) ? [{kind: "link", index}] : []));
+  return [...links, ...[...pins].map(name => ({kind: "pin", name}))];
+}
+
+/** Tell whether two items are the same. */
+export const same = (a, b) => a?.kind === b?.kind && a?.name === b?.name && a?.index === b?.index;

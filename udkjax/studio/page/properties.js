@@ -1,0 +1,110 @@
+// What is selected, in fields: each value with its unit, as it stands in the file.
+
+import {groundOf, list, nameOf, pinsOf, renameElement, renamePin, toggleGround, withKey} from "./document.js";
+import {readValue, valueText} from "./values.js";
+import {copy, remove} from "./keys.js";
+import {swapPair} from "./actions.js";
+import {make} from "./player/elements.js";
+
+// Of each kind the keys that are offered: what they are called, and the kind of quantity they are.
+const KEYS = {
+  link: [["pins", "names"], ["density", "density"], ["width", "length"], ["thickness", "length"], ["mass", "mass"], ["inertia", "inertia"], ["centre", "length"], ["outline", "length"]],
+  slide: [["link", "name"], ["along", "names"], ["direction", "angle"], ["on", "name"]],
+  slot: [["pin", "name"], ["along", "names"], ["direction", "angle"], ["on", "name"], ["link", "name"]],
+  gear: [["links", "names"], ["teeth", "count"], ["radii", "length"], ["internal", "yes"], ["carrier", "name"]],
+  cam: [["pins", "names"], ["links", "names"], ["profile.angle", "angle"], ["profile.radius", "length"]],
+  motor: [["pin", "name"], ["slide", "name"], ["of", "names"], ["speed", "speed"], ["torque", "torque"], ["motion", "motion"]],
+  spring: [["between", "names"], ["pin", "name"], ["of", "names"], ["stiffness", "stiffness"], ["length", "length"], ["angle", "angle"], ["damping", "damping"]],
+  damper: [["between", "names"], ["pin", "name"], ["of", "names"], ["damping", "damping"]],
+  load: [["pin", "name"], ["link", "name"], ["force", "force"], ["torque", "torque"], ["frame", "name"]],
+};
+const EXAMPLES = {density: "7850", mass: "0.2 kg", inertia: "1e-4 kg m2", speed: "60 rpm", torque: "1 N m", stiffness: "1 N/mm", damping: "10 N s/m",
+  force: "[0 N, -10 N]", angle: "30 deg", length: "10"};
+const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", length: "m"};
+
+/** The unit of plain numbers of a quantity in a document. */
+export function unitOf(document, quantity) {
+  const chosen = document.units?.[{speed: "angular_velocity"}[quantity] ?? quantity];
+  return chosen ?? SI[quantity] ?? "";
+}
+
+export class PropertiesPanel {
+  constructor(studio, element) { Object.assign(this, {studio, element}); }
+
+  show() {
+    const {studio} = this, [item, ...more] = studio.selection;
+    const shown = JSON.stringify([studio.selection, studio.document]);
+    if (shown === this.last) return;
+    this.last = shown;
+    if (!item) return this.element.replaceChildren(...this.general());
+    const parts = more.length ? [make("p", {}, `${1 + more.length} selected`)] : item.kind === "pin" ? this.pin(item.name) : this.entry(item);
+    const buttons = [make("button", {type: "button", onclick: () => remove(studio)}, "Delete")];
+    if (studio.selection.some(one => one.kind === "link")) buttons.push(make("button", {type: "button", onclick: () => copy(studio)}, "Duplicate"));
+    return this.element.replaceChildren(...parts, make("div", {class: "group"}, ...buttons));
+  }
+
+  /** A field; what is typed is taken at its end, and an empty one takes the key away. */
+  field(label, value, unit, take, example = "") {
+    const input = make("input", {type: "text", value, placeholder: example, "aria-label": label, spellcheck: "false"});
+    input.addEventListener("change", () => take(input.value.trim()));
+    input.addEventListener("keydown", event => {
+      if (event.key === "Enter") input.blur();
+      if (event.key === "Escape") { input.value = value; input.blur(); }
+    });
+    return make("label", {class: "field"}, make("span", {}, label), input, make("span", {class: "unit"}, unit));
+  }
+
+  set(document, select = null) { this.studio.commit(document, select); }
+
+  general() {
+    const {document} = this.studio, change = (key, value) => {
+      const {[key]: _, ...rest} = document;
+      this.set(value === "" || value === undefined ? rest : {...document, [key]: value});
+    };
+    const units = document.units ?? {}, unit = (key, names, usual) => {
+      const select = make("select", {"aria-label": `unit of ${key}`, onchange: () => change("units", {...units, [key]: select.value})}, ...names.map(name => make("option", {value: name}, name)));
+      select.value = units[key] ?? usual;
+      select.title = "of plain numbers in the file; numbers stay, and mean something else";
+      return make("label", {class: "field"}, make("span", {}, `${key} in`), select, make("span", {class: "unit"}));
+    };
+    return [
+      this.field("name", document.name ?? "", "", value => change("name", value), "of the mechanism"),
+      this.field("gravity", valueText(document.gravity), unitOf(document, "acceleration") || "m/s²", value => change("gravity", readValue(value)), "[0 m/s2, -9.81 m/s2]"),
+      unit("length", ["mm", "cm", "m", "in", "ft"], "m"), unit("angle", ["deg", "rad"], "rad"),
+    ];
+  }
+
+  pin(name) {
+    const {studio} = this, {document} = studio, place = pinsOf(document)[name] ?? ["", ""], unit = unitOf(document, "length");
+    const to = k => text => {
+      const value = readValue(text), next = [...place];
+      next[k] = value;
+      if (value !== undefined) this.set({...document, pins: {...pinsOf(document), [name]: next}});
+    };
+    const fixed = make("input", {type: "checkbox", "aria-label": "fixed to the ground"});
+    fixed.checked = groundOf(document).includes(name);
+    fixed.addEventListener("change", () => this.set(toggleGround(document, name)));
+    return [make("h3", {}, `pin ${name}`),
+      this.field("name", name, "", value => this.set(renamePin(document, name, value), [{kind: "pin", name: value in pinsOf(document) || !value ? name : value}])),
+      this.field("x", valueText(place[0]), unit, to(0)), this.field("y", valueText(place[1]), unit, to(1)),
+      make("label", {class: "field check"}, make("span", {}, "fixed"), fixed, make("span", {class: "unit"}))];
+  }
+
+  entry({kind, index}) {
+    const {studio} = this, {document} = studio, entry = list(document, kind)[index] ?? {}, title = nameOf(document, kind, index);
+    const fields = (KEYS[kind] ?? []).map(([path, quantity]) => {
+      const [key, sub] = path.split("."), value = sub ? entry[key]?.[sub] : entry[key], plain = value === undefined || typeof [value].flat(2)[0] === "number";
+      const take = text => {
+        const next = readValue(text, ["name", "names"].includes(quantity));
+        this.set(withKey(document, kind, index, key, sub ? {...entry[key], [sub]: next} : next));
+      };
+      const unit = plain ? unitOf(document, quantity) : "";
+      return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ?? "");
+    });
+    const extra = Object.keys(entry).filter(key => key !== "name" && !(KEYS[kind] ?? []).some(([path]) => path.split(".")[0] === key));
+    const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", value => this.set(renameElement(document, kind, index, value)), title), ...fields,
+      ...extra.map(key => this.field(key, valueText(entry[key]), "", text => this.set(withKey(document, kind, index, key, readValue(text)))))];
+    if (Array.isArray(entry.of) && entry.of.length === 2) parts.push(make("button", {type: "button", onclick: () => this.set(swapPair(document, kind, index))}, "Turn the other link"));
+    return parts;
+  }
+}

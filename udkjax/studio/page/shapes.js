@@ -1,0 +1,147 @@
+// Geometry of a drawing's elements: hulls of plates, profiles of cams, wheels of gears. Metres and radians.
+
+import {groundOf, list, members, placeOf, pinsOf} from "./document.js";
+import {angle, direction, length} from "./units.js";
+
+const IN_LINE = 1e-9;  // of the size squared: points whose hull has less area are in line
+
+/** The corners of a link through points, and whether they enclose an area: the hull of a plate, or the ends of a bar. */
+export function corners(points) {
+  if (points.length < 3) return [points, false];
+  const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
+  const turn = (o, a, b) => (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0]);
+  const half = list => {
+    const chain = [];
+    for (const p of list) {
+      while (chain.length > 1 && turn(chain[chain.length - 2], chain[chain.length - 1], p) <= 0) chain.pop();
+      chain.push(p);
+    }
+    return chain.slice(0, -1);
+  };
+  const hull = [...half(sorted), ...half(sorted.reverse())];
+  const size = Math.hypot(sorted[0][0] - sorted.at(-1)[0], sorted[0][1] - sorted.at(-1)[1]) || 1;
+  if (hull.length < 3 || area(hull) <= IN_LINE * size * size) {
+    const far = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
+    return [[far[0], far.at(-1)], false];
+  }
+  return [hull, true];
+}
+
+export function area(points) {
+  let sum = 0;
+  points.forEach(([x, y], k) => { const [u, w] = points[(k + 1) % points.length]; sum += x * w - u * y; });
+  return Math.abs(sum) / 2;
+}
+
+/** How a link is drawn: {kind: "line" or "plate", points} through its pins or outline, or {kind: "disc", at, radius}. */
+export function linkShape(document, link) {
+  const places = (link.pins ?? []).map(pin => placeOf(document, pin)).filter(Boolean);
+  if (Array.isArray(link.outline)) {
+    const outline = link.outline.map(p => [length(p?.[0], document), length(p?.[1], document)]);
+    if (outline.every(p => p.every(Number.isFinite))) return {kind: "plate", points: outline};
+  }
+  if (!places.length) return null;
+  if (places.length === 1) {
+    const width = length(link.width, document), mass = +link.mass, inertia = +link.inertia;
+    const gyration = Number.isFinite(inertia / mass) ? Math.sqrt(inertia / mass) : 0;
+    return {kind: "disc", at: places[0], radius: Number.isFinite(width) ? width / 2 : gyration};
+  }
+  if (link.width !== undefined && link.inertia === undefined) return {kind: "line", points: alongLine(places)};
+  const [points, closed] = corners(places);
+  return {kind: closed ? "plate" : "line", points};
+}
+
+function alongLine(places) {
+  const [a, b] = [places[0], places.at(-1)];
+  return [...places].sort((p, q) => (p[0] - q[0]) * (b[0] - a[0]) + (p[1] - q[1]) * (b[1] - a[1]));
+}
+
+/** The largest distance between pins along an axis (m), or a usual size where there is none. */
+export function extent(document, usual = 0.1) {
+  const places = Object.keys(pinsOf(document)).map(pin => placeOf(document, pin)).filter(Boolean);
+  if (places.length < 2) return usual;
+  const along = k => Math.max(...places.map(p => p[k])) - Math.min(...places.map(p => p[k]));
+  return Math.max(along(0), along(1)) || usual;
+}
+
+/** The pin by which a link turns on its carrier. */
+export function centrePin(document, link, carrier = "ground") {
+  const pins = link === "ground" ? groundOf(document) : list(document, "link").find(entry => entry.name === link)?.pins ?? [];
+  const shared = pins.filter(pin => members(document, pin).includes(carrier));
+  return shared.length === 1 ? shared[0] : null;
+}
+
+/** The radii of a gear pair (m), and the pins of its centres; null where they do not follow. */
+export function gearWheels(document, gear) {
+  const pins = (gear.links ?? []).map(link => centrePin(document, link, gear.carrier ?? "ground"));
+  const [one, two] = pins.map(pin => pin && placeOf(document, pin));
+  if (!one || !two) return null;
+  const sizes = (gear.radii ?? gear.teeth ?? []).map(x => (gear.radii ? length(x, document) : +x));
+  const apart = gear.internal ? Math.abs(sizes[0] - sizes[1]) : sizes[0] + sizes[1];
+  const scale = gear.radii ? 1 : Math.hypot(two[0] - one[0], two[1] - one[1]) / apart;
+  const radii = sizes.map(size => size * scale);
+  return radii.every(r => Number.isFinite(r) && r > 0) ? {pins, radii} : null;
+}
+
+/** The direction (rad) of the line of a slide or a slot in world coordinates. */
+export function lineAngle(document, entry) {
+  const [a, b] = (entry.along ?? []).map(pin => placeOf(document, pin));
+  return a && b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : direction(entry.direction, document);
+}
+
+/** The outline of a cam: its corners in world coordinates (m), and the name of its link; null where they do not follow. */
+export function camOutline(document, cam, count = 144) {
+  const [centre, follower] = cam.pins ?? [], at = placeOf(document, centre);
+  const moving = pin => members(document, pin).filter(name => name !== "ground");
+  const link = cam.links?.[0] ?? moving(centre)[0], other = cam.links?.[1] ?? moving(follower)[0];
+  const angles = (cam.profile?.angle ?? []).map(x => angle(x, document)), radii = (cam.profile?.radius ?? []).map(x => length(x, document));
+  if (!at || !link || angles.length < 3 || angles.length !== radii.length || ![...angles, ...radii].every(Number.isFinite)) return null;
+  const pins = list(document, "link").find(entry => entry.name === link)?.pins ?? [];
+  const [a, b] = pins.map(pin => placeOf(document, pin)), turned = a && b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : 0;
+  const radius = periodicSpline(angles, radii);
+  const points = Array.from({length: count}, (_, k) => {
+    const phi = 2 * Math.PI * k / count, r = radius(phi);
+    return [at[0] + r * Math.cos(phi + turned), at[1] + r * Math.sin(phi + turned)];
+  });
+  return {points, link, follower, other, turned, radius};
+}
+
+/** The periodic cubic spline through values at increasing angles within one turn. */
+export function periodicSpline(angles, values) {
+  const n = angles.length, turn = 2 * Math.PI, h = angles.map((x, k) => (k + 1 < n ? angles[k + 1] - x : angles[0] + turn - x));
+  const rows = angles.map((_, k) => {
+    const before = (k + n - 1) % n, after = (k + 1) % n, row = new Array(n + 1).fill(0);
+    row[before] += h[before];
+    row[k] += 2 * (h[before] + h[k]);
+    row[after] += h[k];
+    row[n] = 6 * ((values[after] - values[k]) / h[k] - (values[k] - values[before]) / h[before]);
+    return row;
+  });
+  const bend = solve(rows);
+  return angle => {
+    const x = angles[0] + ((((angle - angles[0]) % turn) + turn) % turn);
+    let k = n - 1;
+    while (k > 0 && angles[k] > x) k--;
+    const after = (k + 1) % n, s = x - angles[k], r = h[k] - s;
+    return (bend[k] * r ** 3 + bend[after] * s ** 3) / (6 * h[k]) + (values[k] / h[k] - bend[k] * h[k] / 6) * r
+      + (values[after] / h[k] - bend[after] * h[k] / 6) * s;
+  };
+}
+
+/** The solution of linear equations, rows of n + 1 numbers, by elimination with pivots. */
+function solve(rows) {
+  const n = rows.length;
+  for (let k = 0; k < n; k++) {
+    const pivot = rows.slice(k).reduce((best, row, i) => (Math.abs(row[k]) > Math.abs(rows[best][k]) ? k + i : best), k);
+    [rows[k], rows[pivot]] = [rows[pivot], rows[k]];
+    for (let i = k + 1; i < n; i++) {
+      const factor = rows[i][k] / rows[k][k];
+      if (factor) for (let j = k; j <= n; j++) rows[i][j] -= factor * rows[k][j];
+    }
+  }
+  const x = new Array(n).fill(0);
+  for (let k = n - 1; k >= 0; k--) {
+    x[k] = (rows[k][n] - rows[k].slice(k + 1, n).reduce((sum, c, j) => sum + c * x[k + 1 + j], 0)) / rows[k][k];
+  }
+  return x;
+}
