@@ -296,9 +296,8 @@ def test_a_pin_that_is_pulled_takes_the_mechanism_along_and_loops_stay_closed(st
         studio.settle()
         assert studio.js("studio.motion.mover !== null"), (name, studio.findings)
         studio.tool("h")
-        moving = studio.js(
-            "Object.keys(studio.document.pins).filter(p => studio.canvas.carrier(studio.document, p) >= 0 && studio.canvas.places.has(p))"
-        )
+        carried = "studio.canvas.carrier(studio.document, p) >= 0 && studio.canvas.places.has(p)"
+        moving = studio.js(f"Object.keys(studio.document.pins).filter(p => {carried})")
         assert moving, name
         # Each frame: the closed state's violation, in units of the scene, or a reason that is shown.
         studio.js(RECORD_FRAMES)

@@ -1,0 +1,217 @@
+// The modules of the studio's page that need no browser: run by `node --test` (tests/studio/test_page_modules.py).
+
+import assert from "node:assert/strict";
+import {test} from "node:test";
+
+const page = name => import(new URL(`../../udkjax/studio/page/${name}.js`, import.meta.url));
+const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
+const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
+const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry, stateAt} = await page("mover"), {TOOLS} = await page("tools");
+
+const context = {size: 0.01, scale: 1000};
+const at = (x, y, pin = null, link = null) => ({place: [x, y], pin, link, pixel: [1000 * x, -1000 * y]});
+const freeze = value => {
+  if (value && typeof value === "object") Object.values(Object.freeze(value)).forEach(freeze);
+  return value;
+};
+
+/** A four-bar in millimetres, frozen: no action may change it. */
+function fourBar() {
+  let found = freeze(d.EMPTY);
+  for (const [a, b] of [[at(0, 0), at(0.03, 0.04)], [at(0.03, 0.04, "B"), at(0.12, 0.09)], [at(0.1, 0), at(0.12, 0.09, "C")]]) found = freeze(actions.drawLink(found, a, b, context).document);
+  for (const pin of ["A", "D"]) found = freeze(actions.drawGround(found, at(0, 0, pin)).document);
+  return freeze(actions.drawMotor(found, at(0, 0, "A")).document);
+}
+
+test("links share pins, and are written in the file's unit", () => {
+  const found = fourBar();
+  assert.deepEqual(found.pins, {A: [0, 0], B: [30, 40], C: [120, 90], D: [100, 0]});
+  assert.deepEqual(found.link.map(link => link.pins), [["A", "B"], ["B", "C"], ["D", "C"]]);
+  assert.deepEqual(found.ground, ["A", "D"]);
+  assert.deepEqual(found.motor, [{pin: "A", speed: "60 rpm"}]);
+  assert.deepEqual(d.members(found, "A"), ["ground", "link1"]);
+});
+
+test("an action without sense is a problem in words", () => {
+  const found = fourBar();
+  for (const result of [actions.drawLink(found, at(0, 0, "A"), at(0, 0, "A"), context), actions.drawLink(found, at(0, 0, "A"), at(0, 0, "B"), context),
+    actions.drawMotor(found, at(0.5, 0.5)), actions.drawGround(found, at(0.5, 0.5)), actions.drawSlide(found, at(1, 1), at(2, 1)), actions.drawSlot(found, at(1, 1), at(2, 1)),
+    actions.drawGear(found, at(0, 0, null, 0), at(0, 0, null, 0)), actions.drawCam(found, at(0, 0, "A"), at(1, 1)), actions.drawLoad(found, at(1, 1), at(2, 1), context),
+    actions.drawSpring(found, at(0, 0, "A"), at(0.03, 0.04, "B")), actions.drawPlate(found, [at(0, 0), at(1, 1), at(2, 2)], context)]) {
+    assert.equal(typeof result.problem, "string");
+    assert.equal(result.document, undefined);
+  }
+});
+
+test("a pin on a bar lies on its line, between its ends", () => {
+  const [found, pin] = d.addPin(fourBar(), [1, 1]), [made, name] = actions.addPinToLink(fourBar(), 0, [0.015, 0.03]);
+  assert.equal(pin, "E");
+  assert.deepEqual(made.link[0].pins, ["A", name, "B"]);
+  const [x, y] = made.pins[name];
+  assert.ok(Math.abs(30 * y - 40 * x) < 1e-9 && x > 0 && x < 30);
+  assert.deepEqual(found.pins.E, [1000, 1000]);
+});
+
+test("a pin on a plate's edge keeps the order of its corners", () => {
+  const {document} = actions.drawPlate(d.EMPTY, [at(0, 0), at(0.1, 0), at(0.1, 0.1), at(0, 0.1)], context);
+  const [made, name] = actions.addPinToLink(document, 0, [0.1, 0.05]);
+  assert.deepEqual(made.link[0].pins, ["A", "B", name, "C", "D"]);
+});
+
+test("merging pins carries all that is at them, and drops links that lose their length", () => {
+  const found = d.mergePins(fourBar(), "B", "A");
+  assert.deepEqual(found.link.map(link => link.pins), [["A", "C"], ["D", "C"]]);
+  assert.ok(!("B" in found.pins));
+  assert.equal(d.mergePins(fourBar(), "A", "A").link.length, 3);
+});
+
+test("what is deleted takes with it what hangs on it, and nothing else", () => {
+  const whole = fourBar();
+  assert.deepEqual(d.removeElements(whole, [{kind: "link", index: 0}]).motor, undefined);
+  assert.deepEqual(Object.keys(d.removeElements(whole, [{kind: "link", index: 0}]).pins), ["B", "C", "D"]);
+  assert.deepEqual(d.removeElements(whole, [{kind: "pin", name: "C"}]).link.map(link => link.pins), [["A", "B"]]);
+  assert.deepEqual(d.removeElements(whole, [{kind: "motor", index: 0}]), Object.fromEntries(Object.entries(whole).filter(([key]) => key !== "motor")));
+  assert.deepEqual(d.removeElements(whole, []), whole);
+});
+
+test("a slide goes with its motor, and names follow a renaming", () => {
+  let found = actions.drawSlide(fourBar(), at(0.12, 0.09, "C"), at(0.2, 0.09)).document;
+  const index = found.link.findIndex(link => link.pins.length === 1);
+  found = actions.drawMotor(found, at(0, 0, null, index)).document;
+  assert.equal(found.motor[1].slide, "slide1");
+  assert.equal(d.renameElement(found, "slide", 0, "ram").motor[1].slide, "ram");
+  assert.equal(d.renameElement(found, "link", index, "block").slide[0].link, "block");
+  assert.equal(d.renameElement(found, "link", 0, "link2"), found);
+  assert.deepEqual(d.renamePin(found, "A", "O").ground, ["O", "D"]);
+  assert.equal(d.renamePin(found, "A", "B"), found);
+  assert.equal(d.removeElements(found, [{kind: "slide", index: 0}]).motor.length, 1);
+});
+
+test("every tool that draws makes what its name says", () => {
+  const base = fourBar(), disc = actions.drawDisc(base, at(0.2, 0.2), at(0.23, 0.2), context).document;
+  const two = actions.drawGround(actions.drawDisc(actions.drawGround(disc, at(0, 0, "E")).document, at(0.3, 0.2), at(0.37, 0.2), context).document, at(0, 0, "F")).document;
+  const gear = actions.drawGear(two, at(0, 0, "E"), at(0, 0, "F")).document.gear[0];
+  assert.deepEqual(gear, {links: ["disc1", "disc2"], teeth: [20, 47]});
+  assert.deepEqual(actions.drawSlot(two, at(0.12, 0.09, "C"), at(0.2, 0.09)).document.slot[0].direction, [1, 0]);
+  assert.deepEqual(actions.drawSpring(base, at(0.03, 0.04, "B"), at(0, 0.2)).document.spring[0].between, ["B", "E"]);
+  assert.deepEqual(actions.drawSpring(base, at(0, 0, "A"), {...at(0, 0, "A"), isClick: true}).document.spring[0], {pin: "A", stiffness: "10 N m/rad"});
+  assert.deepEqual(actions.drawDamper(base, at(0.03, 0.04, "B"), at(0.1, 0, "D")).document.damper[0].between, ["B", "D"]);
+  assert.deepEqual(actions.drawLoad(base, at(0.03, 0.04, "B"), at(0.03, -0.01), context).document.load[0], {pin: "B", force: ["0 N", "-10 N"]});
+  assert.equal(TOOLS.filter(tool => tool.make).length, 12);
+  assert.equal(new Set(TOOLS.map(tool => tool.key)).size, TOOLS.length);
+});
+
+test("the follower of a new cam stands on its profile", () => {
+  let found = actions.drawGround(actions.drawDisc(d.EMPTY, at(0.1, 0.06), at(0.12, 0.06), context).document, at(0, 0, "A")).document;
+  found = actions.drawLink(found, at(0.12, 0.09), at(0.12, 0.15), context).document;
+  found = actions.drawCam(found, at(0.1, 0.06, "A"), at(0.12, 0.09, "B")).document;
+  const outline = shapes.camOutline(found, found.cam[0]), away = Math.hypot(0.02, 0.03);
+  assert.ok(Math.abs(outline.radius(Math.atan2(0.03, 0.02)) - away) < 1e-12);
+  assert.ok(Math.abs(Math.max(...outline.points.map(([x, y]) => Math.hypot(x - 0.1, y - 0.06))) - 1.4 * away) < 1e-3 * away);
+});
+
+test("a periodic spline goes through its values and has no corner where it closes", () => {
+  const angles = [0, 1, 2.5, 4, 5], values = [1, 2, 1.5, 3, 1.2], f = shapes.periodicSpline(angles, values);
+  angles.forEach((x, k) => assert.ok(Math.abs(f(x) - values[k]) < 1e-13));
+  assert.ok(Math.abs(f(2 * Math.PI) - values[0]) < 1e-13);
+  const h = 1e-5, slope = x => (f(x + h) - f(x - h)) / (2 * h);
+  assert.ok(Math.abs((f(h) - f(0)) / h - (f(0) - f(-h)) / h) < 1e-3);
+  assert.ok(Math.abs(slope(1e-4) - slope(2 * Math.PI - 1e-4)) < 1e-2);
+});
+
+test("slots keep their pins on the line of two pins that move", () => {
+  let found = {...fourBar(), slot: [{pin: "C", along: ["A", "B"], on: "link1"}]};
+  found = d.settleSlots(d.movePin(found, "B", [0.05, 0]));
+  assert.deepEqual(found.pins.C, [120, 0]);
+  assert.equal(d.settleSlots(found), found);
+});
+
+test("copies have pins of their own", () => {
+  const [found, copies] = d.duplicate(fourBar(), [{kind: "link", index: 0}, {kind: "link", index: 1}], 0.01, -0.01);
+  assert.deepEqual(copies.map(({index}) => found.link[index].pins), [["E", "F"], ["F", "G"]]);
+  assert.deepEqual(found.pins.F, [40, 30]);
+  assert.deepEqual(found.ground, ["A", "D", "E"]);
+});
+
+test("undo brings back the very state, redo too, and a step that says nothing new is none", () => {
+  const history = new History({n: 0}), states = [history.state], equal = (a, b) => a.n === b.n;
+  for (let n = 1; n <= 50; n++) {
+    states.push({n});
+    assert.equal(history.push(states[n], equal), true);
+    assert.equal(history.push({n}, equal), false);
+  }
+  for (let n = 49; n >= 0; n--) assert.equal(history.undo(), states[n]);
+  assert.equal(history.canUndo, false);
+  assert.equal(history.undo(), states[0]);
+  for (let n = 1; n <= 50; n++) assert.equal(history.redo(), states[n]);
+  history.undo();
+  history.push({n: 99});
+  assert.equal(history.canRedo, false);
+});
+
+test("lengths have units, and go back into them", () => {
+  const document = {units: {length: "mm", angle: "deg"}};
+  assert.equal(units.length("1.5 in", document), 1.5 * 0.0254);
+  assert.equal(units.length(12, document), 12e-3);
+  assert.ok(Number.isNaN(units.length("12 parsec", document)) && Number.isNaN(units.length(null, document)) && Number.isNaN(units.length("nan", document)));
+  assert.equal(units.written(0.0305, document), 30.5);
+  assert.equal(units.written(0.0305, document, "3 cm"), "3.05 cm");
+  assert.equal(units.direction([0, 2], document), Math.PI / 2);
+  assert.equal(units.direction(90, document), Math.PI / 2);
+  for (const x of [0.1, 0.3, 1 / 3, 123.456]) assert.ok(Math.abs(units.written(x / 1000, document) - x) <= 1e-12 * x);
+  assert.equal(units.niceBelow(7.3), 5);
+  assert.equal(units.niceBelow(0.001), 0.001);
+});
+
+test("values are typed as they stand", () => {
+  for (const value of [12, -1.5e-3, "12 mm", ["A", "B"], [1, 2], ["0 N", "-10 N"], [[1, 2], [3, 4]], true, {type: "sine", amplitude: 1}]) assert.deepEqual(readValue(valueText(value)), Array.isArray(value) && value.every(x => /^[A-Z]$/.test(x)) ? "A, B" : value);
+  assert.deepEqual(readValue("A, B", true), ["A", "B"]);
+  assert.equal(readValue("12", true), "12");
+  assert.equal(readValue("  "), undefined);
+});
+
+test("the view zooms about a pixel and fits what there is", () => {
+  const before = {scale: 1000, x: 10, y: 20}, pixel = [300, 200], after = view.zoomAt(before, pixel, view.ZOOM_STEP);
+  view.toMetres(before, pixel).forEach((x, k) => assert.ok(Math.abs(x - view.toMetres(after, pixel)[k]) < 1e-15));
+  const fitted = view.fit([[0, 0], [2, 1]], 800, 600, 1);
+  for (const place of [[0, 0], [2, 1]]) {
+    const [x, y] = view.toPixels(fitted, place);
+    assert.ok(x > 0 && x < 800 && y > 0 && y < 600);
+  }
+  assert.ok(Number.isFinite(view.fit([[1, 1]], 800, 600, 1).scale) && Number.isFinite(view.fit([], 800, 600, 1).scale));
+});
+
+test("the nearest pin is picked, then the topmost symbol", () => {
+  const places = new Map([["A", [0, 0]], ["B", [8, 0]]]);
+  assert.equal(picking.pinAt(places, [5, 0]), "B");
+  assert.equal(picking.pinAt(places, [5, 0], false, "B"), "A");
+  assert.equal(picking.pinAt(places, [50, 0]), null);
+  const plate = {of: {kind: "link", index: 0}, closed: true, width: 8, points: [[20, 20], [80, 20], [80, 80], [20, 80]]};
+  const bar = {of: {kind: "link", index: 1}, closed: false, width: 11, points: [[20, 50], [90, 50]]};
+  assert.equal(picking.itemAt([plate, bar], places, [50, 52]).index, 1);
+  assert.equal(picking.itemAt([plate, bar], places, [50, 70]).index, 0);
+  assert.equal(picking.itemAt([plate, bar], places, [150, 70]), null);
+});
+
+test("every element has symbols that name it, and strange ones have none", () => {
+  const document = {...fourBar(), slide: [{link: "link3", direction: 0}], slot: [{pin: "C", direction: [0, 1]}], spring: [{between: ["A", "C"], stiffness: 1, damping: 1}, {pin: "A", stiffness: 1}],
+    damper: [{between: ["B", "D"], damping: 1}], load: [{pin: "C", force: ["1 N", 0]}, {link: "link2", torque: "-1 N m"}]};
+  const kinds = new Set(symbolsOf(document, 1e-3).map(({of}) => `${of.kind}${of.index ?? of.name}`));
+  for (const name of ["link0", "link2", "pinA", "pinD", "slide0", "slot0", "spring0", "spring1", "damper0", "load0", "load1", "motor0"]) assert.ok(kinds.has(name), name);
+  const strange = {format: 2, pins: {A: ["nan", 0], B: null, C: [1], D: [0, 0]}, link: [{name: "x", pins: ["A", "Z"]}, {name: "y"}, {name: "z", pins: ["D"]}], motor: [{}, {pin: "Z"}, {slide: "no"}],
+    gear: [{}, {links: ["x", "y"], teeth: [0, 0]}], cam: [{}, {pins: ["A", "D"], profile: {angle: [1, 2, 3], radius: ["x", 1, 1]}}], slide: [{}], slot: [{}], spring: [{}, {between: ["A", "D"]}], damper: [{}], load: [{}]};
+  for (const {points = [], frame} of symbolsOf(strange, 1e-3)) assert.ok([...points.flat(), ...frame.flat()].every(Number.isFinite));
+});
+
+test("a body's frames become a motion of the drawing, and a run is smooth between its instants", () => {
+  const drawn = Float64Array.of(1, 2, 0.3), q = Float64Array.of(4, 5, 0.3 + Math.PI / 2), motions = motionsOf(q, drawn, [0, -1]);
+  const [x, y] = carry(motions, 0, [2, 2]);
+  assert.ok(Math.abs(x - 4) < 1e-12 && Math.abs(y - 6) < 1e-12);
+  assert.deepEqual(carry(motions, 1, [7, 8]), [7, 8]);
+  assert.deepEqual(carry(motions, -1, [7, 8]), [7, 8]);
+  const run = {ts: [0, 1, 2], q: [0, 1, 8], v: [0, 3, 12], count: 3};  // t^3
+  for (const t of [0, 0.3, 1, 1.7, 2]) {
+    const state = stateAt(run, t, 1);
+    assert.ok(Math.abs(state.q[0] - t ** 3) < 1e-12 && Math.abs(state.v[0] - 3 * t * t) < 1e-12);
+  }
+});

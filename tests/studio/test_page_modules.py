@@ -1,0 +1,31 @@
+"""The modules of the studio's page, tested by node where there is one."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[2] / "udkjax" / "studio" / "page"
+TESTS = Path(__file__).parent / "page.test.mjs"
+MOST_LINES = 300
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_modules_that_need_no_browser():
+    done = subprocess.run(["node", "--test", str(TESTS)], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert int(re.search(r"# pass (\d+)", done.stdout)[1]) >= 15 if "# pass" in done.stdout else "pass" in done.stdout
+
+
+@pytest.mark.parametrize("file", sorted(PAGE.glob("*.js")), ids=lambda file: file.name)
+def test_a_module_is_small_and_asks_nobody_else(file):
+    text = file.read_text()
+    assert text.count("\n") < MOST_LINES
+    assert text.startswith("// ")
+    assert not re.search(r"https?://(?!www\.w3\.org)|innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function", text)
+    for source in re.findall(r'from "([^"]+)"', text):
+        name = source.removeprefix("./").removeprefix("player/")
+        place = PAGE.parents[1] / "show" / "player" if source.startswith("./player/") else PAGE
+        assert source.startswith("./") and (place / name).exists()
