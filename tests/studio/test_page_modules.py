@@ -16,7 +16,7 @@ MOST_LINES = 300
 def test_modules_that_need_no_browser():
     done = subprocess.run(["node", "--test", str(TESTS)], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert int(re.search(r"# pass (\d+)", done.stdout)[1]) >= 15 if "# pass" in done.stdout else "pass" in done.stdout
+    assert re.search(r"pass \d{2}", done.stdout)
 
 
 @pytest.mark.parametrize("file", sorted(PAGE.glob("*.js")), ids=lambda file: file.name)
@@ -24,7 +24,9 @@ def test_a_module_is_small_and_asks_nobody_else(file):
     text = file.read_text()
     assert text.count("\n") < MOST_LINES
     assert text.startswith("// ")
-    assert not re.search(r"https?://(?!www\.w3\.org)|innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function", text)
+    assert not re.search(
+        r"https?://(?!www\.w3\.org)|innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function", text
+    )
     for source in re.findall(r'from "([^"]+)"', text):
         name = source.removeprefix("./").removeprefix("player/")
         place = PAGE.parents[1] / "show" / "player" if source.startswith("./player/") else PAGE

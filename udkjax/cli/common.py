@@ -97,6 +97,6 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
         from udkjax.study.report import plain
 
         print(text, file=sys.stderr)
-        print(json_text.dumps(plain(results), ensure_ascii=False, allow_nan=False))
+        print(json_text.dumps(plain(results), ensure_ascii=False, allow_nan=False), flush=True)
     else:
-        print(text)
+        print(text, flush=True)

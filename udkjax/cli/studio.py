@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from udkjax.cli.common import refuse
+from udkjax.cli.common import Json, refuse, show
 
 MOST_PORT = 65535
 
@@ -15,6 +15,7 @@ def studio(
     /,
     browser: bool = True,
     port: int = 0,
+    json: Json = False,
 ) -> None:
     """Draw mechanisms in the browser: a page that this machine serves to itself, until it is interrupted (Ctrl-C).
 
@@ -25,6 +26,7 @@ def studio(
         file: drawing to open, or to make; or the folder to work in.
         browser: open a browser.
         port: to listen at; by default one that is free.
+        json: print the address as JSON.
     """
     if not 0 <= port <= MOST_PORT:
         refuse(f"--port {port}: must be between 0 and {MOST_PORT}")
@@ -37,4 +39,4 @@ def studio(
 
     from udkjax.studio.serving import serve
 
-    serve(folder, opened, port, browser, lambda address: print(address, flush=True))
+    serve(folder, opened, port, browser, lambda address: show({"address": address}, address, json))

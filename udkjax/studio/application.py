@@ -35,7 +35,7 @@ EXPORTS = (".html", ".svg", ".png", ".gif", ".dxf", ".csv", ".py")
 
 
 class Studio:
-    """What the routes do.
+    """The actions of the routes, on one folder.
 
     Args:
         folder: whose files are opened and saved.
@@ -88,7 +88,7 @@ def application(studio: Studio, port: int, token: str) -> ASGIApp:
     """Return the server behind its gate.
 
     Args:
-        studio: what the routes do.
+        studio: the actions of its routes.
         port: at which it listens.
         token: that each request of the interface must carry.
     """

@@ -1,4 +1,4 @@
-"""What the page says of a drawing: freedoms, redundancy and its cure, unique reactions, how far a motor turns."""
+"""Findings about a drawing, which the page says: freedoms, redundancy and its cure, unique reactions, how far a motor turns."""
 
 import math
 from typing import Any

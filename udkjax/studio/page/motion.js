@@ -2,7 +2,7 @@
 
 import {list, members, pinsOf, placeOf} from "./document.js";
 import {middle} from "./drawn_symbols.js";
-import {carry, stateAt} from "./mover.js";
+import {carry} from "./mover.js";
 import {shown} from "./units.js";
 import {icon} from "./player/elements.js";
 
@@ -104,7 +104,7 @@ export class Motion {
   seek(t) {
     if (!this.run || !this.mover) return;
     this.t = Math.min(Math.max(t, 0), this.end);
-    const state = stateAt(this.run, this.t, this.mover.size);
+    const state = this.mover.at(this.run, this.t);
     if (this.t > 0 || this.posed) this.motions = this.mover.motions(state.q); else this.still();
     this.studio.redraw();
   }
@@ -125,7 +125,7 @@ export class Motion {
   beginPull(item, at) {
     this.pause();
     const {document} = this.studio, link = item.kind === "link" ? item.index : this.studio.canvas.carrier(document, item.name);
-    const state = this.posed ?? (this.run && this.end ? stateAt(this.run, this.t, this.mover.size) : this.mover.start());
+    const state = this.posed ?? (this.run && this.end ? this.mover.at(this.run, this.t) : this.mover.start());
     const from = this.mover.motions(state.q), place = item.kind === "pin" ? placeOf(document, item.name) : undoMotion(from, link, at);
     Object.assign(this, {pulled: {link, place: place ?? middle(list(document, "link")[link], document)}, posed: {...state, t: 0}});
     this.pullTo(at);

@@ -93,6 +93,14 @@ export class Mover {
     return found.count ? found : {...found, ts: [0], q: state.q, v: state.v, count: 1};
   }
 
+  /** The state of a run at a time, closed: between its instants it is interpolated, which leaves loops open by a little. */
+  at(run, t) {
+    const state = stateAt(run, t, this.size);
+    if (!this.engine) return {...state, violation: 0};
+    const found = this.engine.close(this.parameters, state);
+    return found.closed ? found : {...state, violation: found.violation};
+  }
+
   /** The state nearest to one in which a place of a link (m, as drawn) is at the hand: closed, without what drives it. */
   pull(state, link, place, hand) {
     const body = this.order[link], {length} = this.scene;
