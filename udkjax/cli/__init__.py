@@ -5,6 +5,7 @@ Only the standard library and tyro are imported before a command is known, so th
 
 import atexit
 import gc
+import os
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -31,6 +32,9 @@ COMMANDS = (
 )
 
 
+MOST_STORED = 200_000_000  # bytes of programs of JAX; those that were used longest ago make room
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run one command; exit with one of the codes of `udkjax.cli.exits`."""
     # At its end Python would look for garbage among all that JAX has made, for a third of a second.
@@ -38,8 +42,24 @@ def main(arguments: list[str] | None = None) -> None:
     if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
         print(f"udkjax {version('udkjax')}")
         return
+    store_compiled_programs()
     with exit_codes():
         from udkjax.cli.common import parse_and_run
 
         commands = {name: getattr(import_module(f"udkjax.cli.{name}"), name) for name in COMMANDS}
         parse_and_run(commands, arguments)
+
+
+def store_compiled_programs() -> None:
+    """Let JAX store what it compiles beside the machine code: a command that is run again then compiles nothing.
+
+    Who has told JAX where to store programs is left alone, and so is JAX where it is here already.
+    """
+    from udkjax.native.code_cache import cache_folder
+
+    folder = cache_folder()
+    if folder is None or "jax" in sys.modules:
+        return
+    for name, value in {"DIR": f"{folder / 'jax'}", "MAX_SIZE": f"{MOST_STORED}"}.items():
+        os.environ.setdefault(f"JAX_COMPILATION_CACHE_{name}", value)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

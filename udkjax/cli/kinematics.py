@@ -63,7 +63,7 @@ def kinematics(
         others = udk.branches(mech, driver, first) if branches else None
     except udk.SceneError as problem:
         refuse(problem)
-    names = [udk.Reached(int(code)).name for code in found.status]
+    names = [udk.Reached(int(code)).name for code in np.asarray(found.status)]
     reached = int(np.sum(np.asarray(found.reached)))
     free = math.isinf(float(travel.lower)) and math.isinf(float(travel.upper))
     lines = {
@@ -74,7 +74,7 @@ def kinematics(
         lines["toggle"] = f"{float(found.limit):.15g}"
     for name, words in (("singular", "singular at"), ("not_determined", "velocities open at")):
         if name in names:
-            lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(found.values, names, strict=True) if n == name)
+            lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(found.values), names, strict=True) if n == name)
     if others is not None:
         lines["branches"] = f"{len(others)} at {first:g}"
     columns = measure_channels(mech, found, measured)

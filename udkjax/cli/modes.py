@@ -29,7 +29,7 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
     for k, x in enumerate(np.asarray(found.omega2)):
         omega = math.sqrt(abs(float(x)))
         kind = f"{omega:.8g} rad/s, {omega / (2 * math.pi):.8g} Hz" if x >= 0 else f"grows as exp({omega:.8g} t)"
-        biggest = np.argmax(np.abs(np.asarray(found.shapes[k, :, 2])))
+        biggest = np.argmax(np.abs(np.asarray(found.shapes)[k, :, 2]))
         lines[f"mode {k + 1}"] = f"{kind}; mostly {mech.body_names[biggest]}"
     damped = ", ".join(f"{complex(s):.6g}" for s in np.asarray(found.s))
     lines["s, damped"] = f"{damped} 1/s" if damped else "none: no degree of freedom is left"

@@ -39,8 +39,8 @@ def statics(
     found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)
     lines = {}
     for k, e in enumerate(found):
-        omega2 = ", ".join(f"{float(x):.6g}" for x in e.omega2)
-        angles = ", ".join(f"{name} {float(a):.6g}" for name, a in zip(mech.body_names, e.q[:, 2], strict=True))
+        omega2 = ", ".join(f"{float(x):.6g}" for x in np.asarray(e.omega2))
+        angles = ", ".join(f"{name} {float(a):.6g}" for name, a in zip(mech.body_names, np.asarray(e.q)[:, 2], strict=True))
         free = f"omega2 {omega2} 1/s2" if omega2 else "no degree of freedom is left"
         lines[f"{k + 1}, {e.kind}"] = f"{free}; angles {angles}"
     results = {

@@ -45,42 +45,60 @@ class TruncatedPseudoinverse(NamedTuple):
         return self.vt.T @ (self.inverse * (self.u.T @ b))
 
 
-class DenseRows:
-    """The rows of a mechanism with known numbers, evaluated by NumPy on the scene's programs. The metric is M^(-1/2)."""
+class DenseTerms:
+    """Psi of a mechanism with known numbers and its derivatives, by NumPy on the scene's programs."""
 
-    def __init__(self, mechanism: Mechanism, scales: Scales):
-        self.scales = jax.tree.map(np.asarray, scales)
+    def __init__(self, mechanism: Mechanism):
         programs = scene_programs(mechanism)
         self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
         self._arrays_at = arrays_in_time(mechanism)
         self._entries = tuple(programs.psi_q_entries[:2])
-        self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(rank_tolerance(mechanism))
 
     def _geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._arrays_at(t).geometry(t, q, v)
 
-    def _psi(self, t: Time, q: np.ndarray) -> np.ndarray:
+    def psi(self, t: Time, q: np.ndarray) -> np.ndarray:
+        """Psi (m,)."""
         return self._arrays_at(t).psi(t, q)
+
+    def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Psi_q (m, n) and Psi_t (m,)."""
+        _, rate, entries = self._geometry(t, q, np.zeros_like(q))
+        found = np.zeros((self.count, self.size))
+        found[self._entries] = entries
+        return found, rate
+
+    def gamma(self, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """gamma (m,), of Psi_q a = gamma."""
+        free, b = self._arrays_at(t).loads(t, q, v)
+        return b + self.slopes(t, q)[0] @ free
+
+
+class DenseRows(DenseTerms):
+    """The rows of a mechanism with known numbers, evaluated by NumPy on the scene's programs. The metric is M^(-1/2)."""
+
+    def __init__(self, mechanism: Mechanism, scales: Scales):
+        super().__init__(mechanism)
+        self.scales = jax.tree.map(np.asarray, scales)
+        self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(rank_tolerance(mechanism))
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi and Psi_dot."""
         return self._geometry(t, q, v)[:2]
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return self._psi(t, q) / self.scales.rows
+        return self.psi(t, q) / self.scales.rows
 
     def jacobian(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Psi_q (m, n)."""
-        found = np.zeros((self.count, self.size))
-        found[self._entries] = self._geometry(t, q, q)[2]
-        return found
+        return self.slopes(t, q)[0]
 
     def plus(self, t: Time, q: np.ndarray) -> TruncatedPseudoinverse:
         """D^+ of weighted rows in the metric."""
         return TruncatedPseudoinverse.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self._psi(t, q)))
+        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self.psi(t, q)))
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
         """Return q closed, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
@@ -140,7 +158,7 @@ class KinematicRows(DenseRows):
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
-        return self._psi(t, q), length, D / length[:, None]
+        return self.psi(t, q), length, D / length[:, None]
 
     def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:
         """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""

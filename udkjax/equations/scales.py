@@ -16,7 +16,7 @@ from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, numbers_as_vector
 from udkjax.printing import PrintsTable, units
-from udkjax.scene.fields import ROUNDING, number
+from udkjax.scene.fields import ROUNDING, library_for, number
 from udkjax.scene.mechanism import Mechanism
 
 # Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
@@ -50,10 +50,14 @@ class Scales(PrintsTable):
     @property
     def weights(self) -> Float[Array, "m"]:
         """The weights of the rows of D with which one rank threshold serves them all: 1 for rows in metres, L for radians."""
-        return self.length / self.rows
+        if isinstance(self.rows, np.ndarray) or library_for(self) is jnp:
+            return self.length / self.rows
+        return number(np.asarray(self.length) / np.asarray(self.rows))
 
     def coordinates(self, n: int) -> Float[Array, "n"]:
         """The units of coordinates: L, L and one radian for each body."""
+        if library_for(self.length) is np:
+            return number(np.tile([float(self.length), float(self.length), 1.0], n // 3))
         return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)
 
     def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:

@@ -1,6 +1,5 @@
 """Bodies that assembly moves far from the positions written down: a number that is mistyped closes silently."""
 
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,7 +18,6 @@ class AssemblyWarning(UserWarning):
     """Assembly moved a body by more than a hundredth of its size from its initial guess."""
 
 
-@cached_by_identity
 def moves_of_assembly(mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> tuple[str, ...]:
     """Return, in words, how far each body was moved from its initial guess to the assembled q, where that is worth saying."""
     change = np.asarray(q) - np.asarray(mechanism.q0)
@@ -36,11 +34,11 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
             yield f"assembly moved {name} by {distance:.2g} m and {np.degrees(angle):.2g} deg"
 
 
-def warn_of_moves(mechanism: Mechanism, t: Array | np.ndarray, closure: Any, stacklevel: int) -> None:
-    """Warn where assembly moved a body of a mechanism of known numbers far, to the `Closure` at time t (s)."""
+@cached_by_identity
+def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
+    """Return a warning where assembly moved a body of a mechanism of known numbers far, to the `Closure` at time t (s)."""
     if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:
-        return  # at a later time it is the drivers' business where the bodies are
+        return ""  # at a later time it is the drivers' business where the bodies are
     moves = moves_of_assembly(mechanism, closure.state.q)
-    if moves:
-        cure = "if that is not meant, a number of these bodies or of their joints is wrong; udk.check says more"
-        warnings.warn(f"{'; '.join(moves)}: {cure}", AssemblyWarning, stacklevel=stacklevel + 1)
+    cure = "if that is not meant, a number of these bodies or of their joints is wrong; udk.check says more"
+    return f"{'; '.join(moves)}: {cure}" if moves else ""

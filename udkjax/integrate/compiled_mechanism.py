@@ -41,6 +41,7 @@ class RunPlan:
     projected: bool
     operation: RunStates | None  # of machine code that integrates it
     why_not_native: str  # why there is none, or it is not taken; empty where it is
+    independent_rows: int = 0  # that the method takes
 
     @property
     def is_native(self) -> bool:
@@ -64,12 +65,6 @@ class CompiledMechanism(eqx.Module):
         equations: Any = self.equations
         return SampleRows(equations.mechanism, self.breakpoints)
 
-    @property
-    def independent_row_count(self) -> int:
-        """The number of rows that the method takes."""
-        equations: Any = self.equations
-        return len(equations.scales.rows) - len((equations.redundant or ()) if eliminates(equations.method) else ())
-
 
 def compile_mechanism(
     system: Mechanism | ConstrainedSystem,
@@ -90,16 +85,17 @@ def compile_mechanism(
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
     equations = equations_of(system, method, baumgarte, formulation, analysis)
     projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
-    projected, breakpoints, operation = equations.constrained and projects, system.breakpoints, None
+    projected, breakpoints, operation, rows = equations.constrained and projects, system.breakpoints, None, 0
     why = "it was asked for" if engine == "diffrax" else _reason_for_diffrax(equations, solver, adjoint, meter)
     if not why:
         assert isinstance(equations, TextbookEquations)  # there is a reason for diffrax where they are not
         operation = _run_operation(equations, solver, projected, breakpoints)
+        rows = len(equations.scales.rows) - len((equations.redundant or ()) if eliminates(equations.method) else ())
         missing = unsupported(operation)
         why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
-    return CompiledMechanism(equations, breakpoints, RunPlan(solver, projected, None if why else operation, why))
+    return CompiledMechanism(equations, breakpoints, RunPlan(solver, projected, None if why else operation, why, rows))
 
 
 @cached_by_identity

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.packing import pack
 from udkjax.native import operations
@@ -58,11 +57,6 @@ def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Sca
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
     return _march(call_known(operation, inputs, APPROACH + len(values)), np)
-
-
-def psi_at_once(mechanism: Mechanism, analysis: Analysis, q: np.ndarray) -> np.ndarray:
-    """Psi (m,) in a position at the value zero, of known numbers, by NumPy."""
-    return DenseRows(mechanism, analysis.scales).violation(0.0, q, q)[0]
 
 
 def _by_numpy(x: PyTree) -> PyTree:

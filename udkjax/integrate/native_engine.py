@@ -27,7 +27,8 @@ from udkjax.scene.identity_cache import cached_by_identity
 
 def packed(problem: Problem) -> tuple[RunStates, list[np.ndarray]]:
     """Return the operation of a problem whose numbers are all known, and its inputs."""
-    operation = _operation(problem)
+    operation = problem.compiled.plan.operation
+    assert operation is not None  # who comes here has asked whether there is one
     return operation, _inputs(problem, operation, np)
 
 
@@ -167,9 +168,9 @@ def _known_scene_inputs(compiled: CompiledMechanism) -> SceneInputs:
 
 
 def _output(found: Sequence[Any]) -> IntegratorOutput:
-    q, v, violation, info = (x[0] for x in found)
-    code, t, tried, accepted, evaluations, written = (info[k] for k in range(len(INFO)))
+    q, v, violation, info = [x[0] for x in found]
+    code, t, tried, accepted, evaluations, written = [info[k] for k in range(len(INFO))]
     number = np.arange(len(q))
     reached = (number <= written) & (number < len(q) - 1) | (code == DONE)
-    counts = (x.astype(int) for x in (tried, accepted, evaluations))
+    counts = [x.astype(int) for x in (tried, accepted, evaluations)]
     return IntegratorOutput(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)

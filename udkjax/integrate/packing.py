@@ -1,6 +1,7 @@
 """Numbers as machine code takes them: its inputs, all numbers of a scene in one vector, their changes and cotangents."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -42,8 +43,9 @@ def pack(
     Returns:
         Arrays with the member first.
     """
+    as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
     values = [settings[name] for name in operation.settings]
-    given = (numbers_as_vector(numbers), ts, q, v, numbers_as_vector(values), rows, breaks, *further)
+    given = (as_vector(numbers), ts, q, v, as_vector(values), rows, breaks, *further)
     arrays = [xp.asarray(x, float)[None] for x in given]
     return arrays if xp is np else stop_gradients(arrays)
 

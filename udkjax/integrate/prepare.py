@@ -143,7 +143,7 @@ def prepare_run(
     )
     missed = xp.asarray(False)
     if closure is not None and compiled.plan.is_native:
-        missed = closed & (xp.asarray(closure.rank) > compiled.independent_row_count)
+        missed = closed & (xp.asarray(closure.rank) > compiled.plan.independent_rows)
     return PreparedRun(problem, given_ts, np.shape(state.q), good, closed, missed)
 
 

@@ -18,7 +18,7 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State, close, require_closed
-from udkjax.integrate.assembly_moves import warn_of_moves
+from udkjax.integrate.assembly_moves import AssemblyWarning, moves_from_guess
 from udkjax.integrate.causes.explained import explained
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -32,7 +32,7 @@ from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import number
+from udkjax.scene.fields import is_traced, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 
@@ -137,8 +137,8 @@ def simulate(
         stabilization=stabilization,
         formulation=formulation,
         solver=solver,
-        adjoint=_adjoint(adjoint),
-        meter=_meter(progress),
+        adjoint=None if adjoint is None else _adjoint(adjoint),
+        meter=None if progress is None else _meter(progress),
         max_steps=max_steps,
         engine=engine,
     )
@@ -152,8 +152,8 @@ def simulate(
                 warnings.warn(GEOMETRY_TRACED, stacklevel=2)
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
-            if is_known:
-                warn_of_moves(mechanism, start, closure, stacklevel=3)
+            if is_known and (moves := moves_from_guess(mechanism, start, closure)):
+                warnings.warn(moves, AssemblyWarning, stacklevel=3)
         if throw and closure is not None:
             require_closed(mechanism, closure, start)  # before anything runs
 
@@ -205,8 +205,8 @@ def _run(
 
     Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
     """
-    is_known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, analysis, ts, state, closure, choices)))
-    if is_known and isinstance(system, Mechanism):
+    given = system, analysis, ts, state, closure, choices
+    if isinstance(system, Mechanism) and not is_traced(given):
         with jax.ensure_compile_time_eval():  # while something else is traced
             compiled = compile_known(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
@@ -214,7 +214,8 @@ def _run(
                 return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
     given = bare, analysis, number(ts), state, closure, choices.arrays()
-    return _compiled(*given) if is_known else _simulate(*given)
+    within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
+    return _simulate(*given) if within_jit else _compiled(*given)
 
 
 def _simulate(
@@ -246,7 +247,7 @@ def _finish(
     q, v = xp.where(later, raw.q, problem.q), xp.where(later, raw.v, problem.v)
     ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows, choices.drift_tol)
     code, time, reached = outcome(ending if xp is np else stop_gradients(ending), xp)
-    q, v = (xp.where(reached[:, None], y, xp.nan).reshape(-1, *run.state_shape) for y in (q, v))
+    q, v = [xp.where(reached[:, None], y, xp.nan).reshape(-1, *run.state_shape) for y in (q, v)]
     stats = counts(raw, problem.compiled.plan.projected, len(ts), xp)
     rtol, atol = xp.asarray(choices.rtol, float), xp.asarray(choices.atol, float)
     arrays: dict[str, Any] = {"ts": ts, "q": q, "v": v, "code": code, "time": time, "stats": stats, "rtol": rtol, "atol": atol}
@@ -265,15 +266,13 @@ def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
 
 def _adjoint(adjoint: Any) -> Any:
     """An adjoint of diffrax's; None where derivatives are those of JAX, which `ForwardMode` leaves them to."""
-    if adjoint is None:
-        return None
     import diffrax
 
     return None if type(adjoint) is diffrax.ForwardMode else adjoint
 
 
 def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
-    if progress is None or progress is False:
+    if progress is False:
         return None
     import diffrax
 

@@ -73,7 +73,7 @@ class Operation(ABC):
 
     def shapes(self, inputs: Sequence[Any], times: int) -> list[Shape]:
         """Return the shapes of the outputs, from inputs."""
-        return self.outputs(inputs, max(x.shape[0] for x in inputs), times)
+        return self.outputs(inputs, max([x.shape[0] for x in inputs]), times)
 
     @property
     def coordinates(self) -> int:

@@ -30,6 +30,21 @@ def array_namespace(*numbers: ArrayLike | Sequence[ArrayLike]) -> ModuleType:
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(numbers)) else np
 
 
+def is_traced(tree: Any) -> bool:
+    """Return whether any number in a tree is traced."""
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
+
+
+def library_for(tree: Any) -> ModuleType:
+    """Return NumPy where nothing in a tree is traced: there each operation of JAX would be a program to compile; else JAX's."""
+    return jnp if is_traced(tree) else np
+
+
+def stored(x: Any) -> Any:
+    """Return an array of NumPy as one of JAX, which takes no program; any other as it is."""
+    return jax.device_put(x) if isinstance(x, np.ndarray | np.generic) else x
+
+
 def number(value: Numbers) -> Float[Array, "..."]:
     """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
     dtype = jnp.result_type(float)

@@ -18,6 +18,9 @@ Result = TypeVar("Result")
 CACHE_SIZE = 64  # results of a function that are stored; the one that was asked for longest ago makes room
 
 
+_BY_VALUE = (bool, int, float, str, np.generic, type(None))
+
+
 def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return a function that finds its results again for the same arguments: numbers and texts by value, others by identity.
 
@@ -34,7 +37,7 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         objects = (*args, *kwargs.values())
-        key = (*(_key(x) for x in objects), *kwargs)
+        key = (*[(type(x), x) if isinstance(x, _BY_VALUE) else id(x) for x in objects], *kwargs)
         stored = found.get(key)
         if stored is not None:
             with lock:
@@ -50,12 +53,6 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
         return result
 
     return call
-
-
-def _key(x: object) -> Hashable:
-    if x is None or isinstance(x, bool | int | float | str | np.generic):
-        return type(x), x
-    return id(x)
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:

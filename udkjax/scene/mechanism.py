@@ -19,7 +19,7 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, check_hashable, completion_mistakes, problems_of
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, StaticValue, given_number, number
+from udkjax.scene.fields import Numbers, StaticValue, given_number, is_traced, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
@@ -238,7 +238,7 @@ class Mechanism(PrintsTable):
     @property
     def is_concrete(self) -> bool:
         """True if no number is traced."""
-        return not any(isinstance(leaf, Tracer) for leaf in self.numbers)
+        return not is_traced(self)
 
     @property
     def numbers(self) -> list[Array]:

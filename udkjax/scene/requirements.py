@@ -11,6 +11,7 @@ from jax.core import Tracer
 
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import abbreviate, quote
+from udkjax.scene.fields import is_traced
 from udkjax.scene.mechanism import Mechanism
 
 Given = Mapping[str, Any]  # all arguments of a call by name, defaults among them
@@ -48,7 +49,7 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
     """Return real numbers as an array; a traced one as it is. Raises TypeError where they are none, and names the argument."""
     if isinstance(value, Tracer):
         found: Any = value
-    elif any(isinstance(x, Tracer) for x in jax.tree.leaves(value)):
+    elif not isinstance(value, np.ndarray | float) and is_traced(value):
         found = jnp.asarray(value)  # a list of traced numbers
     else:
         try:

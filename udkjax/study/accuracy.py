@@ -56,6 +56,7 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
     """Return whether nothing but errors changes the total energy: no driver moves, and all forces have potentials at rest."""
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
+    ts = np.asarray(ts)  # of which JAX would compile a program to find the least
     times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
     for element in mechanism.forces.values():
         seen = [frames[name] for name in mechanism.frames_of(element)]

@@ -19,13 +19,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from udkjax.equations.structure import ArrayLibrary
 from udkjax.printing import PrintsWords
+from udkjax.study.control_flow import ControlFlow
 from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, across
-from udkjax.study.curve import Curve, derivatives
+from udkjax.study.curve import AbstractCurve
 from udkjax.study.sequential import sequential
 
 FIRST, LONGEST, SHORTEST = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
@@ -79,7 +80,7 @@ _FOLD, _LANDS = -1, -2
 
 
 def follow(
-    curve: Curve,
+    curve: AbstractCurve,
     s: Float[Array, ""],
     q: Float[Array, "n"],
     values: Float[Array, "T"],
@@ -90,108 +91,120 @@ def follow(
 
     Of a batch one member follows another: side by side all would take as many steps as the slowest. Without derivatives.
     """
+    if curve.by.xp is np:
+        with np.errstate(all="ignore"):  # what is not finite closes nothing
+            return _follow(curve, s, q, values, points, first) if first < len(values) else points
     return sequential(_follow, curve, s, q, values, points, first)
 
 
 def _follow(
-    curve: Curve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], points: Points, first: Int[Array, ""]
+    curve: AbstractCurve,
+    s: Float[Array, ""],
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    points: Points,
+    first: int | Int[Array, ""],
 ) -> Points:
-    X, closed = curve.correct(jnp.append(q, s) / curve.units, fixed=True)
+    by, xp = curve.by, curve.by.xp
+    X, closed = curve.correct(xp.append(q, s) / curve.units, fixed=True)
     targets = values / curve.units[-1]
-    tau = curve.tangent(X, jnp.zeros_like(X).at[-1].set(1.0))
-    one, first = jnp.asarray(FIRST, X.dtype), jnp.asarray(first)
-    start = jnp.where(closed, _LANDS, Reached.open)  # where branches meet, one of them is taken
-    state = _State(X, tau, one, first, jnp.asarray(0), start, points)
+    tau = curve.tangent(X, xp.append(xp.zeros_like(X[:-1]), 1.0))
+    one, k = xp.asarray(FIRST, X.dtype), xp.asarray(first)
+    start = xp.where(closed, _LANDS, Reached.open)  # where branches meet, one of them is taken
+    state = _State(X, tau, one, k, xp.asarray(0), start, points)
 
     def is_unfinished(state: _State) -> Bool[Array, ""]:
         return (state.k < len(values)) & (state.event == Reached.closed)
 
     def body(state: _State) -> _State:
-        state = jax.lax.while_loop(is_unfinished, lambda state: _step(curve, targets, state), state)
-        state = jax.lax.cond(state.event == _FOLD, lambda: _find_fold(curve, targets, state), lambda: state)
+        state = by.while_loop(is_unfinished, lambda state: _step(curve, targets, state), state)
+        state = by.cond(state.event == _FOLD, lambda: _find_fold(curve, targets, state), lambda: state)
         return _record(curve, state)
 
     def goes_on(state: _State) -> Bool[Array, ""]:
         return (is_unfinished(state) | (state.event == _LANDS)) & (state.trials < MAX_TRIALS + 4 * len(values))
 
-    state = jax.lax.while_loop(goes_on, body, state)
-    event = jnp.where(is_unfinished(state), Reached.lost, state.event)
-    status = jnp.where(jnp.arange(len(values)) >= state.k, event, state.points.status)
+    state = by.while_loop(goes_on, body, state)
+    event = xp.where(is_unfinished(state), Reached.lost, state.event)
+    status = xp.where(np.arange(len(values)) >= state.k, event, state.points.status)
     return state.points._replace(status=status)
 
 
-def _step(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
+def _step(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) -> _State:
     """Take one step towards the next value, or right to it."""
+    xp = curve.by.xp
     X, tau, h, k, trials, event, points = state
     target = targets[k]
-    way = jnp.where(target >= X[-1], 1.0, -1.0)
-    tau = tau * jnp.where(tau[-1] * way >= 0, 1.0, -1.0)
-    slope = jnp.abs(tau[-1])
-    wanted = jnp.abs(target - X[-1]) / jnp.where(slope > 0, slope, 1.0)
+    way = xp.where(target >= X[-1], 1.0, -1.0)
+    tau = tau * xp.where(tau[-1] * way >= 0, 1.0, -1.0)
+    slope = xp.abs(tau[-1])
+    wanted = xp.abs(target - X[-1]) / xp.where(slope > 0, slope, 1.0)
     lands = (wanted <= h) & (slope > 0) | (target == X[-1])
-    eta = jnp.where(lands, jnp.where(target == X[-1], 0.0, wanted), h)
+    eta = xp.where(lands, xp.where(target == X[-1], 0.0, wanted), h)
     ahead = X + eta * tau
-    ahead = ahead.at[-1].set(jnp.where(lands, target, ahead[-1]))
+    ahead = xp.append(ahead[:-1], xp.where(lands, target, ahead[-1]))
     at, closed = curve.correct(ahead, fixed=lands)
     turned = curve.tangent(at, tau)
-    rounding = 64 * jnp.finfo(X.dtype).eps * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
-    near = jnp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
+    rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
+    near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
     good = near & (turned @ tau >= LARGEST_BEND) & closed
     good = good & ~(lands & (eta > CLOSE_DISTANCE) & (curve.clearance(at) < NEAR_LOSS))  # only a close tangent leads across
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
     counts = good & ~folds & ~passed
     lands = lands & counts
-    shorter = jnp.where(passed, 0.5 * eta, jnp.where(good, h, 0.5 * eta))
-    longer = jnp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), jnp.minimum(1.5 * h, LONGEST), h)
+    shorter = xp.where(passed, 0.5 * eta, xp.where(good, h, 0.5 * eta))
+    longer = xp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), xp.minimum(1.5 * h, LONGEST), h)
     lost = ~good & (0.5 * eta < SHORTEST)
     return _State(
-        X=jnp.where(counts, at, X),
-        tau=jnp.where(counts, turned, tau),
-        h=jnp.where(folds, eta, jnp.where(counts, longer, shorter)),
+        X=xp.where(counts, at, X),
+        tau=xp.where(counts, turned, tau),
+        h=xp.where(folds, eta, xp.where(counts, longer, shorter)),
         k=k,
         trials=trials + 1,
-        event=jnp.where(
+        event=xp.where(
             folds,
             _FOLD,
-            jnp.where(lands, _LANDS, jnp.where(lost | (trials > MAX_TRIALS + 4 * len(targets)), Reached.lost, event)),
+            xp.where(lands, _LANDS, xp.where(lost | (trials > MAX_TRIALS + 4 * len(targets)), Reached.lost, event)),
         ),
         points=points,
     )
 
 
-def _record(curve: Curve, state: _State) -> _State:
+def _record(curve: AbstractCurve, state: _State) -> _State:
     """Store the point of the curve that is the next value's, where it is one, unless it is that of the start.
 
     Near where branches meet, it and its derivatives are those of the branch's points on both sides.
     """
+    by, xp = curve.by, curve.by.xp
     X, tau, k, points, lands = state.X, state.tau, state.k, state.points, state.event == _LANDS
     stores = lands & (state.trials > 0)
     clearance = curve.clearance(X)
-    dq, ddq, rank = derivatives(curve, X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
-    here = Crossing(X, tau, dq, ddq, jnp.zeros_like(dq), jnp.zeros((), X.dtype))
+    dq, ddq, rank = curve.derivatives(X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
+    here = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
 
     def beside() -> tuple[Crossing, Array]:
         other, is_known = across(curve, X, tau)
-        return jax.tree.map(lambda x, y: jnp.where(is_known, x, y), other, here), is_known
+        return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, here), is_known
 
-    found, is_known = jax.lax.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (here, jnp.asarray(False)))
+    found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (here, xp.asarray(False)))
     X, tau, dq, ddq, dddq, spacing = found
     deficient = rank < len(X) - 1
     doubtful = ~is_known & (deficient | (clearance < LOST_RANK))
-    status = jnp.where(doubtful, Reached.not_determined, jnp.where(deficient, Reached.singular, Reached.closed))
-    dq, ddq = (jnp.where(doubtful, jnp.nan, x) for x in (dq, ddq))
+    status = xp.where(doubtful, Reached.not_determined, xp.where(deficient, Reached.singular, Reached.closed))
+    dq, ddq = (xp.where(doubtful, xp.nan, x) for x in (dq, ddq))
     new = {"q": X[:-1] * curve.units[:-1], "dq": dq, "ddq": ddq, "status": status, "dddq": dddq, "spacing": spacing}
     old = points._asdict()
-    points = points._replace(**{name: old[name].at[k].set(jnp.where(stores, x, old[name][k])) for name, x in new.items()})
-    event = jnp.where(lands, Reached.closed, state.event)
+    points = points._replace(**{name: by.put(old[name], k, xp.where(stores, x, old[name][k])) for name, x in new.items()})
+    event = xp.where(lands, Reached.closed, state.event)
     return state._replace(X=X, tau=tau, k=k + stores, event=event, points=points)
 
 
-def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _State:
+def _find_fold(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) -> _State:
     """Find the toggle within the next step, and the next value if it lies before."""
+    by, xp = curve.by, curve.by.xp
     X, tau, h, k, _, _, points = state
-    target, way = targets[k], jnp.sign(tau[-1])
+    target, way = targets[k], xp.sign(tau[-1])
 
     def point_at(sigma: Float[Array, ""]) -> tuple[Array, Array]:
         at = curve.correct(X + sigma * tau)[0]
@@ -202,53 +215,53 @@ def _find_fold(curve: Curve, targets: Float[Array, "T"], state: _State) -> _Stat
 
         def ahead(sigma: Float[Array, ""]) -> Float[Array, ""]:
             at, tangent = point_at(sigma)
-            return way * jnp.where(of_value, target - at[-1], tangent[-1])
+            return way * xp.where(of_value, target - at[-1], tangent[-1])
 
-        sigma = _root(ahead, end)
+        sigma = _root(ahead, end, by)
         return sigma, (sigma, *point_at(sigma))
 
-    _, (sigma, (fold, landed), (_, turned)) = jax.lax.scan(find, h, jnp.array([False, True]))
-    room = SAME_VALUE * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.abs(fold[-1]))
+    _, (sigma, (fold, landed), (_, turned)) = by.scan(find, h, xp.array([False, True]))
+    room = SAME_VALUE * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.abs(fold[-1]))
     before = (target - fold[-1]) * way <= room
     x = fold * curve.units
-    landed = jnp.where(jnp.abs(target - fold[-1]) <= room, fold, landed)  # which is known to rounding, and not to its root
+    landed = xp.where(xp.abs(target - fold[-1]) <= room, fold, landed)  # which is known to rounding, and not to its root
     points = points._replace(
-        limit=jnp.where(before, points.limit, x[-1]),
-        limit_q=jnp.where(before, points.limit_q, x[:-1]),
+        limit=xp.where(before, points.limit, x[-1]),
+        limit_q=xp.where(before, points.limit_q, x[:-1]),
     )
     return state._replace(
-        X=jnp.where(before, landed, X),
-        tau=jnp.where(before, turned, tau),
-        h=jnp.maximum(h - sigma[1], SHORTEST),
-        event=jnp.where(before, _LANDS, Reached.beyond_limit),
+        X=xp.where(before, landed, X),
+        tau=xp.where(before, turned, tau),
+        h=xp.maximum(h - sigma[1], SHORTEST),
+        event=xp.where(before, _LANDS, Reached.beyond_limit),
         points=points,
     )
 
 
-def _root(f: Callable[[Array], Array], end: Float[Array, ""]) -> Float[Array, ""]:
+def _root(f: Callable[[Array], Array], end: Float[Array, ""], by: ControlFlow) -> Float[Array, ""]:
     """Return where f, positive at 0, becomes negative before `end`, to rounding; the end, where it does not.
 
     By the rule of Illinois: secants of a bracket, of which a side that stays counts half.
     """
-    rounding = 2 * float(jnp.finfo(end.dtype).eps)
+    xp, rounding = by.xp, 2 * float(np.finfo(end.dtype).eps)
 
     def halve(state: tuple[Array, ...]) -> tuple[Array, ...]:
         a, fa, b, fb, k, _ = state
         slope = fb - fa
-        c = jnp.clip(b - fb * (b - a) / jnp.where(slope != 0, slope, 1.0), jnp.minimum(a, b), jnp.maximum(a, b))
+        c = xp.clip(b - fb * (b - a) / xp.where(slope != 0, slope, 1.0), xp.minimum(a, b), xp.maximum(a, b))
         fc = f(c)
         crosses = fc * fb < 0
-        done = (jnp.abs(c - b) <= rounding * end) | (fc == 0)
-        return jnp.where(crosses, b, a), jnp.where(crosses, fb, 0.5 * fa), c, fc, k + 1, done
+        done = (xp.abs(c - b) <= rounding * end) | (fc == 0)
+        return xp.where(crosses, b, a), xp.where(crosses, fb, 0.5 * fa), c, fc, k + 1, done
 
     # One evaluation for both ends: what is traced once compiles in half the time.
-    at_start, at_end = jax.lax.map(f, jnp.stack([jnp.zeros_like(end), end]))
-    state = jnp.zeros_like(end), at_start, end, at_end, jnp.asarray(0), at_end >= 0
-    return jax.lax.while_loop(lambda s: (s[4] < MAX_SECANTS) & ~s[5], halve, state)[2]
+    at_start, at_end = by.map(f, xp.stack([xp.zeros_like(end), end]))
+    state = xp.zeros_like(end), at_start, end, at_end, xp.asarray(0), at_end >= 0
+    return by.while_loop(lambda s: (s[4] < MAX_SECANTS) & ~s[5], halve, state)[2]
 
 
-def no_points(count: int, n: int) -> Points:
+def no_points(count: int, n: int, xp: ArrayLibrary) -> Points:
     """Return points of which none is known yet."""
-    nothing = jnp.zeros((count, n))
-    status = jnp.full(count, int(Reached.lost))
-    return Points(nothing, nothing, nothing, status, nothing, jnp.zeros(count), jnp.asarray(np.inf), jnp.full(n, np.inf))
+    q, dq, ddq, dddq = (xp.zeros((count, n)) for _ in range(4))
+    status = xp.full(count, int(Reached.lost))
+    return Points(q, dq, ddq, status, dddq, xp.zeros(count), xp.asarray(np.inf), xp.full(n, np.inf))

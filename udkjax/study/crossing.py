@@ -9,12 +9,10 @@ position closes to rounding. Where branches merely come close to each other, the
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from udkjax.study.curve import Curve, derivatives, plus
+from udkjax.study.curve import AbstractCurve
 
 # Singular values of E, relative to the largest. Rounding errors of q, 1e-16 over sigma, are over sigma once more in q' and over
 # its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK all.
@@ -59,7 +57,7 @@ class Crossing(NamedTuple):
     spacing: Float[Array, ""]  # h
 
 
-def across(curve: Curve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
+def across(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
     """Find a point, q', q'' and q''' from both sides of it.
 
     Args:
@@ -74,50 +72,52 @@ def across(curve: Curve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tu
     def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
         return _interpolated(curve, X, tau, h)
 
-    spacings = jnp.asarray(SPACINGS, X.dtype)
-    *found, doubt = jax.lax.map(tried, spacings)
-    at, dq, ddq, dddq, h, doubt = (x[jnp.argmin(doubt)] for x in (*found, spacings, doubt))
-    slope = jnp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
-    slope = slope / jnp.linalg.norm(slope) * jnp.where(slope @ tau < 0, -1.0, 1.0)
+    by, xp = curve.by, curve.by.xp
+    spacings = xp.asarray(SPACINGS, X.dtype)
+    *found, doubt = by.map(tried, spacings)
+    at, dq, ddq, dddq, h, doubt = (x[xp.argmin(doubt)] for x in (*found, spacings, doubt))
+    slope = xp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
+    slope = slope / xp.linalg.norm(slope) * xp.where(slope @ tau < 0, -1.0, 1.0)
     return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
 
 
-def _interpolated(curve: Curve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _interpolated(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
-    slope = tau / jnp.where(tau[-1] != 0, tau[-1], 1.0)
-    ends, closed = jax.lax.map(lambda k: curve.correct(X + FIRST * h * k * slope, fixed=True), jnp.array([-1.0, 1.0]))
+    by, xp = curve.by, curve.by.xp
+    slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)
+    ends, closed = by.map(lambda k: curve.correct(X + FIRST * h * k * slope, fixed=True), xp.array([-1.0, 1.0]))
 
     def side(way: Array, nearest: Array) -> tuple[Array, Array]:
         def onward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
             before, last = state
-            ahead = (last + (last - before)).at[-1].set(X[-1] + way * k * h)
+            ahead = xp.append((last + (last - before))[:-1], X[-1] + way * k * h)
             at, is_closed = curve.correct(ahead, fixed=True)
             return (last, at), (at, is_closed)
 
         middle = (ends[0] + ends[1]) / 2
         inner = nearest + (middle - nearest) / FIRST  # a step h before the nearest
-        (_, _), (found, are_closed) = jax.lax.scan(onward, (inner, nearest), jnp.arange(FIRST + 1.0, LAST + 1.0))
-        return jnp.concatenate([nearest[None], found]), jnp.all(are_closed)
+        (_, _), (found, are_closed) = by.scan(onward, (inner, nearest), xp.arange(FIRST + 1.0, LAST + 1.0))
+        return xp.concatenate([nearest[None], found]), xp.all(are_closed)
 
-    (down, up), good = jax.lax.map(lambda x: side(*x), (jnp.array([-1.0, 1.0]), ends))
-    points = jnp.concatenate([down[::-1], up])  # (12, n + 1)
+    (down, up), good = by.map(lambda x: side(*x), (xp.array([-1.0, 1.0]), ends))
+    points = xp.concatenate([down[::-1], up])  # (12, n + 1)
     units = curve.units
 
     def at_point(x: Array) -> tuple[Array, Array]:
-        dq, ddq, _ = derivatives(curve, x[-1] * units[-1], x[:-1] * units[:-1])
+        dq, ddq, _ = curve.derivatives(x[-1] * units[-1], x[:-1] * units[:-1])
         return dq, ddq
 
-    slopes = jax.lax.map(at_point, points)
+    slopes = by.map(at_point, points)
     scaled = points[:, :-1], slopes[0] * units[-1] / units[:-1], slopes[1] * units[-1] ** 2 / units[:-1]
     all_of, fewer = weights(LAST), np.pad(weights(LAST - 1), 1)
-    q, dq, ddq = (jnp.asarray(all_of @ x) for x in scaled)
-    dddq = jnp.asarray(_slope_weights() @ scaled[2]) / h
-    doubts = [jnp.max(jnp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED, strict=True)]
-    at = jnp.append(q, X[-1])
-    E = curve.slopes(at).at[:, -1].set(0.0)
-    at = at - plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding
-    known = jnp.all(closed) & jnp.all(good) & curve.is_closed(at) & (tau[-1] != 0)
-    doubt = jnp.where(known, jnp.max(jnp.stack(doubts)), jnp.inf)
-    doubt = jnp.where(jnp.isfinite(doubt), doubt, jnp.inf)
+    q, dq, ddq = (xp.asarray(all_of @ x) for x in scaled)
+    dddq = xp.asarray(_slope_weights() @ scaled[2]) / h
+    doubts = [xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED, strict=True)]
+    at = xp.append(q, X[-1])
+    E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
+    at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding
+    known = xp.all(closed) & xp.all(good) & curve.is_closed(at) & (tau[-1] != 0)
+    doubt = xp.where(known, xp.max(xp.stack(doubts)), xp.inf)
+    doubt = xp.where(xp.isfinite(doubt), doubt, xp.inf)
     dq, ddq, dddq = (x * units[:-1] / units[-1] ** k for k, x in ((1, dq), (2, ddq), (3, dddq)))
     return at, dq, ddq, dddq, doubt

@@ -1,34 +1,118 @@
 """The positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value: X = (q, s)."""
 
+from abc import abstractmethod
+from typing import Any, ClassVar
+
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.constraints import gamma, psi
+from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
+from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.study.drive import Driven
 
 NEWTON_STEPS = 8  # corrections; three are usual
-_Correction = tuple[Array, Array, Array]  # X, corrections so far, whether it is closed
+_Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
 
 
-class Curve(eqx.Module):
+class AbstractCurve(eqx.Module):
     """The positions of a driven mechanism, as a curve in scaled coordinates and value."""
+
+    weights: eqx.AbstractVar[Any]  # of the rows
+    units: eqx.AbstractVar[Any]  # of coordinates and value
+    rows: eqx.AbstractVar[Any]  # the scales of the rows
+
+    by: ClassVar[ControlFlow]
+
+    @abstractmethod
+    def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
+        """Return the weighted rows of Psi."""
+
+    @abstractmethod
+    def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
+        """Return E, the derivatives of the residual."""
+
+    @abstractmethod
+    def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Any:
+        """Return E^+, truncated where singular values are below `tol` of the largest."""
+
+    @abstractmethod
+    def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
+        """Return gamma: Psi_q a = gamma holds Psi_dot at zero."""
+
+    def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
+        """Return True if the residual is what rounding leaves of it."""
+        xp = self.by.xp
+        size = xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
+        return size <= ROUNDING_UNITS * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
+
+    def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
+        """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
+        xp = self.by.xp
+        if not len(self.rows):  # nothing binds the coordinates
+            return X, xp.asarray(True)
+
+        def body(state: _Correction) -> _Correction:
+            X, k, _ = state
+            E = self.slopes(X)
+            E = xp.where(fixed & (np.arange(len(X)) == len(X) - 1), 0.0, E)
+            return X - self.plus(E) @ self.residual(X), k + 1, self.is_closed(X)
+
+        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
+            _, k, closed = state
+            return (k < NEWTON_STEPS) & ~closed
+
+        X, _, closed = self.by.while_loop(is_unfinished, body, (X, xp.asarray(0), xp.asarray(False)))
+        return X, closed
+
+    def clearance(self, X: Float[Array, "n+1"]) -> Any:
+        """Return how far E is from losing rank, as where branches meet: its n-th singular value over the largest."""
+        xp, E = self.by.xp, self.slopes(X)
+        if min(E.shape) < len(X) - 1:
+            return xp.zeros(())
+        if xp is np and not np.all(np.isfinite(E)):  # NumPy refuses to decompose it
+            return np.asarray(np.nan)
+        sigma = xp.linalg.svd(E, compute_uv=False)
+        return sigma[len(X) - 2] / xp.where(sigma[0] > 0, sigma[0], 1.0)
+
+    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> Float[Array, "n+1"]:
+        xp, E = self.by.xp, self.slopes(X)
+        tau = before - self.plus(E) @ (E @ before)
+        size = xp.linalg.norm(tau)
+        return tau / xp.where(size > 0, size, 1.0)
+
+    def derivatives(self, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
+        """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
+        W, w = self.units[:-1], self.weights
+        E = self.slopes(self.by.xp.append(q, s) / self.units)
+        inverse = self.plus(E[:, :-1])
+        dq = -W * (inverse @ (E[:, -1] / self.units[-1]))
+        return dq, W * (inverse @ (w * self.gamma(s, q, dq))), inverse.rank
+
+
+class Curve(AbstractCurve):
+    """The positions of a mechanism whose numbers may be traced."""
 
     mechanism: Mechanism
     weights: Float[Array, "m"]
     units: Float[Array, "n+1"]
     rows: Float[Array, "m"]
 
+    by: ClassVar[ControlFlow] = BY_JAX
+
     @classmethod
     def of(cls, driven: Driven) -> "Curve":
         scales = driven.analysis.scales
-        units = jnp.append(scales.coordinates(driven.analysis.coordinates), driven.unit)
-        return cls(driven.mechanism, scales.weights, units, scales.rows)
+        scale = scales.coordinates(driven.analysis.coordinates)
+        units = library_for((scale, driven.unit)).append(scale, driven.unit)
+        return cls(mechanism=driven.mechanism, weights=scales.weights, units=number(units), rows=scales.rows)
 
     def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
         x = X * self.units
@@ -37,54 +121,39 @@ class Curve(eqx.Module):
     def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
         return jax.jacfwd(self.residual)(X)
 
-    def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
-        """Return True if the residual is what rounding leaves of it."""
-        size = jnp.max(jnp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
-        return size <= ROUNDING_UNITS * float(jnp.finfo(X.dtype).eps) * jnp.maximum(1.0, jnp.max(jnp.abs(X)))
+    def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Plus:
+        return SVD(tol).plus(E)
 
-    def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
-        """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
-        if not len(self.rows):  # nothing binds the coordinates
-            return X, jnp.asarray(True)
-
-        def body(state: _Correction) -> _Correction:
-            X, k, _ = state
-            E = self.slopes(X)
-            E = jnp.where(fixed & (jnp.arange(len(X)) == len(X) - 1), 0.0, E)
-            return X - plus(E) @ self.residual(X), k + 1, self.is_closed(X)
-
-        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
-            _, k, closed = state
-            return (k < NEWTON_STEPS) & ~closed
-
-        X, _, closed = jax.lax.while_loop(is_unfinished, body, (X, jnp.asarray(0), jnp.asarray(False)))
-        return X, closed
-
-    def clearance(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
-        """Return how far E is from losing rank, as where branches meet: its n-th singular value over the largest."""
-        E = self.slopes(X)
-        if min(E.shape) < len(X) - 1:
-            return jnp.zeros(())
-        sigma = jnp.linalg.svd(E, compute_uv=False)
-        return sigma[len(X) - 2] / jnp.where(sigma[0] > 0, sigma[0], 1.0)
-
-    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> Float[Array, "n+1"]:
-        E = self.slopes(X)
-        tau = before - plus(E) @ (E @ before)
-        size = jnp.linalg.norm(tau)
-        return tau / jnp.where(size > 0, size, 1.0)
+    def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
+        return gamma(self.mechanism, s, q, v)
 
 
-def plus(E: Float[Array, "m n"], tol: float = RANK_TOL) -> Plus:
-    """Return E^+, truncated where singular values are below `tol` of the largest."""
-    return SVD(tol).plus(E)
+class KnownCurve(AbstractCurve):
+    """The positions of a mechanism of known numbers, by NumPy on the scene's programs: nothing is compiled for them."""
 
+    terms: DenseTerms = eqx.field(static=True)
+    weights: Float[np.ndarray, "m"]
+    units: Float[np.ndarray, "n+1"]
+    rows: Float[np.ndarray, "m"]
 
-def derivatives(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
-    """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
-    W, w, mechanism = curve.units[:-1], curve.weights, curve.mechanism
-    E = w[:, None] * jax.jacfwd(lambda q: psi(mechanism, s, q))(q) * W
-    inverse = plus(E)
-    rate = jax.jvp(lambda s: psi(mechanism, s, q), (s,), (jnp.ones_like(s),))[1]
-    dq = -W * (inverse @ (w * rate))
-    return dq, W * (inverse @ (w * gamma(mechanism, s, q, dq))), inverse.rank
+    by: ClassVar[ControlFlow] = BY_NUMPY
+
+    @classmethod
+    def of(cls, driven: Driven) -> "KnownCurve":
+        scales = jax.tree.map(np.asarray, driven.analysis.scales)
+        units = np.append(np.tile([scales.length, scales.length, 1.0], driven.analysis.coordinates // 3), driven.unit)
+        return cls(terms=DenseTerms(driven.mechanism), weights=scales.weights, units=units, rows=scales.rows)
+
+    def residual(self, X: Any) -> Any:
+        x = X * self.units
+        return self.weights * self.terms.psi(x[-1], x[:-1])
+
+    def slopes(self, X: Any) -> Any:
+        x = X * self.units
+        return self.weights[:, None] * np.column_stack(self.terms.slopes(x[-1], x[:-1])) * self.units
+
+    def plus(self, E: Any, tol: float = RANK_TOL) -> TruncatedPseudoinverse:
+        return TruncatedPseudoinverse.of(E, tol)
+
+    def gamma(self, s: Any, q: Any, v: Any) -> Any:
+        return self.terms.gamma(s, q, v)

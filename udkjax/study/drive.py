@@ -11,17 +11,19 @@ from typing import Literal, NamedTuple, cast, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
+from udkjax.equations.dense_rows import DenseTerms
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import Numbers, names, number, number_called
+from udkjax.scene.fields import Numbers, array_namespace, names, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of, point_of_pin
@@ -80,8 +82,10 @@ class Driven(NamedTuple):
         return "rad" if self.is_angle else "m" if self.name else "s"
 
     def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        """Return the value of the coordinate (rad, m) in a position."""
-        return psi(self.mechanism, 0.0, q)[self.row]
+        """Return the value of the coordinate (rad, m) in a position: of NumPy, where all is known."""
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((self.mechanism, q))):
+            return psi(self.mechanism, 0.0, q)[self.row]
+        return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
 
 
 def drive(mechanism: Mechanism, driver: Drive, t: Scalar = 0.0, held: Mapping[str, Scalar] | None = None) -> Driven:
@@ -122,7 +126,9 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Sc
             require_free(known, with_drivers(known, {}), name, called, names)
     _require_determinate(found, analysis, called)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
-    return Driven(found.without_origin, analysis, name, row, analysis.scales.rows[row])
+    rows = analysis.scales.rows
+    unit = rows[row] if isinstance(rows, Tracer) else number(np.asarray(rows)[row])
+    return Driven(found.without_origin, analysis, name, row, unit)
 
 
 def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
@@ -131,7 +137,8 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
     def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        return coordinate_value(element, *(FRAME_AT_REST if k is None else _frame(q[k]) for k in places))
+        rows = q if isinstance(q, Tracer) else np.asarray(q)  # of which JAX would compile a program to take a row
+        return coordinate_value(element, *(FRAME_AT_REST if k is None else _frame(rows[k]) for k in places))
 
     return value
 
@@ -144,14 +151,17 @@ def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | N
 
 
 def _frame(q: Float[Array, "3"]) -> Frame:
+    xp = array_namespace(q)
     x, y, angle = q
-    return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
+    return Frame(x, y, angle, xp.cos(angle), xp.sin(angle))
 
 
 def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
     """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
     driver = Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete()
-    return jnp.asarray(driver.residual(0.0, *frames)[0])
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((driver, frames))):
+        return jnp.asarray(driver.residual(0.0, *frames)[0])
+    return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
 
 
 def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
@@ -257,7 +267,7 @@ def _at_once(given: PyTree) -> AbstractContextManager:
 
 
 def _constant(value: Numbers) -> Polynomial:
-    return Polynomial(jnp.stack([number(value)]))
+    return Polynomial(jnp.stack([value]) if isinstance(value, Tracer) else np.reshape(value, 1))
 
 
 def _value_or(x: Scalar, otherwise: float) -> Scalar:

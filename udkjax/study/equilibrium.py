@@ -21,9 +21,9 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import number
+from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.curve import Curve, plus
+from udkjax.study.curve import Curve
 from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize
 from udkjax.study.positions import distinct, random_positions
@@ -74,18 +74,21 @@ class Equilibrium(PrintsTable):
     @property
     def state(self) -> State:
         """At rest there."""
-        return State(self.q, jnp.zeros_like(self.q))
+        return State(self.q, np.zeros(np.shape(self.q)))
 
     @property
     def stable(self) -> Bool[Array, ""]:
         """True if the potential energy has a minimum there, as all stiffnesses are positive."""
-        return self.balanced & jnp.all(self.omega2 > self.neutral[..., None], axis=-1)
+        xp = library_for(self)
+        neutral = xp.asarray(self.neutral)[..., None]
+        return stored(xp.asarray(self.balanced) & xp.all(xp.asarray(self.omega2) > neutral, axis=-1))
 
     @property
     def indifferent(self) -> Bool[Array, ""]:
         """True if nothing moves it away, though not all stiffnesses are positive: some vanish."""
-        least = jnp.min(self.omega2, axis=-1, initial=jnp.inf)
-        return self.balanced & (jnp.abs(least) <= self.neutral)
+        xp = library_for(self)
+        least = xp.min(xp.asarray(self.omega2), axis=-1, initial=np.inf)
+        return stored(xp.asarray(self.balanced) & (xp.abs(least) <= xp.asarray(self.neutral)))
 
     @property
     def kind(self) -> str:
@@ -126,7 +129,8 @@ def equilibrium(
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
     t = number(t)
-    start = jnp.ravel(close(mechanism, t, state, analysis=analysis).state.q)
+    q = close(mechanism, t, state, analysis=analysis).state.q
+    start = number(library_for(q).ravel(q))
     return _equilibrium(rest_curve(mechanism, analysis), analysis, t, start, free, stable)
 
 
@@ -161,7 +165,7 @@ def degrees_of_freedom(analysis: Analysis) -> int:
 
 def rest_curve(mechanism: Mechanism, analysis: Analysis) -> Curve:
     """Return the positions of the mechanism as a curve, with time in place of a driver's value."""
-    return Curve.of(Driven(mechanism.without_origin, analysis, "", -1, jnp.ones(())))
+    return Curve.of(Driven(mechanism.without_origin, analysis, "", -1, number(1.0)))
 
 
 def omega2(at: Linearization) -> Float[Array, "f"]:
@@ -252,7 +256,7 @@ def _(primals, tangents):
     def newton(curve: Curve, t: Float[Array, ""]) -> Float[Array, "n"]:
         X = jnp.append(q, t) / curve.units
         E = curve.slopes(X).at[:, -1].set(0.0)
-        closed = ((X - plus(E) @ curve.residual(X)) * curve.units)[:-1]
+        closed = ((X - curve.plus(E) @ curve.residual(X)) * curve.units)[:-1]
         if not free:
             return closed
         here, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)

@@ -1,7 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
-from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,16 +14,17 @@ from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.march import can_march, march, march_at_once, psi_at_once
+from udkjax.integrate.march import can_march, march, march_at_once
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import Numbers, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Points, Reached, follow, no_points
-from udkjax.study.curve import Curve
+from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.study.curve import Curve, KnownCurve
 from udkjax.study.drive import Drive, Driven, drive
 from udkjax.study.position_derivatives import with_derivative, with_derivatives
 
@@ -31,6 +32,7 @@ UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther w
 FULL_TURN = 2.0 * np.pi  # rad
 
 Rows: TypeAlias = Float[Array, "T n"]
+Result = TypeVar("Result")
 
 
 class Kinematics(PrintsTable):
@@ -81,7 +83,7 @@ class Kinematics(PrintsTable):
     @property
     def reached(self) -> Bool[Array, "T"]:
         """True for each value that was reached."""
-        return Reached.has_position(self.status)
+        return stored(Reached.has_position(library_for(self.status).asarray(self.status)))
 
     @property
     def ts(self) -> Float[Array, "T"]:
@@ -184,13 +186,9 @@ def kinematics(
             raise ValueError(
                 f"{name} must be one number, or one for each of the {len(values)} values; its shape is {given.shape}"
             )
-    driven, q = _start(mechanism, driver, values[0], state, held)
-    if is_known((driven, q, values, rate, acceleration)) and can_march(driven.mechanism, driven.analysis):
-        given = np.asarray(q), np.asarray(values), np.asarray(rate), np.asarray(acceleration)
-        found = _at_once(driven, *given, mechanism.body_names)
-        if found is not None:
-            return found
-    return _kinematics(driven, q, values, rate, acceleration, mechanism.body_names)
+    first = values[0] if isinstance(values, Tracer) else np.asarray(values)[0]
+    driven, q = _start(mechanism, driver, first, state, held)
+    return _call(_kinematics, driven, q, values, rate, acceleration, mechanism.body_names)
 
 
 @checked
@@ -203,25 +201,7 @@ def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held
     if driver is None:
         raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
     driven, q = _start(mechanism, driver, 0.0, state, held)
-    return _travel(driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
-
-
-def _at_once(
-    driven: Driven, q: np.ndarray, values: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, bodies: tuple[str, ...]
-) -> Kinematics | None:
-    """Solve by machine code and NumPy alone, for which nothing is compiled. None where its steps are not to be relied on."""
-    mechanism, analysis = driven.mechanism, driven.analysis
-    s = psi_at_once(mechanism, analysis, q)[driven.row] if driven.name else values[0]
-    found = march_at_once(mechanism, analysis, driven.unit, s, q, values)
-    if found.trusted < len(values):
-        return None
-    shape, rate = (len(values), -1, 3), np.broadcast_to(rate, values.shape)
-    at, dq, ddq = (np.asarray(x).reshape(shape) for x in found[:3])
-    per = rate[:, None, None]
-    a = ddq * per**2 + dq * np.broadcast_to(acceleration, values.shape)[:, None, None]
-    status, nowhere = np.zeros(len(values), int), np.full((len(bodies), 3), np.inf)
-    arrays = values, at, dq * per, a, rate, status, np.inf, nowhere
-    return Kinematics(*[jnp.asarray(x) for x in arrays], bodies=bodies, unit=driven.value_unit)
+    return _call(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
 
 
 def is_known(tree: PyTree) -> bool:
@@ -229,7 +209,20 @@ def is_known(tree: PyTree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def _call(function: Callable[..., Result], driven: Driven, *given: Any) -> Result:
+    """Call a function of what is given, and of the control flow: by NumPy, where all is known, else as one compiled program."""
+    if not is_known((driven, given)):
+        return _compiled(function, driven, *given)
+    with jax.ensure_compile_time_eval():
+        driven, given = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, (driven, given))
+        return jax.device_put(function(driven, *given, BY_NUMPY))
+
+
 @eqx.filter_jit
+def _compiled(function: Callable[..., Result], driven: Driven, *given: Any) -> Result:
+    return function(driven, *given, BY_JAX)
+
+
 def _kinematics(
     driven: Driven,
     q: Float[Array, "n"],
@@ -237,25 +230,26 @@ def _kinematics(
     rate: Float[Array, "*T"],
     acceleration: Float[Array, "*T"],
     bodies: tuple[str, ...],
+    by: ControlFlow,
 ) -> Kinematics:
-    points = _solve(driven, driven.value(q) if driven.name else values[0], q, values)
-    rate, acceleration = (jnp.broadcast_to(x, values.shape) for x in (rate, acceleration))
+    xp = by.xp
+    points = _solve(driven, driven.value(q) if driven.name else values[0], q, values, by)
+    rate, acceleration = (xp.broadcast_to(x, values.shape) for x in (rate, acceleration))
     v = points.dq * rate[:, None]
     a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
-    q, v, a = (jnp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
+    q, v, a = (xp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
     limit_q, unit = points.limit_q.reshape(-1, 3), driven.value_unit
     return Kinematics(values, q, v, a, rate, points.status, points.limit, limit_q, bodies, unit)
 
 
-@eqx.filter_jit
-def _travel(driven: Driven, q: Float[Array, "n"], far: Scalar) -> Travel:
-    s = driven.value(q)
-    ways = jnp.array([-1.0, 1.0])
-    down_up = jax.vmap(lambda way: _solve(driven, s, q, jax.lax.stop_gradient(s + way * far)[None], False))(ways)
+def _travel(driven: Driven, q: Float[Array, "n"], far: Scalar, by: ControlFlow) -> Travel:
+    xp, s = by.xp, driven.value(q)
+    ways = xp.array([-1.0, 1.0])
+    down_up = by.vmap(lambda way: _solve(driven, s, q, stop_gradients(xp.asarray(s + way * far)[None]), by, False))(ways)
     down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
-    lower, upper = (jnp.where(p.status[0] == Reached.beyond_limit, p.limit, way * jnp.inf) for p, way in ((down, -1), (up, 1)))
+    lower, upper = (xp.where(p.status[0] == Reached.beyond_limit, p.limit, way * np.inf) for p, way in ((down, -1), (up, 1)))
     lower_q, upper_q = (p.limit_q.reshape(-1, 3) for p in (down, up))
-    return Travel(lower, upper, lower_q, upper_q, jnp.stack([down.status[0], up.status[0]]), driven.value_unit)
+    return Travel(lower, upper, lower_q, upper_q, xp.stack([down.status[0], up.status[0]]), driven.value_unit)
 
 
 def _start(
@@ -273,20 +267,34 @@ def _start(
 
 
 def _assemble(mechanism: Mechanism, t: Scalar, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
-    return jnp.ravel(assemble(mechanism, t, state, throw=False, analysis=analysis).q)
+    q = assemble(mechanism, t, state, throw=False, analysis=analysis).q
+    return library_for(q).ravel(q)
 
 
-def _solve(driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], fast: bool = True) -> Points:
+def _solve(
+    driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], by: ControlFlow, fast: bool = True
+) -> Points:
     """Solve by machine code as far as its steps are to be relied on (if `fast`), and by continuation from there on."""
-    curve = Curve.of(driven)
-    points, first = no_points(len(values), len(q)), jnp.asarray(0)
+    xp, is_traced = by.xp, by is BY_JAX
+    curve = (Curve if is_traced else KnownCurve).of(driven)
+    points, first = no_points(len(values), len(q), xp), xp.asarray(0)
+    given = driven.mechanism, driven.analysis, driven.unit, s, q, values
     if fast and can_march(driven.mechanism, driven.analysis):
-        found = march(*stop_gradients((driven.mechanism, driven.analysis, driven.unit, s, q, values)))
-        first, last = found.trusted, jnp.maximum(found.trusted - 1, 0)
+        found = march(*stop_gradients(given)) if is_traced else march_at_once(*given)
+        first, last = found.trusted, xp.maximum(found.trusted - 1, 0)
         some = first > 0
-        s, q = jnp.where(some, values[last], s), jnp.where(some, found.q[last], q)
-        points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=jnp.zeros_like(points.status))
+        s, q = xp.where(some, values[last], s), xp.where(some, found.q[last], q)
+        points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=xp.zeros_like(points.status))
+    if not is_traced:
+        points = follow(curve, s, q, values, points, first)
+        there = Reached.has_position(points.status)[:, None]
+        return points._replace(**{name: np.where(there, getattr(points, name), np.nan) for name in ("q", "dq", "ddq")})
+    assert isinstance(curve, Curve)  # as it is of traced numbers
     points = follow(*stop_gradients((curve, s, q, values)), points, first)
+    return _with_derivatives(curve, q, values, points)
+
+
+def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "T"], points: Points) -> Points:
     there = Reached.has_position(points.status)
     safe = jnp.where(there[:, None], points.q, jax.lax.stop_gradient(q))
     regular = ~there | (points.status == Reached.closed)

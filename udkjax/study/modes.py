@@ -13,7 +13,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import number
+from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.study.linearization import linearize
@@ -42,7 +42,7 @@ class Modes(PrintsTable):
             return fields_table(self, self._units, f"modes of {np.shape(self.omega2)[0]} members")
         rows = []
         for k, x in enumerate(np.asarray(self.omega2)):
-            omega, turns = math.sqrt(abs(float(x))), np.abs(np.asarray(self.shapes[k, :, 2]))
+            omega, turns = math.sqrt(abs(float(x))), np.abs(np.asarray(self.shapes)[k, :, 2])
             kind = f"{omega:.6g} rad/s, {omega / (2 * math.pi):.6g} Hz" if x >= 0 else f"grows as exp({omega:.6g} t)"
             most = int(np.argmax(turns))
             rows.append((f"mode {k + 1}", f"{kind}; mostly {self.bodies[most] if self.bodies else f'body {most}'}"))
@@ -52,13 +52,17 @@ class Modes(PrintsTable):
     @property
     def frequencies(self) -> Float[Array, "f"]:
         """omega (rad/s) without damping; not a number where it moves away."""
-        return jnp.sqrt(self.omega2)
+        xp = library_for(self.omega2)
+        with np.errstate(invalid="ignore"):
+            return stored(xp.sqrt(xp.asarray(self.omega2)))
 
     @property
     def damping(self) -> Float[Array, "2f"]:
         """-Re s / |s| of each s: 0 undamped, 1 without oscillation, negative where it grows."""
-        size = jnp.abs(self.s)
-        return -self.s.real / jnp.where(size > 0, size, 1.0)
+        xp = library_for(self.s)
+        s = xp.asarray(self.s)
+        size = xp.abs(s)
+        return stored(-s.real / xp.where(size > 0, size, 1.0))
 
 
 @checked
@@ -81,7 +85,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, ana
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
-    return _modes(mechanism.without_origin, analysis, free, t, jnp.ravel(state.q))
+    return _modes(mechanism.without_origin, analysis, free, t, number(library_for(state.q).ravel(state.q)))
 
 
 @eqx.filter_jit

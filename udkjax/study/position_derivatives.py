@@ -25,7 +25,7 @@ from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.study.continuation import Points
 from udkjax.study.crossing import LAST, nodes, weights
-from udkjax.study.curve import Curve, derivatives, plus
+from udkjax.study.curve import Curve
 from udkjax.study.sequential import sequential
 
 # Of the largest (s - s*) dq/dp beside it: a residue below that is of rounding, which E^+ multiplies by a hundred at most there.
@@ -202,8 +202,8 @@ def _(primals, tangents):
 def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
     X = jnp.append(q, s) / curve.units
     E = curve.slopes(X)
-    q = ((X - plus(E.at[:, -1].set(0.0)) @ curve.residual(X)) * curve.units)[:-1]
-    dq, ddq, _ = derivatives(curve, s, q)
+    q = ((X - curve.plus(E.at[:, -1].set(0.0)) @ curve.residual(X)) * curve.units)[:-1]
+    dq, ddq, _ = curve.derivatives(s, q)
     return q, dq, ddq
 
 
@@ -218,5 +218,5 @@ def _(primals, tangents):
     curve, x = primals
     moving = eqx.combine(tangents[0], jax.tree.map(jnp.zeros_like, eqx.filter(curve, eqx.is_inexact_array)))
     X = x / jax.lax.stop_gradient(curve.units)
-    nearest = lambda curve: ((X - plus(curve.slopes(X)) @ curve.residual(X)) * curve.units)[-1]  # noqa: E731
+    nearest = lambda curve: ((X - curve.plus(curve.slopes(X)) @ curve.residual(X)) * curve.units)[-1]  # noqa: E731
     return with_derivative(*primals), eqx.filter_jvp(nearest, (curve,), (moving,))[1]

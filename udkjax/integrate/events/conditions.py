@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame, Point, between
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import Number
+from udkjax.scene.fields import Number, library_for
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
@@ -18,11 +18,12 @@ Frames = Mapping[str, Frame]
 
 def frames_of(names: Sequence[str], q: Array | np.ndarray, v: Array | np.ndarray | None = None) -> dict[str, Frame]:
     """Return the frames of all bodies by name, and the ground's, of flat q and v; without v they have no velocities."""
-    q = q.reshape(-1, 3)
-    rates = [()] * len(names) if v is None else v.reshape(-1, 3)
+    xp = library_for((q, v))
+    q = xp.asarray(q).reshape(-1, 3)
+    rates = [()] * len(names) if v is None else xp.asarray(v).reshape(-1, 3)
     frames: dict[str, Frame] = {GROUND: GROUND_FRAME_AT_REST}
     for name, x, dx in zip(names, q, rates, strict=True):
-        frames[name] = Frame(x[0], x[1], x[2], jnp.cos(x[2]), jnp.sin(x[2]), *dx)
+        frames[name] = Frame(x[0], x[1], x[2], xp.cos(x[2]), xp.sin(x[2]), *dx)
     return frames
 
 

@@ -1,0 +1,82 @@
+"""Calls of known numbers: what lies between `simulate` and machine code, and what is compiled before a first result, counted."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+ROOT = Path(udk.__file__).parent
+TS = np.linspace(0.0, 0.2, 5)
+
+
+def called(function: Callable[[], object]) -> set[tuple[str, str]]:
+    """Return the functions of the package that run, by file and name; expressions within them are theirs."""
+    seen = set()
+
+    def listen(frame, event, _):
+        code = frame.f_code
+        if event == "call" and Path(code.co_filename).is_relative_to(ROOT) and not code.co_name.startswith("<"):
+            seen.add((code.co_filename, code.co_qualname))
+
+    sys.setprofile(listen)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+    return seen
+
+
+def pendulums(count: int) -> udk.Mechanism:
+    """Bodies that hang side by side: a structure of its own for each count."""
+    bodies = {f"b{k}": udk.Body(1.0, 0.1, [float(k), -0.5], 0.3) for k in range(count)}
+    joints = {f"j{k}": udk.Revolute(["ground", f"b{k}"], [[float(k), 0.0], [0.0, 0.5]]) for k in range(count)}
+    return udk.Mechanism(bodies, joints)
+
+
+def test_few_functions_stand_between_a_call_and_machine_code():
+    mechanism = udk.library.parallelogram()
+    udk.simulate(mechanism, TS)
+    seen = called(lambda: udk.simulate(mechanism, TS))
+    assert len(seen) <= 42
+    assert len({file for file, _ in seen}) <= 18
+
+
+def test_what_is_decided_of_a_mechanism_is_decided_once():
+    mechanism = udk.library.parallelogram()
+    udk.simulate(mechanism, TS)
+    names = {name for _, name in called(lambda: udk.simulate(mechanism, 2.0 * TS, rtol=1e-6))}
+    assert not names & {"structure", "scene_programs", "compile_mechanism", "rank_tolerance", "has_pieces", "_analyse"}
+
+
+@pytest.mark.parametrize("count, transform", [(2, jax.grad), (3, jax.jacfwd)])
+def test_an_eager_derivative_takes_few_programs(compilations, count, transform):
+    """Two programs close and run, and two more go back: the others are single operations of JAX's."""
+    mechanism = pendulums(count)
+
+    def last(mass):
+        return udk.simulate(mechanism.with_parameters({"body.b0.mass": mass}), TS).q[-1, 0, 2]
+
+    assert len([seconds for seconds in compilations(lambda: transform(last)(1.5)) if seconds]) <= 20
+    assert compilations(lambda: transform(last)(1.7)) == []
+
+
+def test_an_eager_batch_takes_few_programs(compilations):
+    mechanism = pendulums(4)
+
+    def run(mass):
+        return udk.simulate(mechanism.with_parameters({"body.b0.mass": mass}), TS).q
+
+    masses = np.linspace(1.0, 2.0, 3)
+    assert len([seconds for seconds in compilations(lambda: jax.vmap(run)(masses)) if seconds]) <= 6
+
+
+def test_a_batch_at_once_is_its_members():
+    mechanism, masses = pendulums(2), np.linspace(1.0, 2.0, 3)
+    run = lambda mass: udk.simulate(mechanism.with_parameters({"body.b1.inertia": mass}), TS).q  # noqa: E731
+    assert_allclose(jax.vmap(run)(masses), [run(float(x)) for x in masses], rtol=1e-9)

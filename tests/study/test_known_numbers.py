@@ -1,0 +1,53 @@
+"""Positions by NumPy are those that compiled programs find, and nothing is compiled for them."""
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+TURN = np.linspace(0.0, 2 * np.pi, 25)
+CASES = {
+    "a full turn": (udk.library.four_bar, "body.crank.angle", 1.0 + TURN),
+    "to a toggle": (udk.library.four_bar, "body.rocker.angle", np.linspace(1.6, 4.0, 9)),
+    "through meetings of branches": (udk.library.parallelogram, "body.link1.angle", 0.3 + TURN),
+}
+
+
+@pytest.fixture(params=CASES, scope="module")
+def case(request):
+    return CASES[request.param]
+
+
+def test_positions_of_known_and_of_traced_numbers(case):
+    make, driver, values = case
+    mechanism = make()
+    known = udk.kinematics(mechanism, driver, values)
+    traced = jax.jit(lambda values: udk.kinematics(mechanism, driver, values))(values)
+    assert_allclose(known.status, traced.status)
+    for name in ("q", "v", "limit", "limit_q"):
+        assert_allclose(getattr(known, name), getattr(traced, name), rtol=1e-9, atol=1e-9)
+    assert_allclose(known.a, traced.a, rtol=1e-6, atol=1e-6)
+
+
+def test_limits_of_known_and_of_traced_numbers(case):
+    make, driver, _ = case
+    mechanism = make()
+    known = udk.travel(mechanism, driver)
+    traced = jax.jit(lambda shift: udk.travel(mechanism.with_parameters({"gravity": [0.0, shift]}), driver))(-9.81)
+    for name in ("lower", "upper", "status"):
+        assert_allclose(getattr(known, name), getattr(traced, name), rtol=1e-10)
+
+
+def test_nothing_is_compiled_by_xla(compilations):
+    """But for two constants, where derivatives along a driver are traced for the first time."""
+    mechanism = udk.library.n_four_bar(2)
+    driver = f"body.{mechanism.body_names[0]}.angle"
+
+    def ask():
+        found = udk.kinematics(mechanism, driver, np.linspace(0.0, 0.1, 4) + float(np.asarray(mechanism.q0)[0, 2]))
+        assert np.all(np.asarray(found.reached))
+        udk.travel(mechanism, driver)
+
+    assert len([seconds for seconds in compilations(ask) if seconds]) <= 2
