@@ -18,6 +18,7 @@ NAMES = (
     "sweep",
     "identification",
     "uniqueness",
+    "live",
     "peers",
 )
 

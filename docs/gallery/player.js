@@ -48,7 +48,23 @@ class Run {
     this.measures = record.measures.map(m => ({...m, values: floats(m.values)}));
     this.forces = record.reactions && unpack(record.reactions.force);
     this.paths = null;
+    this.fine = 4;  // points of a path for each instant
     this.now = new Float64Array(this.size);
+  }
+
+  /** Another motion of the same bodies. */
+  replace(ts, q, v, measures, frame) {
+    Object.assign(this, {ts, q, v, measures, frame, paths: null, fine: 1});
+  }
+
+  /** The coordinates and their rates at any time between the first and the last instant. */
+  state(t) {
+    const [i, j, h, s] = this.find(t), n = this.size, {q, v, frame} = this, rates = new Float64Array(n), r = 1 - s;
+    for (let k = 0; k < n; k++) {
+      const a = q[i * n + k], b = q[j * n + k], u = v[i * n + k] / frame, w = v[j * n + k] / frame;
+      rates[k] = h > 0 ? 6 * s * r * (b - a) / h + r * (1 - 3 * s) * u + s * (3 * s - 2) * w : u;
+    }
+    return {q: this.pose(t).slice(), v: rates};
   }
 
   /** The interval that holds t, and where in it t is, from 0 to 1. */
@@ -90,7 +106,7 @@ class Run {
   trace() {
     if (!this.paths) {
       const first = this.ts[0], last = this.ts[this.ts.length - 1];
-      const count = clamp(4 * this.ts.length, 2, 3000);
+      const count = clamp(this.fine * this.ts.length, 2, 3000);
       this.paths = {first, last, count, lines: this.traces.map(() => new Float64Array(2 * count))};
       for (let i = 0; i < count; i++) {
         const pose = this.pose(first + (last - first) * i / (count - 1));
@@ -287,19 +303,40 @@ class Painter {
 /** Draws symbols at a pose. */
 class SymbolPainter extends Painter {
   draw(symbols) {
-    for (const {frame, radius, points, closed, width, ...look} of symbols) {
-      const [[x0, y0], cos, sin, scale] = this.axes(frame), fill = this.tone(look.fill), stroke = this.tone(look.stroke), {pt} = this;
-      if (radius) {
-        const [metres, units, least] = radius;
-        this.circle([x0, y0], Math.max(this.view.scale * metres + pt * units, pt * least), {fill, stroke, width});
-        continue;
-      }
-      const corners = points.map(([x, y, px = 0, py = 0]) => {
-        const along = scale * x + pt * px, up = scale * y + pt * py;
-        return [x0 + cos * along - sin * up, y0 - sin * along - cos * up];
-      });
-      this.line(corners, width, stroke, {closed, fill});
+    for (const symbol of symbols) {
+      const {centre, size, corners} = this.outline(symbol), fill = this.tone(symbol.fill), stroke = this.tone(symbol.stroke);
+      if (centre) this.circle(centre, size, {fill, stroke, width: symbol.width});
+      else this.line(corners, symbol.width, stroke, {closed: symbol.closed, fill});
     }
+  }
+
+  /** Where a symbol is (px): the centre and the radius of a circle, or the corners of a line. */
+  outline({frame, radius, points}) {
+    const [[x0, y0], cos, sin, scale] = this.axes(frame), {pt} = this;
+    if (radius) {
+      const [metres, units, least] = radius;
+      return {centre: [x0, y0], size: Math.max(this.view.scale * metres + pt * units, pt * least)};
+    }
+    const corners = points.map(([x, y, px = 0, py = 0]) => {
+      const along = scale * x + pt * px, up = scale * y + pt * py;
+      return [x0 + cos * along - sin * up, y0 - sin * along - cos * up];
+    });
+    return {corners};
+  }
+
+  /** Whether a symbol is at a place (px), or nearer than `reach`. */
+  holds(symbol, x, y, reach) {
+    const {centre, size, corners} = this.outline(symbol);
+    if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
+    const ends = symbol.closed ? [...corners, corners[0]] : corners, near = symbol.width * this.pt / 2 + reach;
+    let inside = false;
+    for (let k = 1; k < ends.length; k++) {
+      const [[ax, ay], [bx, by]] = [ends[k - 1], ends[k]], dx = bx - ax, dy = by - ay;
+      const s = Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0), 1);
+      if (Math.hypot(x - ax - s * dx, y - ay - s * dy) <= near) return true;
+      if ((ay > y) !== (by > y) && x < ax + dx * (y - ay) / dy) inside = !inside;
+    }
+    return inside && Boolean(symbol.closed);
   }
 
   /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */
@@ -335,7 +372,7 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
     if (Number.isFinite(y)) { low = Math.min(low, scaled(y)); high = Math.max(high, scaled(y)); }
   }
   const painter = new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null);
-  if (!(high >= low)) return painter.text("no values", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
+  if (!(high >= low)) return painter.text("no values of this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   const least = log ? 3 : 1e-12 * Math.max(Math.abs(low), Math.abs(high)) || 1;
   if (high - low < least) { low -= least / 2; high += least / 2; }
   const x = time => left + (right - left) * (time - start) / (end - start || 1);
@@ -411,6 +448,7 @@ button, select { font: inherit; font-size: 13px; color: var(--ink); background: 
   height: 32px; padding: 0 8px; margin: 0; cursor: pointer; }
 button:hover, select:hover { background: color-mix(in srgb, var(--ink) 8%, transparent); }
 button[aria-pressed="true"] { color: var(--accent); background: color-mix(in srgb, var(--accent) 14%, transparent); }
+button:disabled { opacity: 0.5; cursor: default; }
 option { color: #111; background: #fff; }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 button svg { display: block; width: 18px; height: 18px; fill: currentColor; }
@@ -445,6 +483,8 @@ const HELP = [
   ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
 ];
 
+const LIVE_HELP = [["Drag a body", "pull at it"], ["G", "first motion"], ["Backspace", "reset the numbers"]];
+
 /** An element with properties and children; texts are texts. */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -468,22 +508,32 @@ function icon(name) {
 
 // Fingers, mouse and wheel on a canvas.
 
-/** Drag moves the view, two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+/** Drag moves the view, or of a live page pulls at the body that is there;
+ *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
 function followPointers(player, canvas) {
   const down = new Map();
-  let moved = 0;
+  let moved = 0, hand = null;  // the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   canvas.addEventListener("pointerdown", event => {
     canvas.setPointerCapture(event.pointerId);
     down.set(event.pointerId, point(event));
     moved = 0;
+    if (down.size === 1 && event.button === 0 && player.live?.bodyAt(canvas, point(event), event.pointerType)) hand = event.pointerId;
   });
   canvas.addEventListener("pointermove", event => {
-    if (!down.has(event.pointerId)) return;
+    if (!down.has(event.pointerId)) {
+      if (player.live) canvas.classList.toggle("holds", Boolean(player.live.bodyAt(canvas, point(event), event.pointerType)));
+      return;
+    }
     const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
     down.set(event.pointerId, now);
     moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
     if (moved < 4) return;
+    if (hand === event.pointerId) {
+      if (player.live.hand) player.live.move(canvas, now);
+      else if (!player.live.grasp(canvas, old, event.pointerType)) hand = null;
+      return;
+    }
     const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
     const [cx, cy] = centre(before), [nx, ny] = centre(after);
     if (down.size === 2) {
@@ -495,6 +545,7 @@ function followPointers(player, canvas) {
     player.draw();
   });
   const up = event => {
+    if (hand === event.pointerId) { hand = null; player.live.release(); }
     if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) player.toggle("playing");
   };
   canvas.addEventListener("pointerup", up);
@@ -507,6 +558,725 @@ function followPointers(player, canvas) {
     player.draw();
   }, {passive: false});
 }
+
+// The engine of one mechanism in a page: the data of udkjax/integrate/portable, run by WebAssembly.
+//
+//   const engine = await loadEngine(data)      throws where there is no WebAssembly
+//   engine.parameters                          a list of {name, unit, value}
+//   engine.values                              their values as they are in the scene, in the same order
+//   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
+//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
+//   engine.measure(parameters, run, efforts)   -> {kinetic, potential, efforts: {driver: values}}
+//
+// Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
+// of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
+
+
+const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
+const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite"};
+const EPS = 2 ** -52;
+
+const numbersOf = text => new Float64Array(bytesOf(text).buffer);
+const largest = (x, unit) => x.reduce((most, value, k) => Math.max(most, Math.abs(value) / unit(k)), 0);
+
+async function inflate(text) {
+  const stream = new Blob([bytesOf(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).arrayBuffer();
+}
+
+/** One module with a memory of its own: constants, stack, and behind them what a call takes, which the next call overwrites. */
+class Instance {
+  static async load(module) {
+    const found = new Instance();
+    found.module = module;
+    found.start = Math.ceil((module.data_end + STACK) / LINE) * LINE;
+    found.memory = new WebAssembly.Memory({initial: Math.ceil(found.start / PAGE) + 1});
+    const env = {...MATHS, __linear_memory: found.memory, malloc: size => found.reserve(Number(size)), free: () => {}};
+    env.__stack_pointer = new WebAssembly.Global({value: "i32", mutable: true}, found.start);
+    const {instance} = await WebAssembly.instantiate(await inflate(module.code), {env});
+    found.exports = instance.exports;
+    return found;
+  }
+
+  begin() { this.end = this.start; }
+
+  /** The address of so many bytes. */
+  reserve(size) {
+    const place = this.end;
+    this.end = Math.ceil((place + size) / LINE) * LINE;
+    const missing = this.end - this.memory.buffer.byteLength;
+    if (missing > 0) this.memory.grow(Math.ceil(missing / PAGE));
+    return place;
+  }
+
+  put(numbers) {
+    const place = this.reserve(8 * numbers.length);
+    new Float64Array(this.memory.buffer, place, numbers.length).set(numbers);
+    return place;
+  }
+
+  view(place, count) { return new Float64Array(this.memory.buffer, place, count); }
+
+  /** Call `run` for one member: its inputs are arrays by name, and so are the results, by how many numbers they have. */
+  run(inputs, results, counts) {
+    this.begin();
+    const fields = {members: 1, directions: 0, next: this.put([0]), ...counts}, given = {};
+    for (const name of this.module.inputs) fields[name] = this.put(inputs[name]);
+    for (const name of this.module.results) fields[name] = given[name] = this.put(new Float64Array(results[name]));
+    const record = this.reserve(8 * this.module.fields.length);
+    const words = new BigInt64Array(this.memory.buffer, record, this.module.fields.length);
+    this.module.fields.forEach((name, k) => { words[k] = BigInt(fields[name] ?? 0); });
+    this.exports.run(record);
+    return Object.fromEntries(this.module.results.map(name => [name, this.view(given[name], results[name]).slice()]));
+  }
+}
+
+const MATHS = {exp2: x => 2 ** x};
+for (const name of ["exp", "log", "pow", "tanh", "tan", "sinh", "cosh", "asin", "acos", "atan", "atan2"]) MATHS[name] = Math[name];
+
+class Engine {
+  constructor(data, instances) {
+    this.data = data;
+    this.instances = instances;
+    this.parameters = data.parameters;
+    this.values = Float64Array.from(data.parameters, p => p.value);
+    this.base = numbersOf(data.numbers);
+    this.samples = numbersOf(data.samples);
+    this.size = 3 * data.bodies.length;
+    this.row = data.sampled.length;
+  }
+
+  /** All numbers of the scene; behind them the times where the motion is not smooth. */
+  numbers(parameters) {
+    if (!parameters || !this.parameters.length) return this.base.slice();
+    const module = this.instances.evaluate;
+    module.begin();
+    const given = module.put(parameters), to = module.put(this.base);
+    module.exports.numbers(given, to);
+    return module.view(to, this.base.length).slice();
+  }
+
+  breaks(numbers) { return numbers.slice(this.data.count).sort(); }
+
+  /** The numbers of the equations as a module takes them: with two thresholds, and with the samples that hold at a time. */
+  dressed(numbers, thresholds, t) {
+    const found = new Float64Array(this.data.count + 2);
+    found.set(numbers.subarray(0, this.data.count));
+    found.set(thresholds, this.data.count);
+    const passed = this.breaks(numbers).filter(b => b <= t).length;
+    this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
+    return found;
+  }
+
+  guess(numbers) {
+    const {q, v} = this.data.guess;
+    return {t: 0, q: Float64Array.from(q, k => numbers[k]), v: Float64Array.from(v, k => numbers[k])};
+  }
+
+  unit = k => (k % 3 === 2 ? 1 : this.data.scales.length);
+
+  /** Close the loops from a guess {t, q, v}, which by default is the scene's: the nearest closed state.
+   *
+   *  Returns t, q and v; `violation` of Psi and `rate` of Psi_dot, the largest of their rows in units of the scene; the `rank` of
+   *  Psi_q there; and whether the state is `closed`: if not, it is the best that was found.
+   */
+  close(parameters = null, guess = null) {
+    const {data} = this, numbers = this.numbers(parameters), start = {...this.guess(numbers), ...guess}, m = data.rows.length;
+    const given = this.dressed(numbers, data.closing.thresholds, start.t);
+    const inputs = {numbers: given, ts: [start.t, start.t], q: start.q, v: start.v, settings: data.closing.settings,
+      rows: data.rows, breaks: []};
+    const found = this.instances.close.run(inputs, {state: 2 * this.size, residuals: 2 * m, rank: 1}, {times: 2, knots: 0});
+    const q = found.state.slice(0, this.size), v = found.state.slice(this.size), row = k => data.rows[k % m];
+    const violation = largest(found.residuals.slice(0, m), row), rate = largest(found.residuals.slice(m), row);
+    const tol = Math.max(data.closing.tol, data.closing.rounding * EPS * Math.max(1, largest(q, this.unit)));
+    const closed = violation <= tol && rate <= tol * Math.max(data.scales.rate, largest(v, this.unit));
+    return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
+  }
+
+  /** Integrate the motion from a closed state {q, v} at times[0].
+   *
+   *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
+   *  that of the ground (m), stiffness (N/m) and damping (N s/m).
+   *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
+   *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
+   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; and the `last` state.
+   */
+  run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
+    const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
+    if (data.why) throw new Error(data.why);
+    if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
+    const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
+    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
+    const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega, max_steps: limit});
+    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0]), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
+      samples: this.samples};
+    const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
+    const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
+    const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
+    let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
+    const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
+    if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
+    const limited = ended.code === 2, last = {t: ended.t, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
+    return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
+      steps: ended.accepted, tried: ended.tried, limited, last};
+  }
+
+  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m). */
+  measure(parameters, {ts, q, v, count}, efforts = false) {
+    const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
+    const numbers = this.dressed(this.numbers(parameters), data.thresholds, ts[0]);
+    module.begin();
+    const given = module.put(numbers), work = module.reserve(8 * module.module.size);
+    module.view(work, module.module.size).fill(0);
+    module.exports.prologue(given, work);
+    const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
+    const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
+      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)]))};
+    for (let i = 0; i < count; i++) {
+      at("t")[0] = ts[i];
+      copy("q", q.subarray(i * size, (i + 1) * size));
+      copy("v", v.subarray(i * size, (i + 1) * size));
+      module.exports.energy(work, work);
+      [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
+      if (!wanted.length) continue;
+      module.exports.accelerations(work, work);
+      for (const {driver, place} of wanted) if (place !== null) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
+    }
+    return found;
+  }
+}
+
+/** The engine of a mechanism, from its data. */
+async function loadEngine(data) {
+  if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
+  const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
+  return new Engine(data, Object.fromEntries(await Promise.all(loaded)));
+}
+
+// Symbols that follow the numbers of a scene (udkjax/show/player/followers.py).
+
+/** Moves the places of a run's symbols, marks and traces to where the numbers say. */
+class Follower {
+  constructor(run, rows) {
+    this.run = run;
+    this.rows = rows;
+    run.symbols = structuredClone(run.symbols);
+    run.marks = structuredClone(run.marks);
+    run.traces = structuredClone(run.traces);
+    this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
+  }
+
+  follow(numbers) {
+    const {run, rows} = this, put = (anchor, start, x, y) => { anchor[start] = numbers[x]; anchor[start + 1] = numbers[y]; };
+    for (const [k, which, x, y] of rows.frames) put(which < 0 ? run.symbols[k].frame : run.symbols[k].frame[which], 1, x, y);
+    for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
+    for (const [k, , x, y] of rows.traces) put(run.traces[k], 1, x, y);
+    for (const [k, , x, y] of rows.pins) run.marks[k].at = [numbers[x], numbers[y]];
+    for (const [k, place] of rows.angles) run.symbols[k].frame[3] = numbers[place];
+    rows.sizes.forEach(([k, place, radius], i) => {
+      const scale = numbers[place] / radius, {points, radius: size} = this.whole[i];
+      if (points) run.symbols[k].points = points.map(([x, y, ...rest]) => [x * scale, y * scale, ...rest]);
+      if (size) run.symbols[k].radius = [size[0] * scale, size[1], size[2]];
+    });
+    run.paths = null;
+  }
+}
+
+// A hand that pulls at a body by a spring, through the mechanism's own dynamics and in time.
+
+const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second of the screen, with half of all masses on it
+const DAMPING = 0.7;  // of the critical one
+const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
+
+/** Pulls while it is held; `live` gives the engine, and shows what comes of it. */
+class Hand {
+  constructor(live, held, target) {
+    const {engine, values} = live, numbers = engine.numbers(values), {speed} = live.player;
+    const mass = 0.5 * engine.data.masses.reduce((sum, [k]) => sum + numbers[k], 0), rate = SWING / speed;
+    Object.assign(this, {live, held, target});
+    this.spring = {stiffness: mass * rate ** 2, damping: 2 * DAMPING * mass * rate};
+    this.before = null;
+    this.state = live.stateNow();
+    live.begin(this.state);
+    this.request = requestAnimationFrame(now => this.frame(now));
+  }
+
+  frame(now) {
+    this.request = requestAnimationFrame(later => this.frame(later));
+    const seconds = this.before === null ? 0 : Math.min((now - this.before) / 1000, LONGEST_FRAME);
+    this.before = now;
+    if (seconds > 0) this.advance(seconds * this.live.player.speed);
+  }
+
+  advance(step) {
+    const {live, state, held, spring, target} = this, t = state.t + step;
+    const pull = {body: held.body, point: held.point, target, ...spring};
+    const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
+    if (!run.done) return live.say(`the pull is too much: ${run.words}`, true);
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n)};
+    live.append(this.state, run.violation[1]);
+    return null;
+  }
+
+  move(target) { this.target = target; }
+
+  release() {
+    cancelAnimationFrame(this.request);
+    this.live.goOn(this.state);
+  }
+}
+
+/** The body that is drawn at a place of the screen, the uppermost first, and the point in its frame; null where there is none. */
+function bodyAt(painter, symbols, [x, y], reach) {
+  for (const symbol of [...symbols].reverse()) {
+    const {frame} = symbol;
+    if (frame.length === 2 || frame[0] < 0 || !painter.holds(symbol, x, y, reach)) continue;
+    const body = frame[0], {pose, view} = painter, angle = pose[3 * body + 2];
+    const dx = (x - view.x) / view.scale - pose[3 * body], dy = (view.y - y) / view.scale - pose[3 * body + 1];
+    return {body, point: [Math.cos(angle) * dx + Math.sin(angle) * dy, Math.cos(angle) * dy - Math.sin(angle) * dx]};
+  }
+  return null;
+}
+
+// The panel of a live page: sliders in sections, what is said about the motion, and what one can do with it.
+
+
+const STEPS = 500;  // of a slider by keys
+const DIGITS = 5;  // of a number beside it
+
+/** Builds the panel of some sliders; `changed(k, value)` is called while one moves, and actions by their names. */
+class SliderPanel {
+  constructor(sliders, changed, actions) {
+    this.sliders = sliders;
+    this.rows = sliders.map((slider, k) => this.row(slider, value => changed(k, value)));
+    this.note = make("p", {class: "note", role: "status"});
+    const sections = Map.groupBy ? Map.groupBy(this.rows, r => r.slider.section) : grouped(this.rows);
+    const parts = [...sections].map(([title, rows], k) => {
+      const part = make("details", {}, make("summary", {}, title), ...rows.map(r => r.element));
+      part.open = k < 1 || sections.size < 3 || this.rows.length < 9;
+      return part;
+    });
+    this.buttons = Object.fromEntries(Object.entries(actions).map(([name, {words, title, act}]) => [name,
+      make("button", {type: "button", title, onclick: act}, words)]));
+    this.element = make("aside", {class: "live", "aria-label": "numbers of the scene"},
+      make("div", {class: "actions"}, ...Object.values(this.buttons)), this.note, make("div", {class: "rows"}, ...parts));
+  }
+
+  row(slider, changed) {
+    const {label, unit, low, high} = slider, step = (high - low) / STEPS;
+    const range = make("input", {type: "range", min: low, max: high, step, "aria-label": label, "aria-valuetext": `${slider.value} ${unit}`});
+    const number = make("input", {type: "number", step: "any", "aria-label": `${label}, number`});
+    const set = value => {
+      if (value < +range.min) range.min = value;
+      if (value > +range.max) range.max = value;
+      range.value = value;
+      number.value = +value.toPrecision(DIGITS);
+      range.setAttribute("aria-valuetext", `${number.value} ${unit}`);
+    };
+    range.addEventListener("input", () => { set(+range.value); changed(+range.value); });
+    number.addEventListener("change", () => {
+      if (!Number.isFinite(number.valueAsNumber)) return set(+range.value);
+      const value = number.valueAsNumber;
+      set(value);
+      changed(value);
+    });
+    range.addEventListener("dblclick", () => { set(slider.value); changed(slider.value); });
+    const shown = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
+    const element = make("div", {class: "slider", title: slider.name},
+      make("span", {class: "name"}, label), number, make("span", {class: "unit"}, shown), range);
+    set(slider.value);
+    return {slider, element, set, range, number};
+  }
+
+  show(values) {
+    values.forEach((value, k) => this.rows[k].set(value));
+  }
+
+  say(words, bad = false) {
+    this.note.textContent = words;
+    this.note.classList.toggle("bad", bad);
+  }
+
+  enable(on) {
+    for (const input of this.element.querySelectorAll("input, button")) input.disabled = !on;
+  }
+}
+
+function grouped(rows) {
+  const found = new Map();
+  for (const row of rows) found.set(row.slider.section, [...(found.get(row.slider.section) ?? []), row]);
+  return found;
+}
+
+const LIVE_STYLE = `
+.middle { display: flex; min-height: 0; }
+.fill .middle { flex: 1; }
+.middle .stage { flex: 1; min-width: 0; }
+.live { width: 300px; flex: none; display: flex; flex-direction: column; min-height: 0; background: var(--panel);
+  border-left: 1px solid var(--line); font-size: 13px; }
+.live .actions { display: flex; gap: 4px; flex-wrap: wrap; padding: 6px 10px; border-bottom: 1px solid var(--line); }
+.live .note { margin: 0; padding: 7px 14px; color: var(--soft); min-height: 34px; border-bottom: 1px solid var(--line); }
+.live .note.bad { color: var(--force); font-weight: 600; }
+.live .rows { overflow: auto; flex: 1; min-height: 0; padding: 4px 14px 14px; }
+.live summary { cursor: pointer; font-weight: 600; padding: 8px 0 4px; }
+.live .slider { display: grid; grid-template-columns: minmax(0, 1fr) 84px 48px; align-items: center; gap: 0 6px; padding: 4px 0 2px; }
+.live .name { overflow-wrap: anywhere; }
+.live .unit { color: var(--soft); }
+.live .slider input[type="range"] { grid-column: 1 / -1; width: 100%; height: 24px; }
+.live input[type="number"] { font: inherit; font-variant-numeric: tabular-nums; width: 100%; height: 26px; padding: 0 4px; text-align: right;
+  color: var(--ink); background: var(--back); border: 1px solid var(--line); border-radius: 5px; appearance: textfield; }
+.live :disabled { opacity: 0.5; cursor: default; }
+.narrow .middle { flex-direction: column; }
+.narrow .live { width: auto; border-left: 0; border-top: 1px solid var(--line); max-height: 40%; }
+.fill.narrow .live { flex: 0 1 38%; }
+.panel canvas.holds { cursor: pointer; }
+@media (pointer: coarse) { .live .slider input[type="range"] { height: 34px; } .live input[type="number"] { height: 34px; } }
+`;
+
+// A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motion is closed and solved anew.
+
+
+const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
+const GHOST = 0.28;  // how much one sees of the first motion
+const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
+// Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
+// same numbers give the same motion.
+const STEP_BYTES = 6e7;
+const FITTED = 300;  // instants that the whole view is fitted to
+const SETTLED = 150;  // ms without a change until the address says the numbers
+
+class Live {
+  constructor(player, data) {
+    this.player = player;
+    this.data = data.live;
+    this.run = player.runs[0];
+    this.ghost = new Run(data.runs[0]);
+    this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame,
+      reactions: this.run.reactions};
+    this.follower = new Follower(this.run, this.data.follow);
+    this.values = Float64Array.from(this.data.sliders, s => s.value);
+    this.changed = this.dirty = false;
+    this.hand = this.job = null;
+    this.steps = Math.round(STEP_BYTES / this.data.engine.modules.run.bytes);  // of one picture
+    this.solving = 0;  // ms, of the last motion
+    this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
+      ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
+      reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
+      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.share()},
+    });
+    player.show.ghost = true;
+    player.buttons.ghost = this.panel.buttons.ghost;
+    this.panel.enable(false);
+    this.ready = this.load();
+  }
+
+  async load() {
+    try {
+      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
+      this.engine = await loadEngine(this.data.engine);
+    } catch (error) {
+      this.say(`This browser cannot simulate (${error.message}): the page plays what was recorded.`, true);
+      return false;
+    }
+    this.panel.enable(true);
+    this.greet();
+    this.readAddress();
+    return true;
+  }
+
+  keys() {
+    return {g: () => this.player.toggle("ghost"), Backspace: () => this.engine && this.reset()};
+  }
+
+  greet() { this.say("Move a slider, or pull at a body: the motion is solved anew."); }
+
+  say(words, bad = false) { this.panel.say(words, bad); }
+
+  // Numbers
+
+  set(k, value) {
+    this.values[k] = value;
+    this.solveSoon();
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => this.writeAddress(), SETTLED);
+  }
+
+  /** Change numbers by the names of their parameters, and solve at once. */
+  change(numbers) {
+    this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
+    this.panel.show(this.values);
+    this.solve();
+  }
+
+  /** Solve before the next picture, once for all changes until then. */
+  solveSoon() {
+    if (this.dirty) return;
+    this.dirty = true;
+    requestAnimationFrame(() => { if (this.dirty) this.solve(); });
+  }
+
+  reset() {
+    this.drop();
+    this.values = Float64Array.from(this.data.sliders, s => s.value);
+    this.panel.show(this.values);
+    const {ts, q, v, measures, end, frame} = this.first;
+    this.run.replace(ts, q, v, measures, frame);
+    this.showReactions(this.first.reactions);
+    this.follower.follow(this.engine.numbers(null));
+    this.player.setEnd(end);
+    this.changed = this.dirty = false;
+    this.writeAddress();
+    this.greet();
+    this.player.draw();
+  }
+
+  // Motion
+
+  solve() {
+    const {engine, first, values} = this;
+    this.dirty = false;
+    this.drop();
+    const start = performance.now(), state = engine.close(values, {t: first.ts[0], ...this.data.start});
+    if (state.closed) {
+      const T = first.ts.length, n = engine.size;
+      const run = {ts: first.ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+      this.job = {run, state, rank: state.rank, from: 0, steps: 0, tried: 0, start};
+      this.follower.follow(engine.numbers(values));
+      this.player.setEnd(first.end);
+      this.goAhead();
+    } else {
+      const gap = this.lengthOf(state.violation);
+      this.say(`The loops do not close with these numbers: they stay open by ${gap}. The last motion that does is shown.`, true);
+    }
+    this.player.draw();
+  }
+
+  /** Solve on for as many steps as fit into one picture, and so on until the end: the first motion that is whole stays. */
+  goAhead() {
+    const {engine, job} = this, {run, from} = job, n = engine.size;
+    const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
+    const part = engine.run(this.values, job.state, times, null, Math.min(this.steps, this.data.engine.settings.max_steps - job.tried));
+    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0);
+    run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
+    run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
+    run.violation.set(part.violation.subarray(skip, skip + count), from);
+    run.count = job.from = from + count;
+    job.steps += part.steps;
+    job.tried += part.tried;
+    job.state = part.last;
+    this.show(run);
+    const span = run.ts[run.ts.length - 1] - run.ts[0];
+    if (part.limited && job.tried < this.data.engine.settings.max_steps) {
+      this.say(`Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`);
+      this.request = requestAnimationFrame(() => { this.goAhead(); this.player.draw(); });
+      return;
+    }
+    this.solving = performance.now() - job.start;
+    const freedoms = n - job.rank, usual = n - this.data.engine.rank;
+    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${this.solving.toFixed(1)} ms, ${job.steps} steps.`
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    this.say(freedoms === usual ? ended : `${ended} ${freedoms} degrees of freedom here, ${usual} at first.`, !part.done);
+    this.job = null;
+  }
+
+  lengthOf(violation) { return `${(violation * this.data.engine.scales.length).toPrecision(2)} m`; }
+
+  show(run) {
+    const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
+    const part = {...run, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
+    this.run.replace(part.ts, part.q, part.v, this.measures(part), 1);
+    this.showReactions(null);  // those of the first motion are none of this one
+    this.changed = true;
+  }
+
+  showReactions(reactions) {
+    this.run.reactions = reactions;
+    const button = this.player.buttons.reactions;
+    if (button) button.disabled = !reactions;
+  }
+
+  /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
+  measures(run) {
+    const found = this.engine.measure(this.values, run, true), {length} = this.data.engine.scales;
+    const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
+    const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
+    const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
+      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
+    return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
+  }
+
+  // The hand
+
+  /** The state at the time that is shown. */
+  stateNow() {
+    const t = this.player.t, {q, v} = this.run.state(t);
+    return {...this.engine.close(this.values, {t, q, v}), t};
+  }
+
+  /** What is on a panel's canvas at a place (px), if a hand can grasp it. */
+  bodyAt(canvas, point, pointer = "mouse") {
+    if (!this.engine) return null;
+    const painter = this.player.painter(canvas);
+    painter.pose = this.run.pose(this.player.t);
+    return bodyAt(painter, this.run.symbols, point, REACH[pointer] ?? REACH.touch);
+  }
+
+  grasp(canvas, point, pointer) {
+    const held = this.bodyAt(canvas, point, pointer);
+    if (!held) return false;
+    if (this.dirty) this.solve();
+    while (this.job) this.goAhead();
+    this.player.pause();
+    this.hand = new Hand(this, held, this.metres(canvas, point));
+    return true;
+  }
+
+  move(canvas, point) { this.hand?.move(this.metres(canvas, point)); }
+
+  drop() {
+    cancelAnimationFrame(this.request);
+    this.job = null;
+    const {hand} = this;
+    this.hand = null;
+    if (hand) cancelAnimationFrame(hand.request);
+  }
+
+  release() {
+    const {hand} = this;
+    this.hand = null;
+    hand?.release();
+  }
+
+  metres(canvas, [x, y]) {
+    const view = this.player.view(canvas.clientWidth, canvas.clientHeight);
+    return [(x - view.x) / view.scale, (view.y - y) / view.scale];
+  }
+
+  /** Begin a record that a hand goes on with: of what was until now. */
+  begin(state) {
+    const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
+    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.data.engine.scales;
+    this.record = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+    this.append(state, state.violation);
+  }
+
+  /** Add one state to the record, and show it. */
+  append({t, q, v}, violation) {
+    const {record} = this;
+    record.ts.push(t);
+    record.q.push(...q);
+    record.v.push(...v);
+    record.violation.push(violation);
+    this.showRecord();
+    this.player.setEnd(Math.max(t, this.player.data.end));
+    this.player.t = t;
+    this.player.draw();
+  }
+
+  showRecord() {
+    const run = Object.fromEntries(Object.entries(this.record).map(([name, x]) => [name, Float64Array.from(x)]));
+    this.show({...run, count: run.ts.length});
+  }
+
+  /** Solve on from where the hand lets go, for as long as the first motion is. */
+  goOn(state) {
+    const {engine, first, record} = this, n = engine.size, times = first.ts.map(t => t - first.ts[0] + state.t);
+    const run = engine.run(this.values, state, times);
+    for (let k = 1; k < run.count; k++) {
+      record.ts.push(run.ts[k]);
+      record.q.push(...run.q.subarray(k * n, (k + 1) * n));
+      record.v.push(...run.v.subarray(k * n, (k + 1) * n));
+      record.violation.push(run.violation[k]);
+    }
+    this.showRecord();
+    this.player.setEnd(record.ts[record.ts.length - 1]);
+    this.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
+    this.player.play();
+  }
+
+  // Pictures
+
+  paintGhost(painter, context, t) {
+    if (!this.changed || !this.player.show.ghost) return;
+    painter.pose = this.ghost.pose(Math.min(t, this.first.end));
+    context.globalAlpha = GHOST;
+    painter.draw(this.ghost.symbols);
+    context.globalAlpha = 1;
+  }
+
+  paintHand(painter) {
+    const {hand} = this;
+    if (!hand) return;
+    const from = painter.px(place(painter.pose, [hand.held.body, ...hand.held.point])), to = painter.px(hand.target);
+    painter.line([from, to], 1.6, painter.theme.accent, {dash: [5, 3]});
+    painter.circle(from, 3.2 * painter.pt, {fill: painter.theme.accent});
+    painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
+  }
+
+  /** What the whole view shows: all that is drawn of the motion as it is now. */
+  fit() {
+    const {bounds} = this.player.data, run = this.run, box = [Infinity, Infinity, -Infinity, -Infinity];
+    this.first.bounds ??= bounds.slice();
+    const anchors = run.marks.flatMap(m => {
+      const [x0, y0] = m.at ?? [0, 0];
+      return m.body === undefined ? [] : (m.points ?? [[0, 0]]).map(([x, y]) => [m.body, x0 + x, y0 + y]);
+    });
+    const stride = Math.max(1, Math.floor(run.ts.length / FITTED));
+    for (let i = 0; i < run.ts.length; i += stride) {
+      const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
+      for (const anchor of anchors) {
+        const [x, y] = place(pose, anchor);
+        box.splice(0, 4, Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y));
+      }
+    }
+    const least = 0.1 * this.data.engine.scales.length;  // a single bar on a line has no height
+    const grow = [0, 1].map(k => Math.max(0, least - (box[k + 2] - box[k]) / 2));
+    const now = [box[0] - grow[0], box[1] - grow[1], box[2] + grow[0], box[3] + grow[1]];
+    bounds.splice(0, 4, ...(this.changed ? now : this.first.bounds));
+  }
+
+  // The address
+
+  numbersInWords() {
+    const pairs = this.data.sliders.map((s, k) => [s.name, this.values[k]]).filter(([, x], k) => x !== this.data.sliders[k].value);
+    return new URLSearchParams(pairs.map(([name, x]) => [name, String(x)])).toString();
+  }
+
+  /** Whether the page has an address of its own: not within another page. */
+  get hasAddress() { return Boolean(this.player.options.fill) && location.protocol !== "about:"; }
+
+  writeAddress() {
+    if (this.hasAddress) history.replaceState(null, "", `#${this.numbersInWords()}`);
+  }
+
+  readAddress() {
+    if (!this.hasAddress) return;
+    const given = new URLSearchParams(location.hash.slice(1));
+    let any = false;
+    this.data.sliders.forEach((slider, k) => {
+      const value = Number(given.get(slider.name));
+      if (!given.has(slider.name) || !Number.isFinite(value)) return;
+      this.values[k] = value;
+      any = true;
+    });
+    if (!any) return;
+    this.panel.show(this.values);
+    this.solve();
+  }
+
+  async share() {
+    const words = this.numbersInWords();
+    this.writeAddress();
+    try {
+      await navigator.clipboard.writeText(this.hasAddress ? location.href : `#${words}`);
+      this.say("The address with these numbers is copied.");
+    } catch {
+      this.say(this.hasAddress ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+    }
+  }
+}
+
 
 // The player's elements, what they do, and how they look.
 
@@ -558,10 +1328,12 @@ class Player {
     this.buttons.names = toggle("names", "Names", "N");
     this.panels = this.runs.map((run, k) => this.panel(run, k));
     this.stage = make("div", {class: "stage"}, ...this.panels.map(p => p.figure));
+    this.live = data.live ? new Live(this, data) : null;
+    const middle = this.live ? make("div", {class: "middle"}, this.stage, this.live.panel.element) : this.stage;
     this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
-      make("dl", {}, ...HELP.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
+      make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
     const groups = [this.playButton, this.timeLabel, this.scrub, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
-      ...Object.values(this.buttons))];
+      ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button))];
     if (this.modes) {
       const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
         oninput: () => { this.amplitude = +range.value; this.draw(); }});
@@ -571,9 +1343,9 @@ class Player {
       make("header", {}, make("h1", {title: data.title}, data.title),
         this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
         this.button("?", "keys", () => this.toggleHelp(), "icon")),
-      this.stage, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+      middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
-    shadow.replaceChildren(make("style", {}, STYLE), this.root);
+    shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);
     this.setPlaying(false);
   }
@@ -614,6 +1386,7 @@ class Player {
 
   whole() {
     this.zoom = {factor: 1, x: 0, y: 0};
+    this.live?.fit();
     this.draw();
   }
 
@@ -666,6 +1439,12 @@ class Player {
     this.tell();
   }
 
+  /** The end of the timeline. */
+  setEnd(end) {
+    this.data.end = end;
+    this.t = Math.min(this.t, end);
+  }
+
   advance(seconds) {
     const {start, end} = this.data;
     let t = this.t + seconds * this.speed;
@@ -712,7 +1491,7 @@ class Player {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+    if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.composedPath()[0].tagName) && event.composedPath()[0] !== this.scrub) return;
     const {start, end} = this.data, step = event.shiftKey ? (end - start) / 20 : this.speed / 30;
     const speeds = [...this.speedSelect.options].map(o => +o.value), at = speeds.indexOf(this.speed);
     const actions = {
@@ -720,7 +1499,7 @@ class Player {
       Home: () => this.seek(start), End: () => this.seek(end), 0: () => this.whole(), "?": () => this.toggleHelp(),
       "+": () => this.setSpeed(speeds[Math.min(at + 1, speeds.length - 1)]), "-": () => this.setSpeed(speeds[Math.max(at - 1, 0)]),
       t: () => this.toggle("traces"), n: () => this.toggle("names"), r: () => this.toggle("reactions"), l: () => this.toggle("loop"),
-      d: () => this.switchTheme(), Escape: () => { this.help.hidden = true; },
+      d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), Escape: () => { this.help.hidden = true; },
     };
     const action = actions[event.key] ?? actions[event.key.toLowerCase()];
     if (!action || (event.key === " " && event.target.tagName === "BUTTON")) return;  // a button takes the space bar itself
@@ -764,18 +1543,24 @@ class Player {
     return {scale, x: width / 2 - scale * (left + right) / 2 + this.zoom.x, y: height / 2 + scale * (bottom + top) / 2 + this.zoom.y};
   }
 
+  /** What paints on a panel's canvas. */
+  painter(canvas, context = null) {
+    const {clientWidth: width, clientHeight: height} = canvas, pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
+    return new SymbolPainter(context, this.view(width, height), this.theme, pt, null);
+  }
+
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
     for (const {run, canvas} of this.panels) {
       const {context, width, height} = this.context(canvas);
       if (!width || !height) continue;
-      const view = this.view(width, height), pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
-      const painter = new SymbolPainter(context, view, theme, pt, null);
-      const step = painter.grid(width, height);
+      const painter = this.painter(canvas, context), step = painter.grid(width, height);
+      this.live?.paintGhost(painter, context, t);
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
+      this.live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);
       painter.bar(step, height);
@@ -829,6 +1614,7 @@ function mount(element, data, options = {}) {
       const {clientWidth, clientHeight} = player.panels[panel].canvas, view = player.view(clientWidth, clientHeight);
       return [view.x + view.scale * x, view.y - view.scale * y];
     },
+    get live() { return player.live; },
     on: listener => player.on(() => listener(handle)),
     destroy: () => player.destroy(),
   };

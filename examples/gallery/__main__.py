@@ -14,7 +14,9 @@ from importlib import import_module
 from pathlib import Path
 
 NAMES = (
+    "four_bar",
     "five_bar",
+    "parallelogram",
     "excavator",
     "jansen_leg",
     "peaucellier",
@@ -80,7 +82,7 @@ def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
         "lines of the drawing": float(len(lines)),
         "largest violation of a constraint (m or rad)": float(np.abs(udk.violation(mech, sol)).max()),
     }
-    return "\n".join(words), (facts, {"motion": udk.animate(mech, sol)})
+    return "\n".join(words), (facts, {"motion": udk.animate(mech, sol, live=True)})
 
 
 def share_player(player: Path) -> None:
@@ -110,7 +112,8 @@ def page(examples: list[dict]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Each picture opens a player. `python -m examples.gallery` makes them all; the scripts are in `examples/gallery`,",
+        "Each picture opens a player. Those of single runs are live: sliders change numbers, a hand pulls at bodies, and the",
+        "page solves the motion anew. `python -m examples.gallery` makes them all; the scripts are in `examples/gallery`,",
         "the drawings in `examples/drawings`.",
         "",
     ]

@@ -11,6 +11,7 @@ from udkjax.show.style import COLOURS, plain
 
 LOW, HIGH = 0.25, 0.40  # m: the radii of the cam
 RATE = 2.0  # rad/s
+LIVE = ["driver.motor.motion.coefficients", "gravity[1]", "body.follower.mass", "body.cam.inertia"]  # what its page changes
 
 
 def radius(angle):
@@ -44,7 +45,7 @@ def make():
         "lift (m)": float(np.ptp(lift)),
         "largest difference from the law that was meant (m)": float(np.abs(lift - radius(np.pi / 2 - turned)).max()),
     }
-    return facts, {"motion": udk.animate(mech, sol, measures={"radius (m)": lift}, traces=()), "lift": figure}
+    return facts, {"motion": udk.animate(mech, sol, measures={"radius (m)": lift}, traces=(), live=LIVE), "lift": figure}
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ def make():
     plots.draw_reactions(figure.subplots(), sol.ts, loads)
     energy = np.asarray(udk.energy(mech, sol).total)
     facts = {"energy that the dampers took (J)": float(energy[0] - energy[-1])}
-    return facts, {"motion": udk.animate(mech, sol, measures=("energy",), reactions=True), "forces": figure}
+    return facts, {"motion": udk.animate(mech, sol, measures=("energy",), reactions=True, live=True), "forces": figure}
 
 
 if __name__ == "__main__":

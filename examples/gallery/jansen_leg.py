@@ -73,7 +73,7 @@ def make():
         "the foot comes back to where it was within (m)": float(np.abs(walk[-1] - walk[0]).max()),
     }
     sol = udk.simulate(mech, ts)
-    animation = udk.animate(mech, sol, measures={"height of the foot (m)": walk[:, 1]}, traces=("F", "E"))
+    animation = udk.animate(mech, sol, measures={"height of the foot (m)": walk[:, 1]}, traces=("F", "E"), live=True)
     return facts, {"motion": animation, "paths": figure}
 
 

@@ -21,7 +21,9 @@ def make():
         "largest distance of D from its line (m)": float(np.abs(corner - line).max()),
         "length of the line that it draws (m)": float(np.ptp(y + 0.5 * SIDE * np.sin(angle))),
     }
-    return facts, {"motion": udk.animate(mech, sol, measures={"x of D (m)": corner, "energy": None}, traces=("D", "C1"))}
+    return facts, {
+        "motion": udk.animate(mech, sol, measures={"x of D (m)": corner, "energy": None}, traces=("D", "C1"), live=True)
+    }
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ def make():
     v = np.asarray(sol.v)[:, :, 2]
     ratio = v[-1, mech.body_names.index("carrier")] / v[-1, mech.body_names.index("sun")]
     facts = {"carrier / sun": float(ratio), "sun / (sun + ring)": SUN / (SUN + SUN + 2 * PLANET)}
-    return facts, {"motion": udk.animate(mech, sol, measures=("rank", "energy"))}
+    return facts, {"motion": udk.animate(mech, sol, measures=("energy",), live=True)}
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ def make():
         "degrees of freedom": float(found.degrees_of_freedom or 0),
         "largest change of energy (J)": float(np.abs(parts.total - parts.total[0]).max()),
     }
-    return facts, {"motion": udk.animate(mech, sol, measures=("rank", "energy"), traces=("head",)), "energy": figure}
+    return facts, {"motion": udk.animate(mech, sol, measures=("energy",), traces=("head",), live=True), "energy": figure}
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from examples.gallery import __main__ as gallery
 
 ROOT = Path(__file__).parents[2]
 FACTS = {  # of each example, what must be true of the numbers that it prints
+    "four_bar": lambda torque, back: 0.01 < torque < 10 and back < 1e-6,
+    "parallelogram": lambda violation, energy: violation < 1e-12 and energy < 1e-5,
     "five_bar": lambda projected, rate: projected < 1e-12 and rate < 0.05,
     "excavator": lambda taken: taken > 0,
     "jansen_leg": lambda flat, step, back: 0.4 < flat < 0.7 and step > 0.5 and back < 1e-9,
@@ -21,7 +23,7 @@ FACTS = {  # of each example, what must be true of the numbers that it prints
     "double_pendulum_map": lambda members, over, calm, failed: members == 2500 and over > 0.1 and calm == 0 and failed == 0,
     "neural_friction": lambda after, before, law: after < 0.1 * before and law < 0.4,
 }
-FAST = ("peaucellier",)
+FAST = ("four_bar",)
 
 
 def test_every_script_is_in_the_gallery_and_is_tested():

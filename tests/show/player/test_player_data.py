@@ -77,9 +77,10 @@ def test_a_cams_outline_is_its_profile():
         {"cam": udk.Cam(("cam", "follower"), [(0.2, 0), (0, 0)], profile)},
     )
     (outline,) = (mark for mark in marks(mech, mech.q0[None]) if mark["kind"] == "outline")
+    assert outline["at"] == [0.2, 0.0]
     x, y = np.array(outline["points"]).T
-    expected = 0.5 + 0.1 * np.cos(np.arctan2(y, x - 0.2))
-    np.testing.assert_allclose(np.hypot(x - 0.2, y), expected, atol=1e-4)  # the spline is within 1e-4 of the cosine
+    expected = 0.5 + 0.1 * np.cos(np.arctan2(y, x))
+    np.testing.assert_allclose(np.hypot(x, y), expected, atol=1e-4)  # the spline is within 1e-4 of the cosine
 
 
 def test_a_rod_that_hangs_by_its_end_is_drawn_to_its_other_end():

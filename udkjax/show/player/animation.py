@@ -136,7 +136,8 @@ def animate(
         title: by default the mechanism's name.
         live: numbers that the page changes by sliders, by their names (`parameters()`), whole or one entry: the motion is closed
             and solved anew in the page, which a hand can pull at, too. {"pin.B[0]": (0.5, 2.0)} gives a slider its range; True
-            takes every number of the scene. Of one run, by default ten seconds; "rank" is not among its measures.
+            takes every number of the scene. Of one run, by default ten seconds. Its measures are violation, energy and effort,
+            which the page finds anew, behind those of your own, which it shows of the first motion alone; "rank" is none.
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
@@ -180,10 +181,10 @@ def _live_run(
     one = require_mechanism(one)
     if run is None:
         run = simulate(one, np.linspace(0.0, LIVE_SECONDS, LIVE_INSTANTS), throw=False)
-    wanted = [name for name in measures if name != "rank"]
-    if one.driver_names and "effort" not in wanted:
-        wanted.append("effort")
-    return one, run, {name: measures.get(name) if isinstance(measures, Mapping) else None for name in wanted}
+    given: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
+    efforts = ["effort"] if one.driver_names else []
+    wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # what the page finds anew, too
+    return one, run, {name: given.get(name) for name in wanted if name != "rank"}
 
 
 @checked

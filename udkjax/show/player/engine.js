@@ -4,7 +4,7 @@
 //   engine.parameters                          a list of {name, unit, value}
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
-//   engine.run(parameters, state, times, pull) -> {ts, q, v, violation, count, done, words, t, steps, last: {t, q, v}}
+//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
 //   engine.measure(parameters, run, efforts)   -> {kinetic, potential, efforts: {driver: values}}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
@@ -137,16 +137,17 @@ class Engine {
    *
    *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
    *  that of the ground (m), stiffness (N/m) and damping (N s/m).
+   *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
    *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; and the `last` state.
    */
-  run(parameters, state, times, pull = null) {
+  run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
     if (data.why) throw new Error(data.why);
     if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
     const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
     const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
-    const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega});
+    const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega, max_steps: limit});
     const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0]), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
       samples: this.samples};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
@@ -155,9 +156,9 @@ class Engine {
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
     const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
     if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
-    const last = {t: ended.t, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
+    const limited = ended.code === 2, last = {t: ended.t, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
     return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
-      steps: ended.accepted, last};
+      steps: ended.accepted, tried: ended.tried, limited, last};
   }
 
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m). */

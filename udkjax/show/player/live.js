@@ -9,6 +9,9 @@ import {SliderPanel} from "./sliders.js";
 const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
 const GHOST = 0.28;  // how much one sees of the first motion
 const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
+// Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
+// same numbers give the same motion.
+const STEP_BYTES = 6e7;
 const FITTED = 300;  // instants that the whole view is fitted to
 const SETTLED = 150;  // ms without a change until the address says the numbers
 
@@ -18,11 +21,13 @@ export class Live {
     this.data = data.live;
     this.run = player.runs[0];
     this.ghost = new Run(data.runs[0]);
-    this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame};
+    this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame,
+      reactions: this.run.reactions};
     this.follower = new Follower(this.run, this.data.follow);
     this.values = Float64Array.from(this.data.sliders, s => s.value);
     this.changed = this.dirty = false;
-    this.hand = null;
+    this.hand = this.job = null;
+    this.steps = Math.round(STEP_BYTES / this.data.engine.modules.run.bytes);  // of one picture
     this.solving = 0;  // ms, of the last motion
     this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
       ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
@@ -86,6 +91,7 @@ export class Live {
     this.panel.show(this.values);
     const {ts, q, v, measures, end, frame} = this.first;
     this.run.replace(ts, q, v, measures, frame);
+    this.showReactions(this.first.reactions);
     this.follower.follow(this.engine.numbers(null));
     this.player.setEnd(end);
     this.changed = this.dirty = false;
@@ -97,19 +103,17 @@ export class Live {
   // Motion
 
   solve() {
-    const start = performance.now(), {engine, first, values} = this;
+    const {engine, first, values} = this;
     this.dirty = false;
     this.drop();
-    const state = engine.close(values, {t: first.ts[0], ...this.data.start});
+    const start = performance.now(), state = engine.close(values, {t: first.ts[0], ...this.data.start});
     if (state.closed) {
-      const run = engine.run(values, state, first.ts);
+      const T = first.ts.length, n = engine.size;
+      const run = {ts: first.ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+      this.job = {run, state, rank: state.rank, from: 0, steps: 0, tried: 0, start};
       this.follower.follow(engine.numbers(values));
       this.player.setEnd(first.end);
-      this.show(run);
-      const ended = run.done ? "" : `The motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
-      const freedoms = engine.size - state.rank, usual = engine.size - this.data.engine.rank;
-      const rank = freedoms === usual ? "" : ` ${freedoms} degrees of freedom here, ${usual} at first.`;
-      this.say(ended + rank || this.timing(start, run), !run.done);
+      this.goAhead();
     } else {
       const gap = this.lengthOf(state.violation);
       this.say(`The loops do not close with these numbers: they stay open by ${gap}. The last motion that does is shown.`, true);
@@ -117,10 +121,32 @@ export class Live {
     this.player.draw();
   }
 
-  timing(start, run) {
-    this.solving = performance.now() - start;
+  /** Solve on for as many steps as fit into one picture, and so on until the end: the first motion that is whole stays. */
+  goAhead() {
+    const {engine, job} = this, {run, from} = job, n = engine.size;
+    const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
+    const part = engine.run(this.values, job.state, times, null, Math.min(this.steps, this.data.engine.settings.max_steps - job.tried));
+    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0);
+    run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
+    run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
+    run.violation.set(part.violation.subarray(skip, skip + count), from);
+    run.count = job.from = from + count;
+    job.steps += part.steps;
+    job.tried += part.tried;
+    job.state = part.last;
+    this.show(run);
     const span = run.ts[run.ts.length - 1] - run.ts[0];
-    return `${+span.toPrecision(3)} s solved anew in ${this.solving.toFixed(1)} ms, ${run.steps} steps.`;
+    if (part.limited && job.tried < this.data.engine.settings.max_steps) {
+      this.say(`Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`);
+      this.request = requestAnimationFrame(() => { this.goAhead(); this.player.draw(); });
+      return;
+    }
+    this.solving = performance.now() - job.start;
+    const freedoms = n - job.rank, usual = n - this.data.engine.rank;
+    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${this.solving.toFixed(1)} ms, ${job.steps} steps.`
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    this.say(freedoms === usual ? ended : `${ended} ${freedoms} degrees of freedom here, ${usual} at first.`, !part.done);
+    this.job = null;
   }
 
   lengthOf(violation) { return `${(violation * this.data.engine.scales.length).toPrecision(2)} m`; }
@@ -129,7 +155,14 @@ export class Live {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
     const part = {...run, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     this.run.replace(part.ts, part.q, part.v, this.measures(part), 1);
+    this.showReactions(null);  // those of the first motion are none of this one
     this.changed = true;
+  }
+
+  showReactions(reactions) {
+    this.run.reactions = reactions;
+    const button = this.player.buttons.reactions;
+    if (button) button.disabled = !reactions;
   }
 
   /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
@@ -139,7 +172,7 @@ export class Live {
     const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
       "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
-    return this.first.measures.filter(m => m.name in known).map(m => ({...m, values: known[m.name]}));
+    return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
   }
 
   // The hand
@@ -162,6 +195,7 @@ export class Live {
     const held = this.bodyAt(canvas, point, pointer);
     if (!held) return false;
     if (this.dirty) this.solve();
+    while (this.job) this.goAhead();
     this.player.pause();
     this.hand = new Hand(this, held, this.metres(canvas, point));
     return true;
@@ -170,6 +204,8 @@ export class Live {
   move(canvas, point) { this.hand?.move(this.metres(canvas, point)); }
 
   drop() {
+    cancelAnimationFrame(this.request);
+    this.job = null;
     const {hand} = this;
     this.hand = null;
     if (hand) cancelAnimationFrame(hand.request);
@@ -252,7 +288,10 @@ export class Live {
   fit() {
     const {bounds} = this.player.data, run = this.run, box = [Infinity, Infinity, -Infinity, -Infinity];
     this.first.bounds ??= bounds.slice();
-    const anchors = run.marks.flatMap(m => (m.points ?? [m.at]).filter(Boolean).map(([x, y]) => [m.body ?? -1, x, y]));
+    const anchors = run.marks.flatMap(m => {
+      const [x0, y0] = m.at ?? [0, 0];
+      return m.body === undefined ? [] : (m.points ?? [[0, 0]]).map(([x, y]) => [m.body, x0 + x, y0 + y]);
+    });
     const stride = Math.max(1, Math.floor(run.ts.length / FITTED));
     for (let i = 0; i < run.ts.length; i += stride) {
       const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
@@ -274,15 +313,15 @@ export class Live {
     return new URLSearchParams(pairs.map(([name, x]) => [name, String(x)])).toString();
   }
 
+  /** Whether the page has an address of its own: not within another page. */
+  get hasAddress() { return Boolean(this.player.options.fill) && location.protocol !== "about:"; }
+
   writeAddress() {
-    if (!this.player.options.fill) return;
-    try {
-      history.replaceState(null, "", `#${this.numbersInWords()}`);
-    } catch { /* a page within another has no address of its own */ }
+    if (this.hasAddress) history.replaceState(null, "", `#${this.numbersInWords()}`);
   }
 
   readAddress() {
-    if (!this.player.options.fill) return;
+    if (!this.hasAddress) return;
     const given = new URLSearchParams(location.hash.slice(1));
     let any = false;
     this.data.sliders.forEach((slider, k) => {
@@ -300,10 +339,10 @@ export class Live {
     const words = this.numbersInWords();
     this.writeAddress();
     try {
-      await navigator.clipboard.writeText(this.player.options.fill ? location.href : `#${words}`);
+      await navigator.clipboard.writeText(this.hasAddress ? location.href : `#${words}`);
       this.say("The address with these numbers is copied.");
     } catch {
-      this.say(this.player.options.fill ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+      this.say(this.hasAddress ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
     }
   }
 }

@@ -1,7 +1,7 @@
 """What a live page has besides: the engine of its mechanism, sliders, and how its symbols follow what they change.
 
 live     engine (udkjax/integrate/portable), sliders (live_parameters.py), follow (followers.py), start: the state that closing
-         begins with, or null where that is the scene's own guess; work: the name of the measure of energy
+         begins with, or null where that is the scene's own guess
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from udkjax.equations import analyse
+from udkjax.integrate.assembly import close
 from udkjax.integrate.portable import portable_engine
+from udkjax.native.program import UnsupportedError
 from udkjax.scene import Mechanism
 from udkjax.scene.requirements import ArgumentError
 from udkjax.show.player.followers import followers
@@ -30,7 +32,10 @@ def live_data(mechanism: Mechanism, solution: ShownMotion, record: Mapping, symb
     if getattr(solution, "events", None) is not None:
         raise ArgumentError("live: a run with events cannot be solved anew in a page; leave out live, or the events")
     sliders = sliders_of(mechanism, live)
-    engine = portable_engine(mechanism, [slider.name for slider in sliders])
+    try:
+        engine = portable_engine(mechanism, [slider.name for slider in sliders])
+    except UnsupportedError as error:
+        raise ArgumentError(f"live: a page has no instruction for {error}: name the numbers to change, without those") from None
     if engine.data["why"]:
         raise ArgumentError(f"live: a page cannot solve the motion anew: {engine.data['why']}")
     return {
@@ -43,8 +48,6 @@ def live_data(mechanism: Mechanism, solution: ShownMotion, record: Mapping, symb
 
 def _start(mechanism: Mechanism, solution: ShownMotion) -> Json | None:
     """Return the initial state of a run that does not begin where the scene says."""
-    from udkjax.integrate.assembly import close
-
     t = float(np.asarray(solution.ts)[0])
     q, v = (np.asarray(x, float)[0] for x in (solution.q, solution.v))
     closed, scales = close(mechanism, t).state, analyse(mechanism).scales

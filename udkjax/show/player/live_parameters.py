@@ -66,6 +66,8 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
     length, rate = float(scales.length), float(scales.rate) or 1.0
     found = []
     for name, value in scalar_parameters(mechanism, wanted).items():
+        if wanted is None and ".profile." in name:  # the outline of a cam is drawn as it was
+            continue
         given = ranges.get(name) or ranges.get(_base(name))
         unit = units_of(mechanism, name)
         low, high = given or usual_range(name, unit, value, length, rate)

@@ -6,7 +6,7 @@ mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How each kind is d
     link      body, points, closed          a bar through the points that hold a body, or a plate
     disc      body, at, radius              a body that has no other shape: a disc of its radius of gyration
     wheel     body, at, radius, internal    a gear's or a pinion's pitch circle
-    outline   body, points                  a cam's profile
+    outline   body, at, points              a cam's profile; its points are relative to `at`
     rail      body, at, axis, span, slot    the line of a prismatic joint or a slot, as far as it is used (m along `axis`)
     rack      body, at, axis, span          a rack's pitch line
     block     body, at, axis                what slides on a rail
@@ -175,8 +175,8 @@ class _Drawing:
             case Cam():
                 angle = np.linspace(0.0, 2 * np.pi, PROFILE_POINTS, endpoint=False)
                 radius = np.asarray(jax.vmap(joint.profile)(jax.numpy.asarray(angle)))
-                rim = np.asarray(joint.points)[0] + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-                self.wheels.append({"kind": "outline", "body": self.number[joint.bodies[0]], "points": rim.tolist()})
+                rim = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+                self.wheels.append({"kind": "outline", **self._at(joint.bodies[0], joint.points[0]), "points": rim.tolist()})
                 self.elements.append({"kind": "roller", **self._at(joint.bodies[1], joint.points[1])})
                 self.shaped.add(joint.bodies[0])
             case _ if (points := getattr(joint, "points", None)) is not None and len(joint.bodies) == 2:

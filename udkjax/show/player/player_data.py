@@ -221,7 +221,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
         elif "at" in mark:
             hold(mark["body"], mark["at"], mark.get("radius", 0.0))
         for point in mark.get("points", []):
-            hold(mark["body"], point)
+            hold(mark["body"], np.add(point, mark.get("at", (0.0, 0.0))))
         for k, x, y in (mark[end] for end in ("a", "b") if end in mark):
             hold(int(k), (x, y))
     for k in range(len(mechanism.bodies)):

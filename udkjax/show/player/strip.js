@@ -14,7 +14,7 @@ export function drawStrip(context, width, height, runs, name, start, end, t, the
     if (Number.isFinite(y)) { low = Math.min(low, scaled(y)); high = Math.max(high, scaled(y)); }
   }
   const painter = new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null);
-  if (!(high >= low)) return painter.text("no values", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
+  if (!(high >= low)) return painter.text("no values of this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   const least = log ? 3 : 1e-12 * Math.max(Math.abs(low), Math.abs(high)) || 1;
   if (high - low < least) { low -= least / 2; high += least / 2; }
   const x = time => left + (right - left) * (time - start) / (end - start || 1);

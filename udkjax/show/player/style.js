@@ -32,6 +32,7 @@ button, select { font: inherit; font-size: 13px; color: var(--ink); background: 
   height: 32px; padding: 0 8px; margin: 0; cursor: pointer; }
 button:hover, select:hover { background: color-mix(in srgb, var(--ink) 8%, transparent); }
 button[aria-pressed="true"] { color: var(--accent); background: color-mix(in srgb, var(--accent) 14%, transparent); }
+button:disabled { opacity: 0.5; cursor: default; }
 option { color: #111; background: #fff; }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 button svg { display: block; width: 18px; height: 18px; fill: currentColor; }

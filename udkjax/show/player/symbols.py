@@ -97,7 +97,7 @@ def _wheel(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 
 def _outline(mark: Mark, unit: float) -> Iterator[Symbol]:
-    yield _line([mark["body"], 0, 0, 0, 1], mark["points"], _edge(mark["body"]), 1.6, _tint(mark["body"]), True)
+    yield _line(_at(mark), mark["points"], _edge(mark["body"]), 1.6, _tint(mark["body"]), True)
 
 
 def _rail(mark: Mark, unit: float) -> Iterator[Symbol]:

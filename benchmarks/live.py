@@ -1,0 +1,127 @@
+"""Live pages: the size of the engine of each scene of the library, how long it takes to make, how fast a page solves and draws.
+
+A run of 401 states in headless Chromium beside the same run by the engine on this processor, in the same minute; and the time
+from a slider that moves to the picture, of 120 moves, one for each frame of the screen.
+"""
+
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import udkjax as udk
+from benchmarks.common import machine, report
+from udkjax.integrate import native_engine
+
+CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
+SPANS = {"andrews_squeezer": 0.03}  # s; of all others
+SPAN = 20.0
+RUNS, MOVES = 30, 120
+PLAYER = "document.getElementById('player').player"
+IN_PAGE = """async ([runs, moves]) => {
+  const {live} = PLAYER, {engine, values, first} = live, times = [], delays = [], frames = [];
+  await live.ready;
+  const state = engine.close(values, {t: first.ts[0]}), median = x => [...x].sort((a, b) => a - b)[x.length >> 1];
+  for (let k = 0; k < runs + 10; k++) {
+    const start = performance.now();
+    engine.run(values, state, first.ts);
+    if (k >= 10) times.push(performance.now() - start);
+  }
+  const {range, slider: {value, low, high}} = live.panel.rows[0], frame = () => new Promise(done => requestAnimationFrame(done));
+  let before = await frame();
+  for (let k = 0; k < moves; k++) {
+    range.value = value + 0.05 * (high - low) * Math.sin(k / 9);
+    const start = performance.now();
+    range.dispatchEvent(new Event("input"));
+    const now = await frame();
+    await new Promise(done => setTimeout(done));
+    delays.push(performance.now() - start);
+    frames.push(now - before);
+    before = now;
+  }
+  return [median(times), median(delays), Math.max(...delays), median(frames)];
+}""".replace("PLAYER", PLAYER)
+
+
+def made(name: str, folder: Path) -> tuple[dict[str, Any], Path, Any]:
+    """Return what making the page of a scene takes, the page, and a run by the engine on this processor."""
+    mechanism, seen = getattr(udk.library, name)(), []
+    run = native_engine.call_known
+
+    def known(operation: Any, inputs: Any, times: int) -> Any:
+        seen.append(lambda: run(operation, inputs, times))
+        return run(operation, inputs, times)
+
+    native_engine.call_known = known
+    try:
+        solution = udk.simulate(mechanism, np.linspace(0.0, SPANS.get(name, SPAN), 401), throw=False)
+    finally:
+        native_engine.call_known = run
+    start = time.perf_counter()
+    animation = udk.animate(mechanism, solution, live=True)
+    seconds = time.perf_counter() - start
+    page = animation.save(folder / f"{name}.html")
+    modules = animation.data["live"]["engine"]["modules"]
+    size = {"module_bytes": modules["run"]["bytes"], "page_bytes": page.stat().st_size, "seconds": seconds}
+    return {"name": name, **size}, page, seen[0]
+
+
+def native_ms(run: Any) -> float:
+    """Return the median time (ms) of a run by the engine on this processor."""
+    times = []
+    for _ in range(RUNS):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times)
+
+
+def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+    """Measure, print a line for each scene, and write the figures."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        print("    playwright is not installed: sizes alone")
+        sync_playwright = None
+    path = next((path for path in CHROMIUM if Path(path).exists()), None)
+    rows = []
+    names = ["simple_pendulum"] if smoke else sorted(udk.library.__all__)
+    with tempfile.TemporaryDirectory() as folder:
+        pages = [made(name, Path(folder)) for name in names]
+        if sync_playwright is None or path is None:
+            rows = [row for row, _, _ in pages]
+        else:
+            with sync_playwright() as tools:
+                browser = tools.chromium.launch(executable_path=path, args=["--no-sandbox"])
+                for row, file, run in pages:
+                    page = browser.new_page(viewport={"width": 1280, "height": 800})
+                    page.goto(file.as_uri())
+                    page.wait_for_timeout(500)  # until its engine is loaded
+                    counts = [3, 5] if smoke else [RUNS, MOVES]
+                    run_ms, picture_ms, worst_ms, frame_ms = page.evaluate(IN_PAGE, counts)
+                    page.close()
+                    found = {"run_ms": run_ms, "native_ms": native_ms(run), "picture_ms": picture_ms}
+                    rows.append(row | found | {"worst_picture_ms": worst_ms, "frame_ms": frame_ms})
+                    show(rows[-1])
+                browser.close()
+    if out:
+        report(machine(), rows, out)
+    return rows
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print the figures of a scene."""
+    sizes = f"run {row['module_bytes'] / 1e3:.0f} kB, page {row['page_bytes'] / 1e3:.0f} kB, made in {row['seconds']:.1f} s"
+    runs = f"run {row['run_ms']:.2f} ms, native {row['native_ms']:.2f} ms"
+    pictures = (
+        f"slider to picture {row['picture_ms']:.0f} ms, at worst {row['worst_picture_ms']:.0f}, frame {row['frame_ms']:.1f} ms"
+    )
+    print(f"    {row['name']:20} {sizes}; {runs}; {pictures}")
+
+
+if __name__ == "__main__":
+    print(json.dumps(main()))

@@ -1,0 +1,39 @@
+"""A four-bar linkage of five pins, live: its pins and the speed of its motor by sliders, and a hand that pulls at its bodies.
+
+The drawing is that of the README. Where the loops cannot be closed, or the motor cannot go on, the page says so.
+"""
+
+import numpy as np
+
+import udkjax as udk
+
+LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # what its page changes
+
+
+def make():
+    """Return what the motor has to do, and the player."""
+    drawing = udk.Drawing(
+        pins={"O": (0, 0), "A": (30, 40), "B": (120, 90), "P": (60, 120), "C": (100, 0)},  # mm
+        links={
+            "crank": {"pins": ["O", "A"], "density": 7850, "width": 15, "thickness": 5},
+            "coupler": {"pins": ["A", "B", "P"], "density": 7850, "thickness": 5},
+            "rocker": {"pins": ["C", "B"], "density": 7850, "width": 15, "thickness": 5},
+        },
+        ground=["O", "C"],
+        motors={"motor": {"pin": "O", "speed": "60 rpm"}},
+        units={"length": "mm"},
+        name="four-bar",
+    )
+    mech = drawing.mechanism()
+    sol = udk.simulate(mech, np.linspace(0.0, 2.0, 201))
+    facts = {
+        "largest torque of the motor (N m)": float(np.abs(udk.efforts(mech, sol)["motor"]).max()),
+        "after a turn the coupler is where it was, within (m)": float(np.abs(sol.q[100, 1, :2] - sol.q[0, 1, :2]).max()),
+    }
+    return facts, {"motion": udk.animate(mech, sol, traces=["P"], live=LIVE)}
+
+
+if __name__ == "__main__":
+    facts, shown = make()
+    print(facts)
+    shown["motion"].save("four_bar.html")

@@ -1,0 +1,34 @@
+"""The paper's linkage, live: one constraint is redundant as long as its three links are equal and parallel.
+
+Change the length of one of them, and no freedom is left: the page says that the loops do not close, or that nothing can move.
+"""
+
+import numpy as np
+
+import udkjax as udk
+
+LIVE = [  # what its page changes
+    "gravity",
+    "joint.A3.points[0]",
+    "joint.A3.points[1]",
+    *(f"body.{name}.mass" for name in ("link1", "link2", "link3", "coupler")),
+    "body.link1.angular_velocity",
+]
+
+
+def make():
+    """Return how well energy and loops are kept, and the player."""
+    mech = udk.library.parallelogram()
+    sol = udk.simulate(mech, np.linspace(0.0, 10.0, 401))
+    energy = np.asarray(udk.energy(mech, sol).total)
+    facts = {
+        "largest violation (m)": float(np.abs(udk.violation(mech, sol)).max()),
+        "largest change of energy (J)": float(np.abs(energy - energy[0]).max()),
+    }
+    return facts, {"motion": udk.animate(mech, sol, live=LIVE)}
+
+
+if __name__ == "__main__":
+    facts, shown = make()
+    print(facts)
+    shown["motion"].save("parallelogram.html")
