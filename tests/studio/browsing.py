@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 COMMAND = "from udkjax.cli import main; main()"
-PATIENCE = 60.0  # s for the server to compile and diagnose, on a machine that others use as well
+PATIENCE = 120.0  # s for the server to compile and diagnose, on a machine that others use as well
 
 
 class StudioPage:
@@ -65,6 +65,13 @@ class StudioPage:
         x, y = self.js(f"studio.canvas.places.get({json.dumps(name)})")
         return box["x"] + x, box["y"] + y
 
+    def link_end(self, index):
+        """Return where a link is on the screen, away from its first pin."""
+        box = self.page.locator("main canvas").bounding_box()
+        outline = f"studio.canvas.outlines.find(({{of}}) => of.kind === 'link' && of.index === {index}).points"
+        x, y = self.js(f"{outline}.at(-1)")
+        return box["x"] + x, box["y"] + y
+
     def click(self, x, y):
         self.page.mouse.click(*self.pixel(x, y))
         self.page.wait_for_timeout(30)
@@ -112,7 +119,7 @@ def studio_page(browser, address, folder, width=1280, height=800, **options):
     try:
         found = StudioPage(context.new_page(), address, folder)
         yield found
-        assert found.problems == []
+        assert found.problems == [], found.problems
         origin = address.partition("/#")[0]
         assert all(url.startswith((origin, "data:", "blob:")) for url in found.requests)
     finally:

@@ -55,7 +55,7 @@ def client(tmp_path):
     from udkjax.studio.folder import Folder
 
     worker = HereWorker()
-    app = application(Studio(Folder(tmp_path), worker, worker), PORT, TOKEN)  # pyright: ignore[reportArgumentType]
+    app = application(Studio(Folder(tmp_path), worker, worker, worker), PORT, TOKEN)  # pyright: ignore[reportArgumentType]
 
     def send(method, path, content=b"", headers=None, without=()):
         given = {"host": f"127.0.0.1:{PORT}", "x-studio-token": TOKEN, "origin": BASE, "content-type": "application/json"}

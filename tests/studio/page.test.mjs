@@ -35,7 +35,7 @@ test("links share pins, and are written in the file's unit", () => {
 test("an action without sense is a problem in words", () => {
   const found = fourBar();
   for (const result of [actions.drawLink(found, at(0, 0, "A"), at(0, 0, "A"), context), actions.drawLink(found, at(0, 0, "A"), at(0, 0, "B"), context),
-    actions.drawMotor(found, at(0.5, 0.5)), actions.drawGround(found, at(0.5, 0.5)), actions.drawSlide(found, at(1, 1), at(2, 1)), actions.drawSlot(found, at(1, 1), at(2, 1)),
+    actions.drawMotor(found, at(0.5, 0.5)), actions.drawGround(found, at(0.5, 0.5)), actions.drawSlide(found, at(1, 1), at(2, 1), context), actions.drawSlot(found, at(1, 1), at(2, 1)),
     actions.drawGear(found, at(0, 0, null, 0), at(0, 0, null, 0)), actions.drawCam(found, at(0, 0, "A"), at(1, 1)), actions.drawLoad(found, at(1, 1), at(2, 1), context),
     actions.drawSpring(found, at(0, 0, "A"), at(0.03, 0.04, "B")), actions.drawPlate(found, [at(0, 0), at(1, 1), at(2, 2)], context)]) {
     assert.equal(typeof result.problem, "string");
@@ -75,7 +75,7 @@ test("what is deleted takes with it what hangs on it, and nothing else", () => {
 });
 
 test("a slide goes with its motor, and names follow a renaming", () => {
-  let found = actions.drawSlide(fourBar(), at(0.12, 0.09, "C"), at(0.2, 0.09)).document;
+  let found = actions.drawSlide(fourBar(), at(0.12, 0.09, "C"), at(0.2, 0.09), context).document;
   const index = found.link.findIndex(link => link.pins.length === 1);
   found = actions.drawMotor(found, at(0, 0, null, index)).document;
   assert.equal(found.motor[1].slide, "slide1");

@@ -30,7 +30,7 @@ from udkjax.studio.worker import Worker
 
 Json = dict[str, Any]
 KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-PLACES = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", "."), "engine/": ("udkjax.native", "wasm")}
+PLACES = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}
 EXPORTS = (".html", ".svg", ".png", ".gif", ".dxf", ".csv", ".py")
 
 
@@ -39,25 +39,26 @@ class Studio:
 
     Args:
         folder: whose files are opened and saved.
-        compiler: the process that reads and compiles.
-        examiner: the one that diagnoses and exports, which takes longer.
+        reader: the process that reads and merges texts, which takes milliseconds.
+        compiler: the one that compiles engines.
+        examiner: the one that diagnoses and exports, which takes longest.
     """
 
-    def __init__(self, folder: Folder, compiler: Worker, examiner: Worker):
-        self.folder, self.compiler, self.examiner = folder, compiler, examiner
+    def __init__(self, folder: Folder, reader: Worker, compiler: Worker, examiner: Worker):
+        self.folder, self.reader, self.compiler, self.examiner = folder, reader, compiler, examiner
 
     def list(self, request: Json) -> Json:
         """Return the scene files of the folder, and the templates."""
-        templates = self.compiler.call("list_templates", {}, COMPILE_SECONDS)
+        templates = self.reader.call("list_templates", {}, COMPILE_SECONDS)
         return {"files": self.folder.list(), "folder": self.folder.root.name, **templates}
 
     def open(self, request: Json) -> Json:
         """Return the text of a file or of a template, and its tables."""
         if "template" in request:
-            opened = self.compiler.call("open_template", {"name": request["template"]}, COMPILE_SECONDS)
+            opened = self.reader.call("open_template", {"name": request["template"]}, COMPILE_SECONDS)
             return {**opened, "path": "", "revision": None}
         text, revision = self.folder.read(request.get("path"))
-        opened = self.compiler.call("open_text", {"text": text}, COMPILE_SECONDS)
+        opened = self.reader.call("open_text", {"text": text}, COMPILE_SECONDS)
         return {**opened, "path": request["path"], "revision": revision}
 
     def save(self, request: Json) -> Json:
@@ -76,7 +77,8 @@ class Studio:
         """Return a drawing's text and tables, its mistakes, and what the page needs to move it."""
         given = {key: request[key] for key in ("text", "document", "engine") if request.get(key) is not None}
         require_size(given.get("text"))
-        return self.compiler.call("compile_drawing", given, COMPILE_SECONDS)
+        worker = self.compiler if "engine" in given else self.reader
+        return worker.call("compile_drawing", given, COMPILE_SECONDS)
 
     def diagnose(self, request: Json) -> Json:
         """Return freedoms, redundant constraints with their fixes, and what else is found about a drawing."""

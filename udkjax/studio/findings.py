@@ -12,6 +12,7 @@ from udkjax.scene.joints import Revolute
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import force_curves
 from udkjax.study.diagnosis import Diagnosis, diagnose
+from udkjax.study.equilibrium import equilibrium
 from udkjax.study.kinematics import travel
 from udkjax.study.report import plural
 
@@ -25,9 +26,10 @@ def examine(mechanism: Mechanism, about: str) -> Json:
 
     Args:
         mechanism: the drawing's.
-        about: "structure" (freedoms, redundancy, reactions), "travel" (how far each motor turns), "dynamics" (curves).
+        about: "structure" (freedoms, redundancy, reactions), "travel" (how far each motor turns), "dynamics" (curves), or
+            "statics" (a position of rest).
     """
-    subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves}
+    subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves, "statics": rest}
     if about not in subjects:
         raise RefusedError(400, f"about: must be one of {', '.join(subjects)}")
     try:
@@ -86,6 +88,17 @@ def _why(found: Diagnosis, mechanism: Mechanism) -> str:
 
 def _names(names: list[str]) -> str:
     return ", ".join(names)
+
+
+def rest(mechanism: Mechanism) -> Json:
+    """Return the position of rest next to the drawn one, downhill if need be, and its frequencies (Hz)."""
+    found = equilibrium(mechanism, stable=True)
+    rates = [float(x) for x in np.asarray(found.omega2)]
+    return {
+        "q": np.asarray(found.q).ravel().tolist() if bool(found.balanced) else None,
+        "kind": found.kind,
+        "frequencies": [math.sqrt(x) / (2 * math.pi) for x in rates if x > 0],
+    }
 
 
 def motor_travel(mechanism: Mechanism) -> Json:

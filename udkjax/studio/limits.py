@@ -8,8 +8,8 @@ MOST_TEXT_CHARACTERS = 500_000  # of a scene file
 MOST_ELEMENTS = 1_000  # of a drawing; an excavator has 30, and pins are compared two by two
 MOST_LISTED = 500  # files of a folder
 MOST_FOLDERS_DEEP = 3
-COMPILE_SECONDS = 30.0  # for reading and compiling one drawing, which takes 0.2 to 2 s
-DIAGNOSE_SECONDS = 60.0
+COMPILE_SECONDS = 60.0  # for reading and compiling one drawing, which takes 0.2 to 4 s where nothing else runs
+DIAGNOSE_SECONDS = 120.0  # 0.1 to 8 s
 EXPORT_SECONDS = 300.0  # a film is drawn frame by frame
 
 

@@ -33,7 +33,7 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
         say: takes the address.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES)
-    workers = Worker(), Worker()
+    workers = Worker(), Worker(), Worker()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((LOOPBACK, port))
@@ -42,8 +42,8 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
         address = f"http://{LOOPBACK}:{bound}/#t={token}" + (f"&f={quote(opened)}" if opened else "")
         config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, lifespan="off", ws="none")
         try:
-            workers[0].start()
-            workers[1].start()
+            for worker in workers:
+                worker.start()
             say(address)
             if browse:
                 webbrowser.open(address)

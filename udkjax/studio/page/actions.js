@@ -122,16 +122,15 @@ const wayOf = (from, to) => {
   return vector(angle);
 };
 
-export function drawSlide(document, from, to) {
+export function drawSlide(document, from, to, {size}) {
   const links = list(document, "link");
   let found = document, name = links[from.link]?.name;
   if (from.pin) {
     const single = links.find(link => link.pins.length === 1 && link.pins[0] === from.pin);
     if (single) name = single.name;
     else {
-      const size = written(0.05, document);
       name = freshName(document, "slider");
-      found = withElement(found, "link", {name, pins: [from.pin], mass: "0.5 kg", width: size});
+      found = withElement(found, "link", {name, pins: [from.pin], mass: "0.5 kg", width: tidy(niceBelow(3 * size) / lengthUnit(document))});
     }
   }
   if (!name) return {problem: "a slide guides a link: drag from a pin or a link along the line"};

@@ -13,7 +13,7 @@ const LABEL = 12;  // px
 
 export class DrawingCanvas {
   constructor(element) {
-    Object.assign(this, {element, places: new Map(), outlines: [], symbols: []});
+    Object.assign(this, {element, places: new Map(), outlines: [], symbols: [], drawn: []});
   }
 
   get width() { return this.element.clientWidth; }
@@ -53,10 +53,10 @@ export class DrawingCanvas {
     this.painter = painter;
     if (studio.picture) this.picture(studio.picture, view);
     if (studio.show.grid) studio.gridStep = painter.grid(width, height);
-    const key = `${view.scale}`;
-    if (this.drawn !== document || this.key !== key) {
-      this.symbols = symbolsOf(document, 1 / view.scale);
-      [this.drawn, this.key] = [document, key];
+    const now = [document, view.scale, studio.paths];
+    if (now.some((x, k) => x !== this.drawn[k])) {
+      this.symbols = symbolsOf(document, 1 / view.scale, studio.paths);
+      this.drawn = now;
     }
     this.paths(studio, painter);
     this.outlines = this.symbols.map(symbol => this.outline(symbol, painter));

@@ -9,11 +9,12 @@ import {make} from "./player/elements.js";
 import {THEMES} from "./player/painter.js";
 import {drawStrip} from "./player/strip.js";
 
+const ROUNDING = 1e-10;  // of the scale of a quantity
 const EDGE = 12;  // px of the strip on either side of its curve
 
 export class CurvesPanel {
   constructor(studio, parts) {
-    Object.assign(this, {studio, select: parts.curveSelect, canvas: parts.curveCanvas, forces: parts.forces, chosen: "", served: null});
+    Object.assign(this, {studio, select: parts.curveSelect, canvas: parts.curveCanvas, forces: parts.forces, statics: parts.statics, chosen: "", served: null});
     this.select.addEventListener("change", () => { this.chosen = this.select.value; studio.redraw(); });
     this.canvas.addEventListener("pointerdown", event => { this.canvas.setPointerCapture(event.pointerId); this.seek(event); });
     this.canvas.addEventListener("pointermove", event => { if (event.buttons) this.seek(event); });
@@ -46,6 +47,13 @@ export class CurvesPanel {
   /** The curves of forces, while they are of this drawing. */
   forcesOf() { return this.served?.document === this.studio.document ? this.served : null; }
 
+  /** Show a curve of what is selected now, where there is one. */
+  follow() {
+    const first = this.names().find(name => name.startsWith(this.selectedName()));
+    if (first && !this.chosen.startsWith(this.selectedName())) this.chosen = first;
+    this.select.value = this.chosen;
+  }
+
   /** Offer the curves that there are. */
   list() {
     const names = this.names();
@@ -73,12 +81,13 @@ export class CurvesPanel {
     const at = name.lastIndexOf(": "), owner = name.slice(0, at), quantity = name.slice(at + 2), link = list(document, "link").findIndex(l => l.name === owner);
     if (quantity === "effort" && owner in energies.efforts) return {unit: "N m", values: energies.efforts[owner]};
     const each = action => Array.from({length: run.count}, (_, i) => action(i * size, mover.motions(run.q.slice(i * size, (i + 1) * size))));
-    if (quantity === "angle" && link >= 0) return {unit: "°", values: each(i => run.q[i + 3 * mover.order[link] + 2] * 180 / Math.PI)};
+    const still = (scale, values) => withoutRounding(values, scale);
+    if (quantity === "angle" && link >= 0) return {unit: "°", values: still(180, each(i => run.q[i + 3 * mover.order[link] + 2] * 180 / Math.PI))};
     if (quantity === "angular velocity") return {unit: "rad/s", values: each(i => run.v[i + 3 * mover.order[link] + 2])};
     const place = placeOf(document, owner), carrier = this.studio.canvas.carrier(document, owner);
     if (quantity.startsWith("angle between ")) return {unit: "°", values: this.angles(owner, each)};
     if (quantity === "speed") return {unit: `${long}/s`, values: each((i, motions) => this.speed(i, motions, carrier, place) / unit)};
-    return {unit: long, values: each((_, motions) => carry(motions, carrier, place)[quantity === "x" ? 0 : 1] / unit)};
+    return {unit: long, values: still(mover.scene.length / unit, each((_, motions) => carry(motions, carrier, place)[quantity === "x" ? 0 : 1] / unit))};
   }
 
   speed(i, motions, link, place) {
@@ -96,6 +105,21 @@ export class CurvesPanel {
       const between = Math.abs((a - b) * 180 / Math.PI) % 360;
       return between > 180 ? 360 - between : between;
     });
+  }
+
+  /** Show the position of rest that the server finds. */
+  async askStatics() {
+    const {studio} = this, {document} = studio;
+    this.statics.disabled = true;
+    studio.say("looking for a position of rest …");
+    try {
+      const {problems, q, kind, frequencies} = await ask("diagnose", {text: await studio.files.text(), about: "statics"});
+      if (problems.length) throw new Error(problems.join("; "));
+      if (document === studio.document && q) studio.motion.pose(Float64Array.from(q));
+      const rates = frequencies.map(x => `${+x.toPrecision(4)} Hz`).join(", ");
+      studio.say(q ? `at rest: ${kind}${rates ? `, frequencies ${rates}` : ""}` : "no position of rest was found");
+    } catch (error) { studio.say(error.message, true); }
+    this.statics.disabled = false;
   }
 
   async askForces() {
@@ -122,7 +146,7 @@ export class CurvesPanel {
     [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
     const context = canvas.getContext("2d"), theme = THEMES[studio.theme];
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.forces.hidden = !motion.run || motion.run.count < 2;
+    this.forces.hidden = this.statics.hidden = !motion.run || motion.run.count < 2;
     if (!this.chosen || !motion.run || motion.run.count < 2) return;
     const key = [this.chosen, motion.run, this.served];
     if (!this.cache || key.some((x, k) => x !== this.cache.key[k])) this.cache = {key, curve: this.values(this.chosen)};
@@ -130,6 +154,12 @@ export class CurvesPanel {
     const run = {label: "", ts: Array.from(ts).slice(0, Math.min(motion.run.count, curve.values.length)), measures: [{name: this.chosen, ...curve}], find: t => find(ts, t)};
     drawStrip(context, width, height, [run], this.chosen, 0, motion.end, motion.t, theme, width);
   }
+}
+
+/** Values, or their first one throughout where they differ by rounding alone. */
+function withoutRounding(values, scale) {
+  const spread = values.reduce((most, x) => Math.max(most, Math.abs(x - values[0])), 0);
+  return spread <= ROUNDING * scale ? values.map(() => values[0]) : values;
 }
 
 function find(ts, t) {

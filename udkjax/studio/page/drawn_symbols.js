@@ -24,15 +24,19 @@ function* hatch(frame, from, to, step, y, metres = 0) {
   }
 }
 
-/** The symbols of a document, the farthest first; `unit` is the unit of symbols (m) in the view: strokes are so far apart. */
-export function symbolsOf(document, unit) {
-  const draft = new Draft(document, unit);
+/** The symbols of a document, the farthest first.
+ *
+ *  `unit` is the unit of symbols (m) in the view: strokes are so far apart. `paths` are those of pins, {name, line: [x, y, ...]}
+ *  in metres, where they are known: rails are as long as they are used.
+ */
+export function symbolsOf(document, unit, paths = []) {
+  const draft = new Draft(document, unit, paths);
   return [...draft.cams, ...draft.rails, ...draft.plates, ...draft.wheels, ...draft.bars, ...draft.elements, ...draft.pins];
 }
 
 class Draft {
-  constructor(document, unit) {
-    Object.assign(this, {document, unit, cams: [], rails: [], plates: [], wheels: [], bars: [], elements: [], pins: []});
+  constructor(document, unit, paths) {
+    Object.assign(this, {document, unit, paths, cams: [], rails: [], plates: [], wheels: [], bars: [], elements: [], pins: []});
     this.number = new Map(list(document, "link").map((link, k) => [link.name, k]));
     this.size = extent(document);
     this.blocks = new Set(list(document, "slide").map(slide => slide.link));
@@ -89,10 +93,23 @@ class Draft {
     const pin = list(this.document, "link").find(link => link.name === entry.link)?.pins?.[0], place = pin && this.place(pin);
     const angle = lineAngle(this.document, entry), on = this.body(entry.on), k = this.body(entry.link);
     if (!place || !Number.isFinite(angle)) return;
-    const long = RAIL * this.size, frame = at(on, place, angle);
-    this.put("rails", on >= 0 ? [line(frame, [[-long, 0], [long, 0]], edge(on), 3)] : [
-      line(frame, [[-long, 0, 0, -9], [long, 0, 0, -9]], "soft", 1.5), ...hatch(frame, -long + 5 * this.unit, long, 5 * this.unit, -9, 1)]);
+    const [from, to] = this.span(pin, place, angle, on), frame = at(on, place, angle);
+    this.put("rails", on >= 0 ? [line(frame, [[from, 0], [to, 0]], edge(on), 3)] : [
+      line(frame, [[from, 0, 0, -9], [to, 0, 0, -9]], "soft", 1.5), ...hatch(frame, from + 5 * this.unit, to, 5 * this.unit, -9, 1)]);
     this.put("elements", [line(at(k, place, angle), offsets([[-15, -9], [15, -9], [15, 9], [-15, 9]]), edge(k), 1.5, tint(k), true)]);
+  }
+
+  /** How far along a line from a place (m) a pin goes: to the ends of its path, and a little farther. */
+  span(pin, [x, y], angle, on) {
+    const path = on < 0 ? this.paths.find(({name}) => name === pin)?.line : null;
+    if (!path) return [-RAIL * this.size, RAIL * this.size];
+    const c = Math.cos(angle), s = Math.sin(angle), margin = 24 * this.unit;
+    let [from, to] = [0, 0];
+    for (let k = 0; k < path.length; k += 2) {
+      const along = c * (path[k] - x) + s * (path[k + 1] - y);
+      [from, to] = [Math.min(from, along), Math.max(to, along)];
+    }
+    return [from - margin, to + margin];
   }
 
   slot(entry) {
@@ -100,7 +117,7 @@ class Draft {
     if (!pin || !Number.isFinite(angle)) return;
     const ends = (entry.along ?? []).map(name => this.place(name));
     const span = ends.length === 2 && ends.every(Boolean) ? [0, Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1])]
-      : [-RAIL * this.size, RAIL * this.size];
+      : this.span(entry.pin, pin, angle, on);
     const start = ends[0] ?? pin, [a, b] = span, round = arc(6.5, -Math.PI / 2, Math.PI / 2, 9);
     const outline = [...round.map(([x, y]) => [b, 0, x, y]), ...round.map(([x, y]) => [a, 0, -x, -y])];
     this.put("bars", [line(at(on, start, angle), outline, on < 0 ? "soft" : edge(on), 1.3, "back", true)]);

@@ -11,6 +11,22 @@ export class FindingsPanel {
     Object.assign(this, {studio, element, travel: null, structure: null});
   }
 
+  /** What stands here is of an earlier drawing, until it is looked at anew. */
+  markStale() { this.element.classList.add("stale"); }
+
+  /** Show other contents, which are of this drawing. */
+  replace(...rows) {
+    this.element.classList.remove("stale");
+    this.element.replaceChildren(...rows);
+  }
+
+  showFailure(words) {
+    this.structure = this.travel = null;
+    this.mark([]);
+    this.replace(make("p", {class: "lead bad"}, "The studio could not look at it"), make("p", {}, words));
+    this.studio.say(words, true);
+  }
+
   mark(entries) {
     this.studio.marked = new Map(entries);
     this.studio.redraw();
@@ -19,7 +35,7 @@ export class FindingsPanel {
   showEmpty() {
     this.structure = this.travel = null;
     this.mark([]);
-    this.element.replaceChildren(
+    this.replace(
       make("p", {class: "lead"}, "Draw a mechanism"),
       make("p", {}, "Press L and drag links from pin to pin; G fixes a pin to the ground; M puts a motor on one. Or open a template."));
   }
@@ -29,7 +45,7 @@ export class FindingsPanel {
     if (!problems.length) return;
     this.structure = this.travel = null;
     this.mark([]);
-    this.element.replaceChildren(make("p", {class: "lead"}, problems.length === 1 ? "One thing is missing before it can move" : `${problems.length} things are missing before it can move`),
+    this.replace(make("p", {class: "lead"}, problems.length === 1 ? "One thing is missing before it can move" : `${problems.length} things are missing before it can move`),
       make("ul", {class: "problems"}, ...problems.slice(0, 30).map(problem => {
         const item = itemOf(this.studio.document, problem);
         return make("li", {}, item ? make("button", {type: "button", class: "link", onclick: () => this.studio.select([item])}, problem) : problem);
@@ -54,7 +70,7 @@ export class FindingsPanel {
     const driven = s.joint_freedoms !== s.freedoms ? `, ${s.freedoms} with its motors held` : "";
     const rows = [make("p", {class: "lead"}, make("b", {}, plural(s.joint_freedoms, "freedom")), driven, " · ",
       make("b", {class: s.redundant ? "bad" : ""}, s.redundant ? plural(s.redundant, "redundant constraint") : "nothing redundant")),
-    make("p", {}, s.motion, ".")];
+    make("p", {}, s.motion, "."), ...(s.singular ? [make("p", {class: "warn"}, "It stands in a singular position: branches of its motion meet here, or it gives way to first order only.")] : [])];
     for (const {motor, unit, ends} of this.travel ?? []) rows.push(make("p", {class: ends.length ? "warn" : ""}, travelWords(motor, unit, ends)));
     for (const set of s.sets) rows.push(this.set(set, pins));
     const loose = Object.entries(s.loose);
@@ -63,7 +79,7 @@ export class FindingsPanel {
       : "all unique"));
     rows.push(make("details", {class: "more"}, make("summary", {}, "The diagnosis in full"), make("pre", {}, s.text)));
     const again = this.element.querySelector("details.more")?.open;
-    this.element.replaceChildren(...rows);
+    this.replace(...rows);
     this.element.querySelector("details.more").open = Boolean(again);
     this.mark(s.sets.flatMap(set => set.constraints.map(pinOf(pins)).filter(Boolean).map(pin => [pin, {sign: "R", strong: false}])));
   }
@@ -72,9 +88,9 @@ export class FindingsPanel {
     const toPin = pinOf(pins), names = constraints.join(", ");
     return make("div", {class: "set"},
       make("p", {}, make("b", {class: "bad"}, "R "), `${names}: ${count} redundant row${count === 1 ? "" : "s"}, ${permanent ? "everywhere" : "in this position only"}.`,
-        fixes.length ? " Free one pin:" : permanent ? " No single change of a joint was found that mends it." : ""),
+        fixes.length ? " One of these mends it:" : permanent ? " No single change of a joint was found that mends it." : ""),
       make("ul", {}, ...fixes.map(fix => make("li", {}, make("button", {type: "button", class: "link",
-        onclick: () => this.studio.select([{kind: "pin", name: toPin(fix.constraint)}].filter(item => item.name)),
+        onclick: () => this.studio.select([itemNamed(this.studio.document, fix.constraint)].filter(Boolean)),
         onmouseenter: () => this.mark([...constraints.map(toPin).filter(Boolean).map(pin => [pin, {sign: "R", strong: pin === toPin(fix.constraint)}])]),
       }, make("b", {}, fix.constraint), `: ${fix.change}`)))));
   }
@@ -87,6 +103,14 @@ function travelWords(motor, unit, ends) {
   if (!ends.length) return `${motor} turns all the way round.`;
   const line = triples => (triples.length ? `: ${triples.map(names => names.join(", ")).join("; ")} in line` : "");
   return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(", and at ")}.`;
+}
+
+/** The pin or the element that a constraint is of, by its name; undefined where there is none. */
+function itemNamed(document, name) {
+  const pin = pinOf(pinsOf(document))(name);
+  if (pin !== undefined) return {kind: "pin", name: pin};
+  return ["slide", "slot", "gear", "cam", "motor", "joint", "driver"].flatMap(kind => list(document, kind).map((_, index) => ({kind, index})))
+    .find(({kind, index}) => nameOf(document, kind, index) === name);
 }
 
 /** The element that a mistake is about. */

@@ -35,7 +35,7 @@ export class Gestures {
     const pin = pinAt(studio.canvas.places, pixel, touch, except);
     const found = pin === null ? itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch, ["link"]) : null;
     const place = pin === null ? studio.snap(toMetres(studio.view, pixel), event) : placeOf(studio.document, pin);
-    return {pixel, pin, link: found?.index ?? null, place};
+    return {pixel, pin, link: found?.index ?? null, place, free: toMetres(studio.view, pixel)};
   }
 
   down(event) {
@@ -67,8 +67,8 @@ export class Gestures {
     const item = itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch);
     if (studio.tool === "pull" || (studio.isMoved && item)) {
       this.now = item && studio.canPull(item) ? {kind: "pull", item} : {kind: "pan"};
-      if (this.now.kind === "pull") studio.beginPull(item, toMetres(studio.view, pixel));
       if (item) studio.select([item]);
+      if (this.now.kind === "pull") studio.beginPull(item, toMetres(studio.view, pixel));
       return;
     }
     if (!item) {

@@ -55,7 +55,11 @@ export function buildPage(studio, root) {
     return found;
   });
   parts.picture = make("div", {class: "group"});
-  const stage = make("main", {}, parts.canvas, make("div", {class: "toggles group"}, ...toggles, parts.picture), parts.status);
+  const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, parts.picture));
+  const narrow = matchMedia("(max-width: 760px)"), unfold = () => { options.open = !narrow.matches; };
+  narrow.addEventListener("change", unfold);
+  unfold();
+  const stage = make("main", {}, parts.canvas, options, parts.status);
   parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
   parts.home = button(svgIcon(ICONS.home), "as drawn (Home)", () => studio.rewind(), "icon");
   parts.scrub = make("input", {type: "range", min: 0, max: 10000, step: 1, "aria-label": "time", oninput: () => {
@@ -70,7 +74,8 @@ export function buildPage(studio, root) {
   parts.curveSelect = make("select", {"aria-label": "curve"});
   parts.curveCanvas = make("canvas", {"aria-hidden": "true"});
   parts.forces = button("Forces", "compute forces at pins, powers and energies", () => studio.curves.askForces());
-  const strip = make("div", {class: "strip"}, parts.curveCanvas, make("div", {class: "group over-strip"}, parts.curveSelect, parts.forces));
+  parts.statics = button("At rest", "find the position of rest next to the drawn one, and its frequencies", () => studio.curves.askStatics());
+  const strip = make("div", {class: "strip"}, parts.curveCanvas, make("div", {class: "group over-strip"}, parts.curveSelect, parts.forces, parts.statics));
   const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.scrub, parts.speed, parts.loops);
   const side = make("aside", {}, section("Findings", "findings"), section("Selection", "properties"), section("Text (TOML)", "source"));
   parts.help = make("dialog", {class: "help", "aria-label": "keys"}, make("h2", {}, "Keys"),

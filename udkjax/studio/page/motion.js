@@ -120,6 +120,13 @@ export class Motion {
     this.studio.redraw();
   }
 
+  /** Show a closed position; what nothing drives starts from there. */
+  pose(q) {
+    this.pause();
+    this.posed = {t: 0, q, v: new Float64Array(this.mover.size), closed: true, violation: 0};
+    this.release();
+  }
+
   // Pulling
 
   beginPull(item, at) {
@@ -137,7 +144,7 @@ export class Motion {
     this.posed = {t: 0, q: found.q, v: new Float64Array(this.mover.size), closed: true, violation: found.violation};
     this.motions = this.mover.motions(found.q);
     this.studio.hand = {at: carry(this.motions, link, place), to: hand};
-    this.studio.say(found.words);
+    this.studio.say(found.words || "pulled: Home returns to the drawing");
     this.showLoops(found.violation);
     this.studio.redraw();
   }
@@ -147,14 +154,19 @@ export class Motion {
     if (!this.pulled) return;
     this.pulled = null;
     this.studio.hand = null;
+    this.release();
+  }
+
+  /** The motion from where it is shown, unless motors drive it. */
+  release() {
     if (!this.mover.scene.drivers.length) {
       this.t = 0;
-      const {posed} = this;
-      this.run = this.mover.run(posed);
+      this.run = this.mover.run(this.posed);
       this.energies = this.mover.energies(this.run);
       this.studio.paths = this.traces();
-      this.motions = this.mover.motions(posed.q);
+      this.showLoops();
     }
+    this.motions = this.mover.motions(this.posed.q);
     this.studio.redraw();
   }
 

@@ -1,7 +1,7 @@
 // Geometry of a drawing's elements: hulls of plates, profiles of cams, wheels of gears. Metres and radians.
 
 import {groundOf, list, members, placeOf, pinsOf} from "./document.js";
-import {angle, direction, length} from "./units.js";
+import {angle, direction, length, point} from "./units.js";
 
 const IN_LINE = 1e-9;  // of the size squared: points whose hull has less area are in line
 
@@ -42,6 +42,8 @@ export function linkShape(document, link) {
   }
   if (!places.length) return null;
   if (places.length === 1) {
+    const centre = Array.isArray(link.centre) ? point(link.centre, document) : null;
+    if (centre && Math.hypot(centre[0] - places[0][0], centre[1] - places[0][1]) > 0) return {kind: "line", points: [places[0], centre]};
     const width = length(link.width, document), mass = +link.mass, inertia = +link.inertia;
     const gyration = Number.isFinite(inertia / mass) ? Math.sqrt(inertia / mass) : 0;
     return {kind: "disc", at: places[0], radius: Number.isFinite(width) ? width / 2 : gyration};

@@ -11,6 +11,7 @@ import {History} from "./history.js";
 import {followKeys} from "./keys.js";
 import {buildPage} from "./layout.js";
 import {Motion} from "./motion.js";
+import {Pictures} from "./pictures.js";
 import {PropertiesPanel} from "./properties.js";
 import {SourcePanel} from "./source.js";
 import {Sync} from "./sync.js";
@@ -42,6 +43,7 @@ class Studio {
     this.properties = new PropertiesPanel(this, this.parts.properties);
     this.source = new SourcePanel(this, this.parts.source);
     this.files = new FileActions(this);
+    this.pictures = new Pictures(this, this.parts.picture);
     this.sync = new Sync(this);
     this.gestures = new Gestures(this, this.parts.canvas);
     followKeys(this);
@@ -89,7 +91,8 @@ class Studio {
   }
 
   /** Take what a tool made, or say why it made nothing. */
-  apply({document, select, problem}) {
+  apply({document, select, problem, measured}) {
+    if (measured) return this.pictures.scale(...measured);
     if (problem) return this.say(problem);
     this.say("");
     this.commit(document, select);
@@ -116,6 +119,7 @@ class Studio {
 
   select(items) {
     this.selection = items;
+    this.curves.follow();
     this.shown();
   }
 

@@ -22,8 +22,9 @@ export class Sync {
       this.structure = null;
       studio.motion.forget();
     }
+    studio.findings.markStale();
     this.pending = this.update(stamp).catch(error => {
-      if (stamp === this.stamp) this.studio.say(error.message, true);
+      if (stamp === this.stamp) studio.findings.showFailure(error.message);
       if (!(error instanceof RequestError)) throw error;
     });
   }

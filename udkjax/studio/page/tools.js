@@ -20,7 +20,11 @@ export const TOOLS = [
   {name: "load", key: "o", title: "Load: a force at a pin or a link", kind: "points", make: actions.drawLoad, icon: "M4 11h11V6l7 6-7 6v-5H4z"},
 ];
 
-export const toolOf = name => TOOLS.find(tool => tool.name === name);
+// The tool that measures on a picture, which has no button among the others.
+const SCALE = {name: "scale", title: "Bring the picture to scale: drag between two of its points whose distance you know", kind: "points",
+  make: (document, from, to) => ({measured: [from.free, to.free]})};
+
+export const toolOf = name => (name === "scale" ? SCALE : TOOLS.find(tool => tool.name === name));
 
 export const KEYS = [
   ["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["Ctrl N, Ctrl S", "new, save"], ["Ctrl D", "duplicate"], ["Delete", "delete"],
