@@ -203,6 +203,13 @@ test("every element has symbols that name it, and strange ones have none", () =>
   for (const {points = [], frame} of symbolsOf(strange, 1e-3)) assert.ok([...points.flat(), ...frame.flat()].every(Number.isFinite));
 });
 
+test("a view far inside of a drawing, or of places without end, costs nothing", () => {
+  const document = {...fourBar(), slide: [{link: "link3", direction: 0}]};
+  assert.ok(symbolsOf(document, 1e-12).length < 500);
+  const far = view.fit([[1e308, -1e308], [-1e308, 1e308]], 800, 600, 1);
+  assert.ok(Object.values(far).every(Number.isFinite));
+});
+
 test("a body's frames become a motion of the drawing, and a run is smooth between its instants", () => {
   const drawn = Float64Array.of(1, 2, 0.3), q = Float64Array.of(4, 5, 0.3 + Math.PI / 2), motions = motionsOf(q, drawn, [0, -1]);
   const [x, y] = carry(motions, 0, [2, 2]);

@@ -205,3 +205,12 @@ def test_what_takes_too_long_is_stopped_and_the_next_is_served():
             worker.call("open_template", {"name": "nothing"}, 60.0)
     finally:
         worker.close()
+
+
+def test_fixes_are_changes_of_the_drawing(client):
+    text = client.ask("open", template="parallelogram").json()["text"]
+    fixes = client.ask("diagnose", text=text).json()["sets"][0]["fixes"]
+    for fix in fixes:
+        drawn = fix["drawn"]
+        assert drawn["kind"] == "slot" and {drawn["on"], drawn["link"]} < {"ground", "link1", "link2", "link3", "coupler"}
+        np.testing.assert_allclose(drawn["direction"], [np.sqrt(0.5), -np.sqrt(0.5)], atol=1e-12)  # along the crank, as drawn

@@ -467,3 +467,22 @@ def test_curves_scrub_and_forces_and_rest_are_computed_when_asked_for(studio):
     assert "Hz" in studio.status()
     studio.page.keyboard.press("Home")
     assert studio.js("studio.motion.posed") is None
+
+
+@pytest.mark.slow
+def test_a_pin_is_freed_by_a_click_and_the_motion_stays(studio):
+    draw_five_bar(studio)
+    studio.settle()
+    before, bodies = np.reshape(studio.run()["q"], (-1, 4, 3)), studio.run()["bodies"]
+    studio.page.get_by_role("button", name="free F").click()
+    studio.settle()
+    assert "1 freedom · nothing redundant" in studio.findings and "all unique" in studio.findings
+    assert studio.document["slot"][0]["pin"] == "F"
+    after = studio.run()
+    order = [after["bodies"].index(body) for body in bodies]
+    q = np.reshape(after["q"], (-1, 4, 3))[:, order]
+    np.testing.assert_allclose(q[:, :, :2], before[:, :, :2], atol=1e-7)  # of two runs of other equations
+    assert_moves_as_simulated(studio, studio.js("studio.state.text"))
+    studio.page.keyboard.press("Control+z")
+    studio.settle()
+    assert "1 redundant constraint" in studio.findings

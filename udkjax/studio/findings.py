@@ -7,11 +7,12 @@ import numpy as np
 
 from udkjax.integrate import SimulationError
 from udkjax.integrate.assembly import AssemblyError
-from udkjax.scene import Mechanism, SceneError
-from udkjax.scene.joints import Revolute
+from udkjax.scene import GROUND, Mechanism, SceneError
+from udkjax.scene.joints import Revolute, Slot
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import force_curves
 from udkjax.study.diagnosis import Diagnosis, diagnose
+from udkjax.study.diagnosis.fixes import Fix
 from udkjax.study.equilibrium import equilibrium
 from udkjax.study.kinematics import travel
 from udkjax.study.report import plural
@@ -58,13 +59,28 @@ def structure(mechanism: Mechanism) -> Json:
                 "constraints": list(r.constraints),
                 "count": r.count,
                 "permanent": r.permanent,
-                "fixes": [{"constraint": fix.constraint, "change": fix.change} for fix in r.fixes[:MOST_FIXES]],
+                "fixes": [
+                    {"constraint": fix.constraint, "change": fix.change, "drawn": drawn_change(fix)}
+                    for fix in r.fixes[:MOST_FIXES]
+                ],
             }
             for r in found.redundancies
         ],
         "loose": loose,
         "text": str(found),
     }
+
+
+def drawn_change(fix: Fix) -> Json | None:
+    """Return a fix as a change of the drawing: a constraint that is gone, or the slot that takes a pin's place; else None."""
+    joint = fix.mechanism.joints.get(fix.constraint)
+    if joint is None:
+        return {"kind": "remove"}
+    if not isinstance(joint, Slot):
+        return None
+    on, guided = joint.bodies
+    angle = float(joint.axis) + (0.0 if on == GROUND else float(fix.mechanism.bodies[on].angle))
+    return {"kind": "slot", "on": on, "link": guided, "direction": [math.cos(angle), math.sin(angle)]}
 
 
 def _why(found: Diagnosis, mechanism: Mechanism) -> str:

@@ -81,8 +81,7 @@ def engine_of(mechanism: Mechanism, document: Json) -> Json:
         hand = None
         if mechanism.drivers:
             free = {**document, "motor": [m for m in document.get("motor", []) if "torque" in m], "driver": []}
-            hand = portable_engine(loads(merge_document("", free)), names, pull=False).data
-            hand = {**hand, "modules": {name: code for name, code in hand["modules"].items() if name != "run"}}
+            hand = portable_engine(loads(merge_document("", free)), names, pull=False, runs=False).data
     except (UnsupportedError, SceneError) as error:
         return {"why": str(error)}
     return {"engine": engine, "hand": hand, "pins": pins, "why": engine["why"]}

@@ -57,6 +57,7 @@ def portable_engine(
     rtol: float = 1e-8,
     atol: float = 1e-8,
     pull: bool = True,
+    runs: bool = True,
 ) -> PortableEngine:
     """Compile the engine of a mechanism for pages.
 
@@ -66,6 +67,7 @@ def portable_engine(
         rtol: relative tolerance of runs.
         atol: tolerance of runs, relative to the mechanism's scales, as in `simulate`.
         pull: whether a hand may pull bodies: each gets a spring, without stiffness until it does.
+        runs: whether it integrates motions; without them it closes positions and evaluates energies, and is compiled faster.
 
     Returns:
         The `PortableEngine`.
@@ -95,7 +97,7 @@ def portable_engine(
     problem = _problem(dressed, analysis, rtol, atol)
     data["why"] = UNKNOWN_ROWS if analysis.redundant_rows is None else problem.compiled.plan.why_not_native
     modules = {"close": _close(dressed, data)}
-    if not data["why"]:
+    if runs and not data["why"]:
         modules["run"] = _run(problem, data)
         if data["sampled"] and any(k >= numbers.count for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")

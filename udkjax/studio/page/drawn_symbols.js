@@ -6,6 +6,7 @@ import {camOutline, extent, gearWheels, lineAngle, linkShape} from "./shapes.js"
 import {length} from "./units.js";
 
 const ROUND = 48;  // corners of a circle that is drawn as a line
+const MOST_STROKES = 200;  // of one line: a view may be far inside of it
 const RAIL = 0.25;  // of the extent: half of a rail's length
 const edge = body => `edge:${body}`, tint = body => `tint:${body}`;
 const offsets = points => points.map(([x, y]) => [0, 0, x, y]);
@@ -18,7 +19,8 @@ const circle = (frame, radius, fill = "", stroke = "", width = 1.5) => ({frame, 
 const at = (body, [x, y], angle = 0, turns = 1) => [body, x, y, angle, turns];
 
 function* hatch(frame, from, to, step, y, metres = 0) {
-  for (let x = from; x < to; x += step) {
+  if (!(to > from)) return;
+  for (let x = from, wide = Math.max(step, (to - from) / MOST_STROKES); x < to; x += wide) {
     const start = metres ? [x, 0, 0, y] : [0, 0, x, y];
     yield line(frame, [start, [start[0], 0, start[2] - 5, y - 5]], "soft", 1);
   }

@@ -2,6 +2,7 @@
 // why nothing does; which reactions are unique; how far motors turn.
 
 import {list, nameOf, LISTS, pinsOf} from "./document.js";
+import {applyFix} from "./fixes.js";
 import {make} from "./player/elements.js";
 
 const COMPONENTS = ["x", "y", "torque"];
@@ -84,6 +85,12 @@ export class FindingsPanel {
     this.mark(s.sets.flatMap(set => set.constraints.map(pinOf(pins)).filter(Boolean).map(pin => [pin, {sign: "R", strong: false}])));
   }
 
+  /** A button that makes a fix, where the drawing has something for it. */
+  freeing(fix) {
+    const {studio} = this, changed = studio.motion.mover && applyFix(studio.document, fix, studio.motion.mover.scene);
+    return changed ? [make("button", {type: "button", class: "small", "aria-label": `free ${fix.constraint}`, onclick: () => studio.commit(changed, [])}, "Do it")] : [];
+  }
+
   set({constraints, count, permanent, fixes}, pins) {
     const toPin = pinOf(pins), names = constraints.join(", ");
     return make("div", {class: "set"},
@@ -92,7 +99,7 @@ export class FindingsPanel {
       make("ul", {}, ...fixes.map(fix => make("li", {}, make("button", {type: "button", class: "link",
         onclick: () => this.studio.select([itemNamed(this.studio.document, fix.constraint)].filter(Boolean)),
         onmouseenter: () => this.mark([...constraints.map(toPin).filter(Boolean).map(pin => [pin, {sign: "R", strong: pin === toPin(fix.constraint)}])]),
-      }, make("b", {}, fix.constraint), `: ${fix.change}`)))));
+      }, make("b", {}, fix.constraint), `: ${fix.change}`), ...this.freeing(fix)))));
   }
 }
 

@@ -19,7 +19,7 @@ const KEYS = {
   load: [["pin", "name"], ["link", "name"], ["force", "force"], ["torque", "torque"], ["frame", "name"]],
 };
 const EXAMPLES = {density: "7850", mass: "0.2 kg", inertia: "1e-4 kg m2", speed: "60 rpm", torque: "1 N m", stiffness: "1 N/mm", damping: "10 N s/m",
-  force: "[0 N, -10 N]", angle: "30 deg", length: "10"};
+  force: "[0 N, -10 N]", angle: "30 deg"};
 const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", length: "m"};
 
 /** The unit of plain numbers of a quantity in a document. */
@@ -69,7 +69,7 @@ export class PropertiesPanel {
     };
     return [
       this.field("name", document.name ?? "", "", value => change("name", value), "of the mechanism"),
-      this.field("gravity", valueText(document.gravity), unitOf(document, "acceleration") || "m/s²", value => change("gravity", readValue(value)), "[0 m/s2, -9.81 m/s2]"),
+      this.field("gravity", valueText(document.gravity), unitOf(document, "acceleration") || "m/s²", value => change("gravity", readValue(value)), "[0, -9.81 m/s2]"),
       unit("length", ["mm", "cm", "m", "in", "ft"], "m"), unit("angle", ["deg", "rad"], "rad"),
     ];
   }
@@ -99,7 +99,7 @@ export class PropertiesPanel {
         this.set(withKey(document, kind, index, key, sub ? {...entry[key], [sub]: next} : next));
       };
       const unit = plain ? unitOf(document, quantity) : "";
-      return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ?? "");
+      return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ? `such as ${EXAMPLES[quantity]}` : "");
     });
     const extra = Object.keys(entry).filter(key => key !== "name" && !(KEYS[kind] ?? []).some(([path]) => path.split(".")[0] === key));
     const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", value => this.set(renameElement(document, kind, index, value)), title), ...fields,

@@ -5,6 +5,7 @@ import {RequestError, ask} from "./api.js";
 import {Mover} from "./mover.js";
 import {loadEngine} from "./player/engine.js";
 
+const BREATH = 120;  // ms without a change before an engine is compiled, which takes the server half a second or more
 const PAUSE = 250;  // ms without a change before a drawing is diagnosed, which takes the server a second
 
 /** What an engine is compiled for: all of a drawing but the places of its pins, which are parameters. */
@@ -70,6 +71,8 @@ export class Sync {
   async compile(text, document, isLate) {
     const {studio} = this, hasWasm = typeof WebAssembly === "object";
     studio.motion.showWaiting();
+    await new Promise(done => { setTimeout(done, BREATH); });
+    if (isLate()) return;
     const compiled = await ask("compile", {text, engine: hasWasm ? "wasm" : "recorded"});
     if (isLate()) return;
     if (compiled.problems.length) return void studio.findings.showProblems(compiled.problems);

@@ -21,5 +21,6 @@ export function fit(points, width, height, size) {
   if (top - bottom < least) [bottom, top] = [(bottom + top - least) / 2, (bottom + top + least) / 2];
   const margin = Math.min(70, 0.16 * Math.min(width, height));
   const scale = Math.min((width - 2 * margin) / (right - left), (height - 2 * margin) / (top - bottom));
+  if (!Number.isFinite(scale) || !(scale > 0)) return fit([], width, height, size);
   return {scale, x: width / 2 - scale * (left + right) / 2, y: height / 2 + scale * (bottom + top) / 2};
 }

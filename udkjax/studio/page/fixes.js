@@ -1,0 +1,34 @@
+// Changes that take redundancy away, as changes of the drawing: an element goes, or a pin becomes a slot of one of its two links.
+
+import {LISTS, list, members, nameOf, pinsOf, removeElements, toggleGround, withElement, withEntry} from "./document.js";
+import {lengthUnit, tidy} from "./units.js";
+
+/** The document after a fix {constraint, drawn}, or null where the drawing has nothing for it.
+ *
+ *  A link that loses the pin keeps its mass, inertia and centre, which are written out: `scene` says what they are.
+ */
+export function applyFix(document, {constraint, drawn}, scene) {
+  if (drawn?.kind === "remove") {
+    const found = LISTS.flatMap(kind => list(document, kind).map((_, index) => ({kind, index})))
+      .find(({kind, index}) => kind !== "link" && nameOf(document, kind, index) === constraint);
+    return found ? removeElements(document, [found]) : null;
+  }
+  if (drawn?.kind !== "slot" || !Object.hasOwn(pinsOf(document), constraint)) return null;
+  const met = members(document, constraint), {on, link} = drawn;
+  if (met.length !== 2 || !met.includes(on) || !met.includes(link)) return null;
+  const direction = drawn.direction.map(x => tidy(Math.round(x * 1e12) / 1e12));
+  const slot = {pin: constraint, direction, ...(on === "ground" ? {} : {on})};
+  if (on === "ground") return withElement(toggleGround(document, constraint), "slot", slot);
+  const index = list(document, "link").findIndex(entry => entry.name === on), freed = keepBody(document, index, scene, constraint);
+  return freed && withElement(freed, "slot", slot);
+}
+
+/** The document whose link gives up a pin, and remains the same body. */
+function keepBody(document, index, scene, pin) {
+  const {pins, density, thickness, width, outline, mass, inertia, centre, ...rest} = list(document, "link")[index];
+  const k = scene.bodies.indexOf(rest.name), left = pins.filter(name => name !== pin);
+  if (k < 0 || !left.length) return null;
+  const place = scene.frames[k].slice(0, 2).map(x => tidy(x / lengthUnit(document)));
+  const body = {mass: `${scene.masses[k]} kg`, inertia: `${scene.inertias[k]} kg m2`, centre: place};
+  return withEntry(document, "link", index, () => ({...rest, pins: left, ...body}));
+}
