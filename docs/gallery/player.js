@@ -126,6 +126,25 @@ function place(pose, [body, x, y]) {
 
 const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
 
+const FITTED = 300;  // instants that bounds are of
+
+/** Left, bottom, right, top (m) of all that is drawn of a run, at least `least` to each side of its middle. */
+function boundsOf(run, least) {
+  const anchors = run.marks.flatMap(m => {
+    const [x0, y0] = m.at ?? [0, 0];
+    return m.body === undefined ? [] : (m.points ?? [[0, 0]]).map(([x, y]) => [m.body, x0 + x, y0 + y]);
+  });
+  const low = [Infinity, Infinity], high = [-Infinity, -Infinity], stride = Math.max(1, Math.floor(run.ts.length / FITTED));
+  for (let i = 0; i < run.ts.length; i += stride) {
+    const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
+    for (const anchor of anchors) {
+      place(pose, anchor).forEach((x, k) => { low[k] = Math.min(low[k], x); high[k] = Math.max(high[k], x); });
+    }
+  }
+  const grow = low.map((x, k) => Math.max(0, least - (high[k] - x) / 2));
+  return [...low.map((x, k) => x - grow[k]), ...high.map((x, k) => x + grow[k])];
+}
+
 // Painting on a canvas: themes, lines and circles, arrows, texts, the grid, traces and reactions.
 
 
@@ -933,6 +952,46 @@ const LIVE_STYLE = `
 @media (pointer: coarse) { .live .slider input[type="range"] { height: 34px; } .live input[type="number"] { height: 34px; } }
 `;
 
+// The numbers of a live page in its address, so that whoever opens it sees the same motion.
+
+class Address {
+  constructor(live) { this.live = live; }
+
+  /** Whether the page has an address of its own: not within another page. */
+  get exists() { return Boolean(this.live.player.options.fill) && location.protocol !== "about:"; }
+
+  /** The numbers that are not those of the scene. */
+  get words() {
+    const {data: {sliders}, values} = this.live, changed = sliders.map((s, k) => [s, values[k]]).filter(([s, x]) => x !== s.value);
+    return new URLSearchParams(changed.map(([s, x]) => [s.name, String(x)])).toString();
+  }
+
+  write() {
+    if (this.exists) history.replaceState(null, "", `#${this.words}`);
+  }
+
+  read() {
+    if (!this.exists) return;
+    const given = new URLSearchParams(location.hash.slice(1)), numbers = {};
+    for (const {name} of this.live.data.sliders) {
+      const value = Number(given.get(name));
+      if (given.get(name) && Number.isFinite(value)) numbers[name] = value;
+    }
+    if (Object.keys(numbers).length) this.live.change(numbers);
+  }
+
+  async copy() {
+    const {live, words} = this;
+    this.write();
+    try {
+      await navigator.clipboard.writeText(this.exists ? location.href : `#${words}`);
+      live.say("The address with these numbers is copied.");
+    } catch {
+      live.say(this.exists ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+    }
+  }
+}
+
 // A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motion is closed and solved anew.
 
 
@@ -942,7 +1001,6 @@ const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be graspe
 // Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
 // same numbers give the same motion.
 const STEP_BYTES = 6e7;
-const FITTED = 300;  // instants that the whole view is fitted to
 const SETTLED = 150;  // ms without a change until the address says the numbers
 
 class Live {
@@ -962,10 +1020,11 @@ class Live {
     this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
       ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
       reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
-      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.share()},
+      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.address.copy()},
     });
     player.show.ghost = true;
     player.buttons.ghost = this.panel.buttons.ghost;
+    this.address = new Address(this);
     this.panel.enable(false);
     this.ready = this.load();
   }
@@ -980,7 +1039,7 @@ class Live {
     }
     this.panel.enable(true);
     this.greet();
-    this.readAddress();
+    this.address.read();
     return true;
   }
 
@@ -998,7 +1057,7 @@ class Live {
     this.values[k] = value;
     this.solveSoon();
     clearTimeout(this.settling);
-    this.settling = setTimeout(() => this.writeAddress(), SETTLED);
+    this.settling = setTimeout(() => this.address.write(), SETTLED);
   }
 
   /** Change numbers by the names of their parameters, and solve at once. */
@@ -1025,7 +1084,7 @@ class Live {
     this.follower.follow(this.engine.numbers(null));
     this.player.setEnd(end);
     this.changed = this.dirty = false;
-    this.writeAddress();
+    this.address.write();
     this.greet();
     this.player.draw();
   }
@@ -1216,67 +1275,11 @@ class Live {
 
   /** What the whole view shows: all that is drawn of the motion as it is now. */
   fit() {
-    const {bounds} = this.player.data, run = this.run, box = [Infinity, Infinity, -Infinity, -Infinity];
+    const {bounds} = this.player.data;
     this.first.bounds ??= bounds.slice();
-    const anchors = run.marks.flatMap(m => {
-      const [x0, y0] = m.at ?? [0, 0];
-      return m.body === undefined ? [] : (m.points ?? [[0, 0]]).map(([x, y]) => [m.body, x0 + x, y0 + y]);
-    });
-    const stride = Math.max(1, Math.floor(run.ts.length / FITTED));
-    for (let i = 0; i < run.ts.length; i += stride) {
-      const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
-      for (const anchor of anchors) {
-        const [x, y] = place(pose, anchor);
-        box.splice(0, 4, Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y));
-      }
-    }
-    const least = 0.1 * this.data.engine.scales.length;  // a single bar on a line has no height
-    const grow = [0, 1].map(k => Math.max(0, least - (box[k + 2] - box[k]) / 2));
-    const now = [box[0] - grow[0], box[1] - grow[1], box[2] + grow[0], box[3] + grow[1]];
-    bounds.splice(0, 4, ...(this.changed ? now : this.first.bounds));
-  }
-
-  // The address
-
-  numbersInWords() {
-    const pairs = this.data.sliders.map((s, k) => [s.name, this.values[k]]).filter(([, x], k) => x !== this.data.sliders[k].value);
-    return new URLSearchParams(pairs.map(([name, x]) => [name, String(x)])).toString();
-  }
-
-  /** Whether the page has an address of its own: not within another page. */
-  get hasAddress() { return Boolean(this.player.options.fill) && location.protocol !== "about:"; }
-
-  writeAddress() {
-    if (this.hasAddress) history.replaceState(null, "", `#${this.numbersInWords()}`);
-  }
-
-  readAddress() {
-    if (!this.hasAddress) return;
-    const given = new URLSearchParams(location.hash.slice(1));
-    let any = false;
-    this.data.sliders.forEach((slider, k) => {
-      const value = Number(given.get(slider.name));
-      if (!given.has(slider.name) || !Number.isFinite(value)) return;
-      this.values[k] = value;
-      any = true;
-    });
-    if (!any) return;
-    this.panel.show(this.values);
-    this.solve();
-  }
-
-  async share() {
-    const words = this.numbersInWords();
-    this.writeAddress();
-    try {
-      await navigator.clipboard.writeText(this.hasAddress ? location.href : `#${words}`);
-      this.say("The address with these numbers is copied.");
-    } catch {
-      this.say(this.hasAddress ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
-    }
+    bounds.splice(0, 4, ...(this.changed ? boundsOf(this.run, 0.1 * this.data.engine.scales.length) : this.first.bounds));
   }
 }
-
 
 // The player's elements, what they do, and how they look.
 

@@ -52,6 +52,7 @@ def test_ranges_are_as_wanted_or_by_the_unit(slider_crank):
         ("body.arm.angular_velocity", "arm angular velocity", "Initial state"),
         ("joint.mesh.radii[1]", "mesh radii 2", "Joints"),
         ("pin.B[0]", "B x", "Pins"),
+        ("driver.crank.motion.coefficients[1]", "crank motion coefficients 2", "Drivers"),
     ],
 )
 def test_what_a_slider_is_called(name, label, section):

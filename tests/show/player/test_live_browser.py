@@ -262,6 +262,41 @@ def test_a_finger_pulls(opened, pendulum):
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
+def test_the_whole_view_is_that_of_the_motion_that_is_shown(opened, live):
+    with opened(live) as page:
+        before = page.evaluate(f"{PLAYER}.live.player.data.bounds")
+        page.evaluate(f"{LIVE}.change({{'pin.B[0]': 4.0}})")
+        page.locator(".panel canvas").press("0")
+        right = page.evaluate(f"{PLAYER}.live.player.data.bounds[2]")
+        assert right == pytest.approx(4.0, abs=0.05)  # where the slider begins
+        page.locator(".panel canvas").press("Backspace")
+        page.locator(".panel canvas").press("0")
+        assert page.evaluate(f"{PLAYER}.live.player.data.bounds") == before
+
+
+def test_a_long_motion_is_solved_a_picture_at_a_time(opened, pendulum):
+    """With so few steps for each picture that it takes several; the motion is that of Python all the same."""
+    mechanism, animation = pendulum
+    with opened(animation) as page:
+        page.evaluate(f"{LIVE}.steps = 9")
+        script = f"{LIVE}.change({{'gravity[1]': -7.0}}); [{LIVE}.run.ts.length, {LIVE}.panel.note.textContent]"
+        count, words = page.evaluate(script)
+        assert 1 < count < len(TS) and "Solving" in words
+        until(page, f"{LIVE}.job === null")
+        run = udk.simulate(mechanism.with_parameters({"gravity[1]": -7.0}), TS)
+        assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), atol=1e-6)
+
+
+def test_markup_in_names_of_a_live_page_is_text(opened, hostile):
+    animation = udk.animate(hostile.mechanism, udk.simulate(hostile.mechanism, TS), live=True)
+    with opened(animation) as page:
+        page.wait_for_timeout(100)
+        assert page.evaluate("window.hit") is None
+        assert page.locator("img, b b, u").count() == 0
+        labels = page.locator(".live .name").all_text_contents()
+        assert any(label.startswith("<img src=x onerror='window") for label in labels)
+
+
 def test_without_webassembly_it_plays_what_was_recorded(opened, live):
     with opened(live, script="delete window.WebAssembly") as page:
         assert "no WebAssembly" in note(page) and "recorded" in note(page)

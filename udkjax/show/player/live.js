@@ -1,9 +1,10 @@
 // A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motion is closed and solved anew.
 
+import {Address} from "./address.js";
 import {loadEngine} from "./engine.js";
 import {Follower} from "./follow.js";
 import {Hand, bodyAt} from "./hand.js";
-import {Run, place} from "./motion.js";
+import {Run, boundsOf, place} from "./motion.js";
 import {SliderPanel} from "./sliders.js";
 
 const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
@@ -12,7 +13,6 @@ const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be graspe
 // Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
 // same numbers give the same motion.
 const STEP_BYTES = 6e7;
-const FITTED = 300;  // instants that the whole view is fitted to
 const SETTLED = 150;  // ms without a change until the address says the numbers
 
 export class Live {
@@ -32,10 +32,11 @@ export class Live {
     this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
       ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
       reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
-      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.share()},
+      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.address.copy()},
     });
     player.show.ghost = true;
     player.buttons.ghost = this.panel.buttons.ghost;
+    this.address = new Address(this);
     this.panel.enable(false);
     this.ready = this.load();
   }
@@ -50,7 +51,7 @@ export class Live {
     }
     this.panel.enable(true);
     this.greet();
-    this.readAddress();
+    this.address.read();
     return true;
   }
 
@@ -68,7 +69,7 @@ export class Live {
     this.values[k] = value;
     this.solveSoon();
     clearTimeout(this.settling);
-    this.settling = setTimeout(() => this.writeAddress(), SETTLED);
+    this.settling = setTimeout(() => this.address.write(), SETTLED);
   }
 
   /** Change numbers by the names of their parameters, and solve at once. */
@@ -95,7 +96,7 @@ export class Live {
     this.follower.follow(this.engine.numbers(null));
     this.player.setEnd(end);
     this.changed = this.dirty = false;
-    this.writeAddress();
+    this.address.write();
     this.greet();
     this.player.draw();
   }
@@ -286,64 +287,8 @@ export class Live {
 
   /** What the whole view shows: all that is drawn of the motion as it is now. */
   fit() {
-    const {bounds} = this.player.data, run = this.run, box = [Infinity, Infinity, -Infinity, -Infinity];
+    const {bounds} = this.player.data;
     this.first.bounds ??= bounds.slice();
-    const anchors = run.marks.flatMap(m => {
-      const [x0, y0] = m.at ?? [0, 0];
-      return m.body === undefined ? [] : (m.points ?? [[0, 0]]).map(([x, y]) => [m.body, x0 + x, y0 + y]);
-    });
-    const stride = Math.max(1, Math.floor(run.ts.length / FITTED));
-    for (let i = 0; i < run.ts.length; i += stride) {
-      const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
-      for (const anchor of anchors) {
-        const [x, y] = place(pose, anchor);
-        box.splice(0, 4, Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y));
-      }
-    }
-    const least = 0.1 * this.data.engine.scales.length;  // a single bar on a line has no height
-    const grow = [0, 1].map(k => Math.max(0, least - (box[k + 2] - box[k]) / 2));
-    const now = [box[0] - grow[0], box[1] - grow[1], box[2] + grow[0], box[3] + grow[1]];
-    bounds.splice(0, 4, ...(this.changed ? now : this.first.bounds));
-  }
-
-  // The address
-
-  numbersInWords() {
-    const pairs = this.data.sliders.map((s, k) => [s.name, this.values[k]]).filter(([, x], k) => x !== this.data.sliders[k].value);
-    return new URLSearchParams(pairs.map(([name, x]) => [name, String(x)])).toString();
-  }
-
-  /** Whether the page has an address of its own: not within another page. */
-  get hasAddress() { return Boolean(this.player.options.fill) && location.protocol !== "about:"; }
-
-  writeAddress() {
-    if (this.hasAddress) history.replaceState(null, "", `#${this.numbersInWords()}`);
-  }
-
-  readAddress() {
-    if (!this.hasAddress) return;
-    const given = new URLSearchParams(location.hash.slice(1));
-    let any = false;
-    this.data.sliders.forEach((slider, k) => {
-      const value = Number(given.get(slider.name));
-      if (!given.has(slider.name) || !Number.isFinite(value)) return;
-      this.values[k] = value;
-      any = true;
-    });
-    if (!any) return;
-    this.panel.show(this.values);
-    this.solve();
-  }
-
-  async share() {
-    const words = this.numbersInWords();
-    this.writeAddress();
-    try {
-      await navigator.clipboard.writeText(this.hasAddress ? location.href : `#${words}`);
-      this.say("The address with these numbers is copied.");
-    } catch {
-      this.say(this.hasAddress ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
-    }
+    bounds.splice(0, 4, ...(this.changed ? boundsOf(this.run, 0.1 * this.data.engine.scales.length) : this.first.bounds));
   }
 }
-

@@ -28,6 +28,7 @@ SECTIONS = {
     "body": "Bodies",
     "link": "Links",
 }  # in their order; all others follow
+PLACES = ("points", "point", "position", "velocity", "vector", "gravity")  # fields of which two entries are x and y
 NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of what is never negative
 INITIAL = "Initial state"
 INITIAL_FIELDS = ("velocity", "angular_velocity")  # and of bodies their position and angle, which assembly starts from
@@ -95,9 +96,10 @@ def label_of(name: str) -> str:
     text = " ".join(words).replace("_", " ")
     if parts[-1] in ("points", "radii", "times", "values") and indices:
         text = f"{text.removesuffix('s') if parts[-1] == 'points' else text} {indices.pop(0) + 1}"
-    if indices:
-        text += f" {'xy'[indices[-1]]}" if indices[-1] < 2 and len(indices) == 1 else "".join(f" {k + 1}" for k in indices)
-    return " ".join(dict.fromkeys(text.split(" ")))  # "motor speed" of the motor that is called motor
+    in_plane = parts[-1] in PLACES or parts[0] == "pin"
+    text += "".join(f" {'xy'[k]}" if in_plane and k < 2 else f" {k + 1}" for k in indices)
+    given = text.split(" ")
+    return " ".join(word for k, word in enumerate(given) if k == 0 or word != given[k - 1])  # the speed of a motor called motor
 
 
 def usual_range(name: str, unit: str, value: float, length: float, rate: float) -> tuple[float, float]:

@@ -123,3 +123,22 @@ export function place(pose, [body, x, y]) {
 }
 
 export const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
+
+const FITTED = 300;  // instants that bounds are of
+
+/** Left, bottom, right, top (m) of all that is drawn of a run, at least `least` to each side of its middle. */
+export function boundsOf(run, least) {
+  const anchors = run.marks.flatMap(m => {
+    const [x0, y0] = m.at ?? [0, 0];
+    return m.body === undefined ? [] : (m.points ?? [[0, 0]]).map(([x, y]) => [m.body, x0 + x, y0 + y]);
+  });
+  const low = [Infinity, Infinity], high = [-Infinity, -Infinity], stride = Math.max(1, Math.floor(run.ts.length / FITTED));
+  for (let i = 0; i < run.ts.length; i += stride) {
+    const pose = run.q.subarray(i * run.size, (i + 1) * run.size);
+    for (const anchor of anchors) {
+      place(pose, anchor).forEach((x, k) => { low[k] = Math.min(low[k], x); high[k] = Math.max(high[k], x); });
+    }
+  }
+  const grow = low.map((x, k) => Math.max(0, least - (high[k] - x) / 2));
+  return [...low.map((x, k) => x - grow[k]), ...high.map((x, k) => x + grow[k])];
+}

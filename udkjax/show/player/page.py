@@ -9,10 +9,9 @@ from string import Template
 
 from udkjax.show.player.packing import Json
 
-LIVE_MODULES = "engine", "follow", "hand", "sliders", "live"
 MODULES = (  # after those they import
     *("motion", "painter", "symbols", "strip", "style", "elements", "pointers"),
-    *LIVE_MODULES,
+    *("engine", "follow", "hand", "sliders", "address", "live"),
     *("player", "mount"),
 )
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.

@@ -1,0 +1,76 @@
+"""Modules out of LLVM's object code: exports, imports and constants, and what is no object code."""
+
+import numpy as np
+import pytest
+
+from tests.wasm_host import Host
+from udkjax.native.ir import POINTER, Function
+from udkjax.native.wasm import compile_wasm
+from udkjax.native.wasm.object_code import MAGIC, Reader, leb128, link
+
+
+@pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**21 - 1, 2**32])
+def test_whole_numbers_are_read_as_they_are_written(number):
+    reader = Reader(leb128(number) + b"\x05")
+    assert reader.number() == number and reader.byte() == 5 and not reader
+
+
+@pytest.mark.parametrize(("number", "code"), [(624485, b"\xe5\x8e\x26"), (3, b"\x03")])
+def test_leb128_is_that_of_the_specification(number, code):
+    assert leb128(number) == code
+
+
+def doubled(name, factor):
+    f = Function(name, [(POINTER, "x"), (POINTER, "y")])
+    f.store(f.load(f.given["x"]) * factor, f.given["y"])
+    return f
+
+
+def test_each_of_several_functions_is_exported_by_its_name():
+    text = "\n".join(doubled(name, factor).text() for name, factor in (("twice", 2.0), ("hidden", 5.0), ("thrice", 3.0)))
+    linked = compile_wasm(text, ("thrice", "twice"))
+    host = Host(linked.code, linked.data_end)
+    host.begin()
+    x, y = host.put([7.0]), host.put([0.0])
+    for name, expected in (("twice", 14.0), ("thrice", 21.0)):
+        host.call(name, x, y)
+        assert host.numbers(y, 1)[0] == expected
+    assert linked.imports == () and linked.data_end == 0
+
+
+def test_functions_that_are_no_instructions_are_imports():
+    f = Function("both", [(POINTER, "x"), (POINTER, "y")])
+    f.store(f.intrinsic("exp", f.load(f.given["x"])) + f.intrinsic("sqrt", f.load(f.given["x"])), f.given["y"])
+    linked = compile_wasm("\n".join([*f.declared, f.text()]), ("both",))
+    assert linked.imports == ("exp",)
+    host = Host(linked.code, linked.data_end)
+    host.begin()
+    x, y = host.put([2.0]), host.put([0.0])
+    host.call("both", x, y)
+    assert host.numbers(y, 1)[0] == pytest.approx(np.exp(2.0) + np.sqrt(2.0), rel=1e-15)
+
+
+def test_constants_are_at_the_beginning_of_memory():
+    text = "@table = private unnamed_addr constant [2 x double] [double 1.5, double 2.5], align 8\n"
+    f = Function("read", [(POINTER, "k"), (POINTER, "y")])
+    place = f.op(f"fptosi double {f.load(f.given['k']).name} to i64", "i64")
+    f.store(f.load(f.at("@table", place)), f.given["y"])
+    linked = compile_wasm(text + f.text(), ("read",))
+    assert linked.data_end == 16
+    host = Host(linked.code, linked.data_end)
+    host.begin()
+    y = host.put([0.0])
+    host.call("read", host.put([1.0]), y)
+    assert host.numbers(y, 1)[0] == 2.5
+
+
+def test_what_is_missing_is_named():
+    with pytest.raises(ValueError, match="the module has no function 'walk'"):
+        compile_wasm(doubled("run", 2.0).text(), ("run", "walk"))
+
+
+@pytest.mark.parametrize("code", [b"", b"\x7fELF\x02\x01\x01\x00"])
+def test_what_is_no_webassembly_is_refused(code):
+    with pytest.raises(ValueError, match="no WebAssembly"):
+        link(code, ("run",))
+    assert code != MAGIC

@@ -1,0 +1,39 @@
+// The numbers of a live page in its address, so that whoever opens it sees the same motion.
+
+export class Address {
+  constructor(live) { this.live = live; }
+
+  /** Whether the page has an address of its own: not within another page. */
+  get exists() { return Boolean(this.live.player.options.fill) && location.protocol !== "about:"; }
+
+  /** The numbers that are not those of the scene. */
+  get words() {
+    const {data: {sliders}, values} = this.live, changed = sliders.map((s, k) => [s, values[k]]).filter(([s, x]) => x !== s.value);
+    return new URLSearchParams(changed.map(([s, x]) => [s.name, String(x)])).toString();
+  }
+
+  write() {
+    if (this.exists) history.replaceState(null, "", `#${this.words}`);
+  }
+
+  read() {
+    if (!this.exists) return;
+    const given = new URLSearchParams(location.hash.slice(1)), numbers = {};
+    for (const {name} of this.live.data.sliders) {
+      const value = Number(given.get(name));
+      if (given.get(name) && Number.isFinite(value)) numbers[name] = value;
+    }
+    if (Object.keys(numbers).length) this.live.change(numbers);
+  }
+
+  async copy() {
+    const {live, words} = this;
+    this.write();
+    try {
+      await navigator.clipboard.writeText(this.exists ? location.href : `#${words}`);
+      live.say("The address with these numbers is copied.");
+    } catch {
+      live.say(this.exists ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+    }
+  }
+}
