@@ -6,6 +6,7 @@ import {test} from "node:test";
 const page = name => import(new URL(`../../udkjax/studio/page/${name}.js`, import.meta.url));
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
+const {applyFix} = await page("fixes");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry, stateAt} = await page("mover"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
@@ -201,6 +202,19 @@ test("every element has symbols that name it, and strange ones have none", () =>
   const strange = {format: 2, pins: {A: ["nan", 0], B: null, C: [1], D: [0, 0]}, link: [{name: "x", pins: ["A", "Z"]}, {name: "y"}, {name: "z", pins: ["D"]}], motor: [{}, {pin: "Z"}, {slide: "no"}],
     gear: [{}, {links: ["x", "y"], teeth: [0, 0]}], cam: [{}, {pins: ["A", "D"], profile: {angle: [1, 2, 3], radius: ["x", 1, 1]}}], slide: [{}], slot: [{}], spring: [{}, {between: ["A", "D"]}], damper: [{}], load: [{}]};
   for (const {points = [], frame} of symbolsOf(strange, 1e-3)) assert.ok([...points.flat(), ...frame.flat()].every(Number.isFinite));
+});
+
+test("a fix makes a pin a slot, and the link that gives it up keeps its mass", () => {
+  const document = fourBar(), scene = {bodies: ["link1", "link2", "link3"], frames: [[0.015, 0.02, 0], [0.075, 0.065, 0], [0.11, 0.045, 0]], masses: [1, 2, 3], inertias: [0.1, 0.2, 0.3]};
+  const drawn = {kind: "slot", on: "link2", link: "link1", direction: [1, 1e-17]}, found = applyFix(document, {constraint: "B", drawn}, scene);
+  assert.deepEqual(found.slot, [{pin: "B", direction: [1, 0], on: "link2"}]);
+  assert.deepEqual(found.link[1], {name: "link2", pins: ["C"], mass: "2 kg", inertia: "0.2 kg m2", centre: [75, 65]});
+  assert.deepEqual(d.members(found, "B"), ["link1"]);
+  const free = applyFix(document, {constraint: "A", drawn: {kind: "slot", on: "ground", link: "link1", direction: [0, 1]}}, scene);
+  assert.deepEqual([free.ground, free.slot], [["D"], [{pin: "A", direction: [0, 1]}]]);
+  assert.equal(applyFix(document, {constraint: "B", drawn: null}, scene), null);
+  assert.equal(applyFix(document, {constraint: "B", drawn: {...drawn, on: "link3"}}, scene), null);
+  assert.equal(applyFix({...document, gear: [{links: ["link1", "link3"], teeth: [1, 2]}]}, {constraint: "gear1", drawn: {kind: "remove"}}, scene).gear, undefined);
 });
 
 test("a view far inside of a drawing, or of places without end, costs nothing", () => {

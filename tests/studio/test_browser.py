@@ -486,3 +486,17 @@ def test_a_pin_is_freed_by_a_click_and_the_motion_stays(studio):
     studio.page.keyboard.press("Control+z")
     studio.settle()
     assert "1 redundant constraint" in studio.findings
+
+
+@pytest.mark.slow
+def test_arrows_move_what_is_selected_by_steps_of_the_grid(studio):
+    studio.link((40, 100), (60, 130))
+    studio.tool("v")
+    studio.click(60, 130)
+    step = 1e3 * studio.js("studio.gridUnit()")
+    for key in ("ArrowRight", "ArrowRight", "ArrowUp", "ArrowLeft"):
+        studio.page.keyboard.press(key)
+    assert studio.document["pins"]["B"] == pytest.approx([60 + step, 130 + step])
+    for _ in range(4):
+        studio.page.keyboard.press("Control+z")
+    assert studio.document["pins"]["B"] == [60, 130]

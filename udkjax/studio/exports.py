@@ -1,5 +1,6 @@
 """A drawing in other forms: a page, pictures, a film, a table of its motion, a script."""
 
+import contextlib
 import csv
 import io
 import tempfile
@@ -8,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from udkjax.integrate import Solution
+from udkjax.native.program import UnsupportedError
 from udkjax.scene import Mechanism
-from udkjax.show.player import animate
+from udkjax.show.player import Animation, animate
 from udkjax.studio.shown_runs import INSTANTS, duration_of, shown_run
 
 SCRIPT = '''"""{title}, drawn in the studio of udkjax."""
@@ -34,7 +36,8 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
     Args:
         mechanism: that is drawn.
         text: its file.
-        suffix: .html, .svg, .png, .gif, .dxf (as `animate` saves them), .csv (positions over time), or .py.
+        suffix: .html (a page that solves the motion anew), .svg, .png, .gif or .dxf, as `animate` saves them; .csv (positions
+            over time) or .py (a script).
     """
     if suffix == ".py":
         return script(mechanism, text).encode()
@@ -43,8 +46,16 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
         return table(mechanism, run).encode()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"drawing{suffix}"
-        animate(mechanism, run).save(path)
+        shown(mechanism, run, suffix).save(path)
         return path.read_bytes()
+
+
+def shown(mechanism: Mechanism, run: Solution, suffix: str) -> Animation:
+    """Return a run as an animation; as a page it solves the motion anew, where machine code can."""
+    if suffix == ".html":
+        with contextlib.suppress(ValueError, UnsupportedError):
+            return animate(mechanism, run, live=True)
+    return animate(mechanism, run)
 
 
 def script(mechanism: Mechanism, text: str) -> str:

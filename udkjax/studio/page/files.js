@@ -4,7 +4,7 @@ import {ask} from "./api.js";
 import {EMPTY} from "./document.js";
 import {make} from "./player/elements.js";
 
-const EXPORTS = {html: "page that moves, offline", svg: "picture", png: "picture in pixels", gif: "film", dxf: "drawing for CAD", csv: "table of the motion", py: "Python script"};
+const EXPORTS = {html: "page that simulates, offline", svg: "picture", png: "picture in pixels", gif: "film", dxf: "drawing for CAD", csv: "table of the motion", py: "Python script"};
 
 export class FileActions {
   constructor(studio) {

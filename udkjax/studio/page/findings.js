@@ -38,7 +38,8 @@ export class FindingsPanel {
     this.mark([]);
     this.replace(
       make("p", {class: "lead"}, "Draw a mechanism"),
-      make("p", {}, "Press L and drag links from pin to pin; G fixes a pin to the ground; M puts a motor on one. Or open a template."));
+      make("p", {}, "Press L and drag links from pin to pin; G fixes a pin to the ground; M puts a motor on one."),
+      make("div", {class: "group"}, make("button", {type: "button", onclick: () => this.studio.files.showOpen()}, "Open a file or a template")));
   }
 
   /** Mistakes, as the reader of files names them; each leads to its element. */

@@ -1,8 +1,9 @@
 // The keyboard: what users of drawing programs expect.
 
-import {duplicate, removeElements} from "./document.js";
+import {duplicate, pinsOfItems, removeElements, settleSlots, shiftPins} from "./document.js";
 import {TOOLS} from "./tools.js";
 
+const TIME_STEPS = 100;  // of an arrow, in a run
 const COPY_PIXELS = 24;  // between what is duplicated and its copy
 const typing = target => ["INPUT", "TEXTAREA", "SELECT"].includes(target.tagName) && target.type !== "range" && target.type !== "checkbox";
 
@@ -33,12 +34,24 @@ const plain = studio => ({
   Backspace: () => remove(studio),
   Escape: () => { if (!studio.gestures.cancel()) { if (studio.tool !== "select") studio.setTool("select"); else studio.select([]); } },
   Enter: () => studio.gestures.finish(),
+  ArrowLeft: () => nudge(studio, -1, 0),
+  ArrowRight: () => nudge(studio, 1, 0),
+  ArrowUp: () => nudge(studio, 0, 1),
+  ArrowDown: () => nudge(studio, 0, -1),
   Home: () => studio.rewind(),
   " ": () => studio.motion.toggle(),
   f: () => studio.fit(),
   "?": () => studio.parts.help.showModal(),
   ...Object.fromEntries(TOOLS.map(tool => [tool.key, () => studio.setTool(tool.name)])),
 });
+
+/** Move what is selected by a step of the grid; without it, or away from the drawing, the arrows go through time. */
+function nudge(studio, x, y) {
+  const pins = pinsOfItems(studio.document, studio.selection), step = studio.gridUnit();
+  if (pins.length && !studio.isMoved) return studio.commit(settleSlots(shiftPins(studio.document, pins, x * step, y * step)));
+  studio.motion.pause();
+  return studio.motion.seek(studio.motion.t + (x || y) * studio.motion.end / TIME_STEPS);
+}
 
 export function remove(studio) {
   if (studio.selection.length) studio.commit(removeElements(studio.document, studio.selection), []);

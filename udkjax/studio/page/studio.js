@@ -151,10 +151,16 @@ class Studio {
     this.setView(fit(places, width || 800, height || 600, NEW_SIZE));
   }
 
+  /** The distance (m) of places that are snapped to. */
+  gridUnit() {
+    const unit = lengthUnit(this.document);
+    return unit * niceBelow(2 * SNAP_PIXELS / this.view.scale / unit);
+  }
+
   /** A place on the grid, unless Alt is held. */
   snap(place, event) {
     if (!this.show.snap || event.altKey) return place;
-    const unit = lengthUnit(this.document), step = niceBelow(2 * SNAP_PIXELS / this.view.scale / unit);
+    const unit = lengthUnit(this.document), step = this.gridUnit() / unit;
     return place.map(x => tidy(Math.round(x / unit / step) * step) * unit);
   }
 
