@@ -214,3 +214,17 @@ def test_fixes_are_changes_of_the_drawing(client):
         drawn = fix["drawn"]
         assert drawn["kind"] == "slot" and {drawn["on"], drawn["link"]} < {"ground", "link1", "link2", "link3", "coupler"}
         np.testing.assert_allclose(drawn["direction"], [np.sqrt(0.5), -np.sqrt(0.5)], atol=1e-12)  # along the crank, as drawn
+
+
+def test_the_engine_takes_places_of_pins_and_a_hand_that_nothing_drives(client):
+    answer = client.ask("compile", text=SIX_BAR, engine="wasm").json()
+    names = [parameter["name"] for parameter in answer["engine"]["parameters"]]
+    assert names == [f"pin.{pin}[{k}]" for pin in answer["pins"] for k in (0, 1)]
+    assert set(answer["engine"]["modules"]) == {"run", "close", "evaluate"}
+    assert set(answer["hand"]["modules"]) == {"close", "evaluate"}  # it is moved, and does not move
+    assert len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
+
+
+def test_a_motor_at_rest_has_a_finite_duration(client):
+    scene = client.ask("compile", text=SIX_BAR.replace("60 rpm", "0 rpm")).json()["scene"]
+    assert 0 < scene["duration"] < 100
