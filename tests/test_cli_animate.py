@@ -83,3 +83,30 @@ def test_a_run_that_failed_is_shown_and_how_it_ended_is_said(tmp_path, capsys):
     assert "step limit at t" in (tmp_path / "run.html").read_text()
     with pytest.warns(udk.show.player.animation.FailedRunWarning, match="the run failed: step limit"):
         udk.animate(mech, failed)
+
+
+def test_a_live_page_has_the_engine_and_the_sliders_that_are_named(run, tmp_path):
+    out = tmp_path / "live.html"
+    assert udkjax("animate", SCENE, "--t1", 1, "--out", out, "--live", "pin.B", "link.crank.mass") == 0
+    text = out.read_text()
+    assert [name in text for name in ('"name":"pin.B[0]"', '"name":"link.crank.mass"', '"name":"pin.C[0]"')] == [
+        True,
+        True,
+        False,
+    ]
+    assert udkjax("animate", run, "--live", "--out", out) == 0  # a run from a file, and all of its numbers
+    assert '"name":"pin.C[0]"' in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((SCENE, "--live", "pin.Q", "--out", "page.html"), 'no parameter "pin.Q"'),
+        ((SCENE, "--live", "--out", "page.gif"), "--live makes a page that simulates"),
+        ((SCENE, "examples/slider_crank.toml", "--t1", 1, "--live", "--out", "page.html"), "one mechanism and one solution"),
+    ],
+)
+def test_what_cannot_be_live_is_refused(words, said, tmp_path, capsys):
+    *given, out = words
+    assert udkjax("animate", *given, tmp_path / out) != 0
+    assert said in capsys.readouterr().err

@@ -743,15 +743,20 @@ class Engine {
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m). */
   measure(parameters, {ts, q, v, count}, efforts = false) {
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
-    const numbers = this.dressed(this.numbers(parameters), data.thresholds, ts[0]);
+    const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
-    const given = module.put(numbers), work = module.reserve(8 * module.module.size);
+    const given = module.reserve(8 * (data.count + 2)), work = module.reserve(8 * module.module.size);
     module.view(work, module.module.size).fill(0);
-    module.exports.prologue(given, work);
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
       efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)]))};
+    let next = -Infinity;  // until then the constants hold: samples change them
     for (let i = 0; i < count; i++) {
+      if (ts[i] >= next) {
+        module.view(given, data.count + 2).set(this.dressed(numbers, data.thresholds, ts[i]));
+        module.exports.prologue(given, work);
+        next = breaks.find(b => b > ts[i]) ?? Infinity;
+      }
       at("t")[0] = ts[i];
       copy("q", q.subarray(i * size, (i + 1) * size));
       copy("v", v.subarray(i * size, (i + 1) * size));

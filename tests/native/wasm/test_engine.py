@@ -16,6 +16,7 @@ SCENES = sorted(udk.library.__all__)
 FAST = ("parallelogram", "slider_crank", "planetary_gear")
 every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
 TIMES = np.linspace(0.0, 2.0, 41)
+SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds
 
 
 def both(operation, inputs, times):
@@ -41,10 +42,10 @@ def known_call(monkeypatch, module, do):
 
 @every_scene
 def test_a_run(monkeypatch, name):
-    mechanism = getattr(udk.library, name)()
+    mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
     found = []
     operation, inputs, times = known_call(
-        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, TIMES, engine="native"))
+        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, ts, engine="native"))
     )
     wasm, native = both(operation, inputs, times)
     for x, y in zip(wasm, native, strict=True):
@@ -66,6 +67,19 @@ def test_closing(name):
         assert_array_equal(x, y)
     assert rank[0, 0] == analysis.rank
     assert np.all(np.abs(residuals[0, : residuals.shape[1] // 2]) <= 1e-9 * np.asarray(analysis.scales.rows))
+
+
+def test_a_scene_that_runs_by_loops(monkeypatch):
+    mechanism, found = udk.library.n_four_bar(14), []
+    times = np.linspace(0.0, 0.2, 5)
+    operation, inputs, count = known_call(
+        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, times, engine="native"))
+    )
+    assert not operation.code.is_small
+    wasm, native = both(operation, inputs, count)
+    for x, y in zip(wasm, native, strict=True):
+        assert_array_equal(x, y)
+    assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(times), -1)[1:-1], rtol=0, atol=1e-6)
 
 
 def test_marching(monkeypatch):

@@ -104,6 +104,25 @@ def test_the_motion_is_the_one_that_python_simulates(opened, name):
             assert_allclose(shown, values, rtol=0, atol=1e-6 * max(1.0, float(np.abs(values).max())))
 
 
+def test_samples_of_loads_and_motions_hold_between_their_times(opened):
+    """A motor that follows a spline, against a torque that is held between samples: both are in what it has to exert."""
+    knots = np.linspace(0.0, 2.0, 6)
+    mechanism = udk.Mechanism(
+        {"arm": udk.Body(2.0, 0.3, (0.5, 0.0))},
+        {"axle": udk.Revolute(("ground", "arm"), [(0.0, 0.0), (-0.5, 0.0)])},
+        {"motor": udk.Driver(("ground", "arm"), "angle", udk.Spline(knots, 0.4 * np.sin(2 * knots)))},
+        {"brake": udk.Torque(("ground", "arm"), udk.Held([1.0, -2.0, 3.0], dt=0.6))},
+    )
+    ts = TS + 1e-3  # beside the samples
+    animation = udk.animate(mechanism, udk.simulate(mechanism, ts), live=["gravity[1]", "body.arm.mass"])
+    other = mechanism.with_parameters({"gravity[1]": -3.0, "body.arm.mass": 1.5})
+    run = udk.simulate(other, ts)
+    with opened(animation) as page:
+        page.evaluate(f"{LIVE}.change({{'gravity[1]': -3.0, 'body.arm.mass': 1.5}})")
+        assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(ts), -1), atol=1e-8)
+        assert_allclose(measure(page, "torque of motor"), udk.efforts(other, run)["motor"], atol=1e-6)
+
+
 def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
     with opened(live) as page:
         plain(page)
