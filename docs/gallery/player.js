@@ -412,7 +412,7 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
     context.stroke();
   });
   painter.line([[x(t), top - 4], [x(t), bottom]], 1.2, theme.ink);
-  const ends = {back: theme.panel, align: "right", size: 10.5}, back = value => (log ? 10 ** value : value);
+  const ends = {back: theme.panel, align: "right", size: 11}, back = value => (log ? 10 ** value : value);
   painter.text(short(back(high)), [right, top + 3], theme.soft, ends);
   painter.text(short(back(low)), [right, bottom - 7], theme.soft, ends);
   // Values at this time, from the right: one for each run, in its colour; without the runs' names where there is no room.
