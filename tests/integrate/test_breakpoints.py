@@ -277,3 +277,27 @@ def test_a_force_that_names_its_pieces():
     x = np.where(since < 0, rate * since, np.where(w * since < np.pi, rate / w * np.sin(w * since), -rate * (since - np.pi / w)))
     v = np.where(since < 0, rate, np.where(w * since < np.pi, rate * np.cos(w * since), -rate))
     assert_within([sol.q[:, 0, 0], sol.v[:, 0, 0]], [x, v], tol)
+
+
+class Reversal(udk.ForceElement):
+    """A force along x that changes its sign at a time."""
+
+    time: float = 0.3
+
+    def loads(self, t, *frames):
+        return [(jnp.where(t < self.time, 1.0, -5.0), 0.0, 0.0)]
+
+    @property
+    def breakpoints(self):
+        return [self.time]
+
+
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("end", [0.3, 0.5])
+def test_an_event_and_the_end_may_be_at_a_breakpoint(engine, end):
+    ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1)}, forces=[Reversal(["ball"])], gravity=(0.0, 0.0))
+    line = udk.Event(lambda t, at: at["ball"].x - 0.045, udk.Log(), name="line")  # which it passes at 0.3 s, but for rounding
+    found = udk.simulate(ball, [0.0, end], events=[line], engine=engine, rtol=1e-8, atol=1e-8)
+    later = end - 0.3
+    assert_allclose(found.q[-1, 0, 0], 0.045 + 0.3 * later - 2.5 * later**2, atol=1e-12)
+    assert found.stats["steps"] < 60  # not one window after another up to the breakpoint

@@ -24,7 +24,7 @@ def integrate_by_diffrax(
     problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
 ) -> IntegratorOutput:
     """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
-    ts, y0 = problem.ts, jnp.concatenate([problem.q, problem.v])
+    ts, y0 = _leave_breakpoints(problem), jnp.concatenate([problem.q, problem.v])
     if problem.compiled.plan.projected:  # machine code does so, and its derivatives are combined with those of this engine
         y0 = project(problem.equations, ts[0], y0)
     run = diffrax.diffeqsolve(
@@ -58,6 +58,20 @@ def integrate_by_diffrax(
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
     return IntegratorOutput(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
+
+
+def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:
+    """Return the times of a run that begins behind a breakpoint at its first time, and ends before one at its last.
+
+    A breakpoint nearer than the smallest step is one: no step leads from the one time to the other.
+    """
+    ts, breakpoints = problem.ts, problem.compiled.breakpoints
+    if breakpoints is None:
+        return ts
+    inf, is_near = np.inf, lambda t: jnp.abs(breakpoints - t) <= problem.smallest
+    start = jnp.max(jnp.where(is_near(ts[0]), jnp.nextafter(breakpoints, inf), -inf), initial=-inf)
+    end = jnp.min(jnp.where(is_near(ts[-1]), jnp.nextafter(breakpoints, -inf), inf), initial=inf)
+    return ts + stop_gradients(jnp.clip(ts, start, end) - ts)
 
 
 def derivative(t: Float[ArrayLike, ""], y: Float[Array, "2n"], equations: AbstractSystem) -> Float[Array, "2n"]:

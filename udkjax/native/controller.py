@@ -109,7 +109,8 @@ def write_decide(module: Module):
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
     # --- outputs
     ready = accept & ((s.accepted > 0.0) | (stepped & (s.last > 0.5)))
-    until = where(ready, s.t1, -np.inf)
+    # The last step may end a little before a breakpoint at the end of the run: outputs there are due, too.
+    until = where(ready, where(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
     if module.plan.breaks:
         enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
         until = where(enough, until + where(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
