@@ -1,4 +1,4 @@
-"""How the symbols of a mechanism follow its numbers, in a page where these change.
+"""Symbols of a mechanism that follow its numbers, in a page where these change.
 
 Places of symbols in the frames of bodies are numbers of the scene: points of joints and springs, radii of wheels, directions of
 rails. Those that equal one follow it:

@@ -1,4 +1,4 @@
-"""What a live page has besides: the engine of its mechanism, sliders, and how its symbols follow what they change.
+"""The data that a live page has besides: the engine of its mechanism, sliders, and symbols that follow what they change.
 
 live     engine (udkjax/integrate/portable), sliders (live_parameters.py), follow (followers.py), start: the state that closing
          begins with, or null where that is the scene's own guess

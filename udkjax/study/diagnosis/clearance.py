@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import BarycentricInterpolator
 from scipy.optimize import brentq
 
-from udkjax.study.diagnosis.configuration import NEIGHBOUR_STEP, Configuration, Positions
+from udkjax.study.diagnosis.configuration import NEIGHBOUR_STEP, Configuration, RankedPositions
 
 SLOPE_STEP = 1e-5  # of the characteristic length, and rad: the third root of rounding, for central differences
 WALK_STEPS = 160  # steps along the path in each direction: about a turn of everything, or more
@@ -41,7 +41,7 @@ class Clearance(NamedTuple):
     searched: float  # how far along the path
 
 
-def clearance(positions: Positions, at: Configuration, rank: int, walk: bool = True) -> Clearance:
+def clearance(positions: RankedPositions, at: Configuration, rank: int, walk: bool = True) -> Clearance:
     """Look for the next configuration where the rank is below `rank`, which it has in general."""
     if not rank or at.rank < rank:
         return Clearance(0.0 if rank else 1.0, 0.0 if rank else np.inf, None, 0.0)
@@ -53,13 +53,13 @@ def clearance(positions: Positions, at: Configuration, rank: int, walk: bool = T
     return Clearance(float(sigma / at.sigma[0]), estimate, nearest, searched)
 
 
-def _slope(positions: Positions, at: Configuration, direction: np.ndarray, rank: int) -> float:
+def _slope(positions: RankedPositions, at: Configuration, direction: np.ndarray, rank: int) -> float:
     step = SLOPE_STEP * positions.unit * direction
     change = positions.at(at.t, at.q + step).J - positions.at(at.t, at.q - step).J
     return float(at.u[:, rank - 1] @ change @ at.vt[rank - 1]) / (2 * SLOPE_STEP)
 
 
-def _search(positions: Positions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
+def _search(positions: RankedPositions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
     """Return the nearest rank change on the path, and how far that was followed."""
     onward, around = _walk(positions, start, rank, 1.0)
     back = [] if around else _walk(positions, start, rank, -1.0)[0]
@@ -74,7 +74,7 @@ def _search(positions: Positions, start: Configuration, rank: int) -> tuple[Rank
     return nearest, float(np.max(np.abs(way)))
 
 
-def _walk(positions: Positions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
+def _walk(positions: RankedPositions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
     """Follow closed positions along the path to beyond the first minimum of sigma; say whether they came back to the start."""
     path, more = [start], WALK_STEPS
     heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
@@ -99,12 +99,12 @@ def _has_kink(sigma: list[float]) -> bool:
     return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
-def _step(positions: Positions, at: Configuration, heading: np.ndarray, step: float, side: float) -> Configuration | None:
+def _step(positions: RankedPositions, at: Configuration, heading: np.ndarray, step: float, side: float) -> Configuration | None:
     t = at.t if heading.any() else at.t + side * positions.rows.driver_time_step * step
     return positions.displace(at, heading, step, t)
 
 
-def _root(positions: Positions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
+def _root(positions: RankedPositions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
     """Return the configuration beside the k-th position where sigma vanishes, if it does."""
     if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None

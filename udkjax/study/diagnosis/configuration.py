@@ -47,7 +47,7 @@ class Configuration(NamedTuple):
         return float(self.sigma[self.rank - 1] / self.sigma[0]) if self.rank else 1.0
 
 
-class Positions:
+class RankedPositions:
     """The closed positions of one mechanism."""
 
     def __init__(self, rows: KinematicRows, rank_tol: float):

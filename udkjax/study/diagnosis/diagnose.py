@@ -10,7 +10,7 @@ from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import StateHistory
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, JointForces, Positions, decompose
+from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
 from udkjax.study.diagnosis.diagnosis import Diagnosis
 from udkjax.study.diagnosis.fixes import Fix, Redundancy, fixes_of
@@ -61,7 +61,7 @@ def diagnose(
     require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # velocities have no part in it
     q = np.asarray(closure.state.q, float)
     rows = KinematicRows(mechanism)
-    positions = Positions(rows, rank_tol)
+    positions = RankedPositions(rows, rank_tol)
     here = positions.at(float(t), q.ravel())
     around = positions.around(here)
     ordinary = max([here.rank, *(c.rank for c in around)])
@@ -126,7 +126,7 @@ def _choose_redundant(N: np.ndarray) -> list[int]:
 
 
 def _fixes(
-    mechanism: Mechanism, positions: Positions, usual: list[Configuration], owners: list[str], dependency: Dependency
+    mechanism: Mechanism, positions: RankedPositions, usual: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[Fix]:
     """Return the fixes of a set; its stress is that of the first of the positions."""
     first = max(usual, key=lambda c: c.smallest)
@@ -134,7 +134,9 @@ def _fixes(
     return fixes_of(mechanism, positions, [first, *others], owners, dependency)
 
 
-def _cure(mechanism: Mechanism, positions: Positions, usual: list[Configuration], found: list[Redundancy]) -> tuple[Fix, ...]:
+def _cure(
+    mechanism: Mechanism, positions: RankedPositions, usual: list[Configuration], found: list[Redundancy]
+) -> tuple[Fix, ...]:
     """Return the best fixes one after another, each found on what the one before has left, until nothing is redundant."""
     done: list[Fix] = []
     current, at, sets = mechanism, usual, [r for r in found if r.permanent]
@@ -145,7 +147,7 @@ def _cure(mechanism: Mechanism, positions: Positions, usual: list[Configuration]
         done.append(best)
         current = best.mechanism
         rows = KinematicRows(current)
-        here = Positions(rows, positions.rank_tol)
+        here = RankedPositions(rows, positions.rank_tol)
         at, owners = [here.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
         attached = {name: current.frames_of(element) for name, element in current.constraints.items()}
         first = max(at, key=lambda c: c.smallest)

@@ -15,7 +15,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Constraint, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.diagnosis.configuration import Configuration, Positions, decompose
+from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
 SMALLEST_PIVOT = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
@@ -70,7 +70,7 @@ class Redundancy(NamedTuple):
 
 
 def fixes_of(
-    mechanism: Mechanism, positions: Positions, at: list[Configuration], owners: list[str], dependency: Dependency
+    mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[Fix]:
     """Return for each constraint of a dependent set the best change, verified, the best conditioned first.
 
@@ -163,7 +163,7 @@ def _effect(
 
 def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
     """Return True if the changed mechanism is closed in all positions, has the same mobility there, and fewer redundant rows."""
-    positions = Positions(KinematicRows(after), rank_tol)
+    positions = RankedPositions(KinematicRows(after), rank_tol)
     seen = [positions.at(position.t, position.q) for position in at]
     closed = all(
         np.max(np.abs(positions.rows.residual(c.t, c.q)), initial=0.0) < rank_tol * max(1.0, positions.rows.scales.size(c.q, np))

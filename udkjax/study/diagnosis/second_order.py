@@ -14,7 +14,7 @@ import numpy as np
 
 from udkjax.equations import constraints
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.diagnosis.configuration import Configuration, Positions
+from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
 N_STARTS = 400  # directions to look from
 ITERATIONS = 60
@@ -35,7 +35,7 @@ class Branch(NamedTuple):
     followed: bool  # whether a closed position was found along it, on both sides
 
 
-def branches(mechanism: Mechanism, positions: Positions, at: Configuration) -> list[Branch]:
+def branches(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> list[Branch]:
     """Return the branches that meet at a configuration; of one that is not singular, the directions in which it moves."""
     A, N, V = quadratic_forms(mechanism, positions, at), at.left, at.right
     if not V.shape[1]:
@@ -44,7 +44,7 @@ def branches(mechanism: Mechanism, positions: Positions, at: Configuration) -> l
     return [_follow(positions, at, V @ zeros.space, zeros.dimension) for zeros in found]
 
 
-def quadratic_forms(mechanism: Mechanism, positions: Positions, at: Configuration) -> np.ndarray:
+def quadratic_forms(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> np.ndarray:
     """Return the forms A (k, d, d) of the second-order condition: N^T of the second derivative of scaled Psi along V."""
     N, V = at.left, at.right
     if not N.shape[1] or not V.shape[1]:
@@ -115,7 +115,7 @@ def _inside(one: np.ndarray, two: np.ndarray) -> bool:
     return one.shape[1] < two.shape[1] and bool(np.linalg.norm(one - two @ (two.T @ one)) < SAME_DIRECTION)
 
 
-def _follow(positions: Positions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
+def _follow(positions: RankedPositions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
     tangent = tangents @ np.ones(tangents.shape[1]) / np.sqrt(tangents.shape[1])
     size = positions.rows.scales.size(positions.unit * tangent, np)
     tangent = tangent / size * np.sign(tangent[np.argmax(np.abs(tangent))])
@@ -128,5 +128,5 @@ def _follow(positions: Positions, at: Configuration, tangents: np.ndarray, dimen
     return Branch((positions.unit * tangent).reshape(-1, 3), dimension, rank, len(reached) == 2)
 
 
-def _reaches(positions: Positions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:
+def _reaches(positions: RankedPositions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:
     return end is not None and bool(np.linalg.norm((end.q - at.q) / positions.unit - way) < TANGENT_TOL * np.linalg.norm(way))

@@ -38,7 +38,7 @@ OTHER_TOL = 0.01, 10.0  # of the tolerance: where errors are measured; the secon
 SMALLEST_TOL = 1e-14  # below it, step control follows rounding errors
 
 
-class Place(NamedTuple):
+class DisagreementPlace(NamedTuple):
     """A time (s) at which a derivative differs most from its difference; both are in units of the channel per unit of z."""
 
     record: int
@@ -82,7 +82,7 @@ class GradientCheck:
     truncation: Float[np.ndarray, "D S H"]
     derivative_error: Float[np.ndarray, "D S"]
     size: Float[np.ndarray, "D S"]
-    places: tuple[tuple[Place, ...], ...]
+    places: tuple[tuple[DisagreementPlace, ...], ...]
     tol: Tolerances
     other_tol: Tolerances
 
@@ -235,14 +235,16 @@ def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) 
     return np.where((code == Result.successful)[:, None], seen, np.nan)
 
 
-def _places(problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, found: Differences) -> tuple[Place, ...]:
+def _places(
+    problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, found: Differences
+) -> tuple[DisagreementPlace, ...]:
     places = []
     for rows, best in zip(series, best_steps((found.noise + found.truncation).T), strict=True):
         difference = found.values[best][rows]
         worst = int(np.argmax(np.abs(difference - slope[rows])))
         record, time, channel = problem.index[rows[worst]]
         name, t = problem.channel_names[channel], float(problem.ts[record, time])
-        places.append(Place(int(record), name, t, float(slope[rows[worst]]), float(difference[worst])))
+        places.append(DisagreementPlace(int(record), name, t, float(slope[rows[worst]]), float(difference[worst])))
     return tuple(places)
 
 
