@@ -66,6 +66,22 @@ export function extent(document, usual = 0.1) {
   return Math.max(along(0), along(1)) || usual;
 }
 
+/** Places (m) between which all of a drawing is: pins, corners of links, rims of discs, wheels and cams. */
+export function extentPoints(document) {
+  const found = Object.keys(pinsOf(document)).map(pin => placeOf(document, pin)).filter(Boolean);
+  const rim = ([x, y], r) => found.push([x - r, y - r], [x + r, y + r]);
+  for (const link of list(document, "link")) {
+    const shape = linkShape(document, link);
+    if (shape?.kind === "disc") rim(shape.at, shape.radius); else found.push(...shape?.points ?? []);
+  }
+  for (const gear of list(document, "gear")) {
+    const wheels = gearWheels(document, gear);
+    wheels?.radii.forEach((radius, k) => rim(placeOf(document, wheels.pins[k]), radius));
+  }
+  for (const cam of list(document, "cam")) found.push(...camOutline(document, cam, 12)?.points ?? []);
+  return found;
+}
+
 /** The pin by which a link turns on its carrier. */
 export function centrePin(document, link, carrier = "ground") {
   const pins = link === "ground" ? groundOf(document) : list(document, "link").find(entry => entry.name === link)?.pins ?? [];

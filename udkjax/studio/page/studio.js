@@ -3,7 +3,7 @@
 import {askedFile} from "./api.js";
 import {DrawingCanvas} from "./canvas.js";
 import {CurvesPanel} from "./curves.js";
-import {EMPTY, list, members, placeOf, pinsOf} from "./document.js";
+import {EMPTY, list, members, pinsOf} from "./document.js";
 import {FileActions} from "./files.js";
 import {FindingsPanel} from "./findings.js";
 import {Gestures} from "./gestures.js";
@@ -16,6 +16,7 @@ import {PropertiesPanel} from "./properties.js";
 import {SourcePanel} from "./source.js";
 import {Sync} from "./sync.js";
 import {toolOf} from "./tools.js";
+import {extentPoints} from "./shapes.js";
 import {lengthUnit, niceBelow, tidy} from "./units.js";
 import {fit} from "./view.js";
 import {THEMES} from "./player/painter.js";
@@ -145,7 +146,7 @@ class Studio {
   pan(dx, dy) { this.setView({...this.view, x: this.view.x + dx, y: this.view.y + dy}); }
 
   fit() {
-    const places = Object.keys(pinsOf(this.document)).map(pin => placeOf(this.document, pin)).filter(Boolean);
+    const places = extentPoints(this.document);
     for (const {line} of this.paths) for (let k = 0; k < line.length; k += 2) places.push([line[k], line[k + 1]]);
     const {width, height} = this.canvas;
     this.setView(fit(places, width || 800, height || 600, NEW_SIZE));
