@@ -84,9 +84,10 @@ class Draft {
     if (!place) return;
     const body = this.bodyOf(name);
     if (groundOf(this.document).includes(name)) {
-      const frame = at(-1, place, 0, 0);
+      const frame = at(-1, place, 0, 0), links = list(this.document, "link").filter(link => link.pins?.includes(name));
+      const layer = links.some(link => link.pins.length === 1) ? "elements" : "rails";  // a wheel would hide it
       for (const symbol of [line(frame, offsets([[0, 0], [-10, -17], [10, -17]]), "soft", 1.4, "back", true),
-        line(frame, offsets([[-15, -17], [15, -17]]), "soft", 1.4), ...hatch(frame, -10, 16, 5, -17)]) this.rails.push({...symbol, of});
+        line(frame, offsets([[-15, -17], [15, -17]]), "soft", 1.4), ...hatch(frame, -10, 16, 5, -17)]) this[layer].push({...symbol, of});
     }
     this.pins.push({...circle(at(body, place), [0, 4.2], "back", "ink", 1.7), of});
   }
