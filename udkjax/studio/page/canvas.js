@@ -31,8 +31,13 @@ export class DrawingCanvas {
 
   /** The link that carries a pin, or -1 for the ground. */
   carrier(document, pin) {
-    if (groundOf(document).includes(pin)) return -1;
-    return list(document, "link").findIndex(link => link.pins?.includes(pin));
+    if (this.carriers?.document !== document) {
+      const found = new Map();
+      list(document, "link").forEach((link, k) => { for (const name of link.pins ?? []) if (!found.has(name)) found.set(name, k); });
+      for (const name of groundOf(document)) found.set(name, -1);
+      this.carriers = {document, found};
+    }
+    return this.carriers.found.get(pin) ?? -1;
   }
 
   /** The pixels of all pins, except some. */
