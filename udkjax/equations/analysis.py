@@ -104,8 +104,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
     Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
     the known one that it was made from by `with_parameters`: a run watches the rows that are left out, and says so where
     numbers made one of them independent. A mechanism whose geometry is traced as an argument of a function under `jit` has no
-    origin: its redundant rows stay unknown, and `Auto` then takes singular values throughout, with diffrax: correct, but
-    hundreds of times slower. Analyse it before the trace, and pass the analysis on: `simulate(mechanism, ts, analysis=analysis)`.
+    origin: its redundant rows are not known here, and a run finds them when it begins.
 
     Args:
         mechanism: The scene; its numbers may be traced.

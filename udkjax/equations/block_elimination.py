@@ -17,6 +17,7 @@ from udkjax.equations.scene_layout import (
     DROP_TOL,
     ENTRIES,
     RIGHT,
+    ROW,
     SAFE_TOL,
     ConstraintGroup,
     arrays_of_solve,
@@ -71,12 +72,14 @@ class BlockElimination:
         yield from self._gram
         yield Reset("nearness", 0, 1)
         yield Reset("trusted", 0, 1, 1.0)
+        layout = self.terms.layout
+        first_mark = layout.first_mark if layout.leaves_out_marked else None
         for e in self.order:
 
             def write(w: KernelWriter, e: Fronts = e):
-                _eliminate(w, e.size, e.later_sizes, dropping)
+                _eliminate(w, e.size, e.later_sizes, dropping, first_mark)
 
-            key = ("eliminate", e.size, e.later_sizes, dropping)
+            key = ("eliminate", e.size, e.later_sizes, dropping, first_mark)
             yield KernelLoop(self.terms.kernel(key, write), self._front_table(e))
 
     def solve(self, solve: int = 0) -> Parts:
@@ -130,6 +133,21 @@ class BlockElimination:
 
             blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
             yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
+
+    def independent(self) -> Parts:
+        """Write `independent`: one for each row that the last factorization did not leave out, zero for the others."""
+        starts: dict[int, list[list[int]]] = {}
+        for block, (start, size) in enumerate(zip(self._diagonals, self._sizes, strict=True)):
+            starts.setdefault(size, []).append([start, self._place(block, ROW)])
+        for p, table in sorted(starts.items()):
+
+            def mark(w: KernelWriter, p: int = p):
+                zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
+                for j in range(p):
+                    inverse = w.read("factors", 0, p + triangle(j, j))
+                    w.write(where(greater(absolute(inverse), zero), one, zero), "independent", 1, j)
+
+            yield KernelLoop(self.terms.kernel(("independent", p), mark), np.array(table))
 
     # --- the matrix
 
@@ -211,7 +229,7 @@ def _scaled(w: KernelWriter, row: list[Scalar], base: Callable[[int], int]) -> l
 # Kernels of a front: a block of p rows, and the later blocks that it meets, of so many rows each.
 
 
-def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool) -> None:
+def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool, first_mark: int | None) -> None:
     drop_tol, safe_tol = (w.read("constants", None, tol) for tol in (DROP_TOL, SAFE_TOL))
     zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
     S = [[w.read("gram", 0, p + triangle(i, j)) for j in range(i + 1)] for i in range(p)]
@@ -222,8 +240,13 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool) 
         inverse = reciprocal = one / pivot
         if dropping:
             inverse = where(greater(pivot, diagonal * drop_tol), reciprocal, zero)
-        w.write(absolute(diagonal * reciprocal), "nearness", None, 0, MAXIMUM)
-        w.write(greater(pivot, diagonal * safe_tol), "trusted", None, 0, ALL)
+        nearness, trusted = absolute(diagonal * reciprocal), greater(pivot, diagonal * safe_tol)
+        if first_mark is not None:
+            is_independent = greater(w.read("constants", 1, first_mark + j), zero)
+            inverse, nearness = (where(is_independent, x, zero) for x in (inverse, nearness))
+            trusted = where(is_independent, trusted, w.graph.constant(True, bool))
+        w.write(nearness, "nearness", None, 0, MAXIMUM)
+        w.write(trusted, "trusted", None, 0, ALL)
         for i in range(j + 1, p):
             lower = S[i][j] * inverse
             for k in range(j + 1, i + 1):

@@ -94,7 +94,7 @@ class ForceGroup(ElementGroup):
 class SceneLayout:
     """The groups of a scene's elements, and the sizes of all arrays, for one choice of rows that are eliminated."""
 
-    def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...], baumgarte: bool, every_row: bool):
+    def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...] | None, baumgarte: bool, every_row: bool):
         self.gains, self.baumgarte = 2 if baumgarte else 0, baumgarte
         self.body_count = len(mechanism.body_names)
         self.coordinate_count = 3 * self.body_count
@@ -116,7 +116,11 @@ class SceneLayout:
         }
         self._eliminated = 0  # rows so far
         self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
-        rows = self._find_rows(redundant_rows)
+        rows = self._find_rows(redundant_rows or ())
+        # Where redundant rows are numbers, too: which rows are independent, in the order of their elimination.
+        self.marks, self.first_mark = self.row_count if redundant_rows is None else 0, self.constant_count
+        self.constant_count += self.marks
+        self.leaves_out_marked = bool(self.marks) and not every_row
         self.constraints = [self._constraint_group(kind, rows, every_row) for kind in self._kinds(rows)]
         forces = element_kinds(mechanism, list(mechanism.forces.values()))
         self.forces = [self._force_group(kind) for kind in forces]

@@ -26,7 +26,23 @@ from udkjax.scene.mechanism import Mechanism
 WRITTEN_OUT_OPERATIONS = 2800
 
 # The arrays that programs return; all others are scratch.
-RESULTS = ("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy")
+RESULTS = (
+    "a",
+    "q1",
+    "v1",
+    "dq1",
+    "dv1",
+    "psi",
+    "psi_dot",
+    "terms",
+    "rank",
+    "distance",
+    "safe",
+    "pieces",
+    "root",
+    "energy",
+    "independent",
+)
 
 
 class ScenePrograms:
@@ -42,7 +58,7 @@ class ScenePrograms:
         self,
         tree: TreeDef,
         shapes: Shapes,
-        redundant_rows: tuple[int, ...],
+        redundant_rows: tuple[int, ...] | None,
         baumgarte: bool,
         policy: RankPolicy,
         every_row: bool = False,
@@ -91,8 +107,13 @@ class ScenePrograms:
 
     @property
     def number_count(self) -> int:
-        """The number of values that `prologue` takes: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
-        return self._number_count + self._layout.gains + 2
+        """The number of values that `prologue` takes: all numbers of the scene, gains, marks of rows, `drop_tol`, `safe_tol`."""
+        return self._number_count + self._layout.gains + self._layout.marks + 2
+
+    @property
+    def marks_rows(self) -> bool:
+        """True if redundant rows are told by numbers: a mark for each row of Psi, one where it is independent."""
+        return self._layout.marks > 0
 
     @cached_property
     def for_derivatives(self) -> "ScenePrograms":
@@ -251,6 +272,12 @@ class ScenePrograms:
         return program(self._solver.elimination.rank())
 
     @cached_property
+    def independent_rows(self) -> LoopProgram:
+        """independent: one for each row of Psi that elimination does not leave out, zero for those that depend on others."""
+        solver = self._solver
+        return program(solver.position_terms("psi_q"), solver.factorize_dropping, solver.elimination.independent())
+
+    @cached_property
     def value_derivatives(self) -> LoopProgram:
         """Of a mechanism whose time is a driver's value: q' and q'' as dq1 and dv1; psi of all rows; distance.
 
@@ -264,7 +291,7 @@ class ScenePrograms:
 
     @cached_property
     def prologue(self) -> LoopProgram:
-        """`constants`, from `numbers`: all numbers of the scene, the gains, `drop_tol` and `safe_tol`."""
+        """`constants`, from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
         return write_prologue(self._layout, self._places, self._number_count)
 
     @cached_property
@@ -275,14 +302,14 @@ class ScenePrograms:
 
 @lru_cache(maxsize=16)
 def _scene_programs(
-    tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...], baumgarte: bool, policy: RankPolicy
+    tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...] | None, baumgarte: bool, policy: RankPolicy
 ) -> ScenePrograms:
     return ScenePrograms(tree, shapes, redundant_rows, baumgarte, policy)
 
 
 def scene_programs(
     mechanism: Mechanism,
-    redundant_rows: tuple[int, ...] = (),
+    redundant_rows: tuple[int, ...] | None = (),
     baumgarte: bool = False,
     policy: RankPolicy = RankPolicy.DROP,
     in_pieces: bool = True,
@@ -291,7 +318,7 @@ def scene_programs(
 
     Args:
         mechanism: The scene; its numbers may be traced.
-        redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`).
+        redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`); None: marks among the numbers tell which.
         baumgarte: Whether the gains alpha and beta are fed back.
         policy: What is done with a small pivot.
         in_pieces: Whether the numbers are those of `Mechanism.at` a time, or all samples and knots.

@@ -10,7 +10,10 @@ from udkjax.equations.scene_layout import (
     DROP_TOL,
     GAINS,
     OWN_CONSTANTS,
+    RIGHT,
+    ROW,
     SAFE_TOL,
+    ConstraintGroup,
     ElementGroup,
     SceneLayout,
 )
@@ -25,14 +28,14 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
     Args:
         layout: Where the constants lie.
         places: The scene, with the place of each number in `numbers` instead of the number.
-        number_count: How many numbers the scene has; behind them are the gains, `drop_tol` and `safe_tol`.
+        number_count: How many numbers the scene has; behind them are the gains, the marks of rows, `drop_tol` and `safe_tol`.
 
     Returns:
         Loops over the bodies and over the elements of each group.
     """
     scene = KernelWriter()
     copies = [(GAINS + k, number_count + k) for k in range(layout.gains)]
-    copies += [(k, number_count + layout.gains + k) for k in (DROP_TOL, SAFE_TOL)]
+    copies += [(k, number_count + layout.gains + layout.marks + k) for k in (DROP_TOL, SAFE_TOL)]
     copies += [(layout.gravity + k, int(place)) for k, place in enumerate(np.ravel(places.gravity))]
     for to, place in copies:
         scene.write(scene.read("numbers", None, place), "constants", None, to)
@@ -44,7 +47,16 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
     constraints, forces = list(places.constraints.values()), list(places.forces.values())
     parts += [_group_constants(layout, group, constraints) for group in layout.constraints]
     parts += [_group_constants(layout, group, forces) for group in layout.forces]
+    if layout.marks:
+        parts += [_marks(layout, group, number_count + layout.gains) for group in layout.constraints]
     return LoopProgram(parts)
+
+
+def _marks(layout: SceneLayout, group: ConstraintGroup, start: int) -> KernelLoop:
+    w = KernelWriter()
+    for i, row in enumerate(group.rows):
+        w.write(w.read("numbers", ROW, start + row), "constants", RIGHT, layout.first_mark + i)
+    return KernelLoop(w.kernel(), group.table)
 
 
 def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequence[Element]) -> KernelLoop:

@@ -120,8 +120,6 @@ def _reason_for_diffrax(
         return f"it knows the Udwadia-Kalaba equation of a mechanism, not {type(equations).__name__}"
     if not eliminates(equations.method) and dense_method(equations.method) is None:
         return f"it does not know the pseudoinverse {type(equations.method).__name__}"
-    if isinstance(equations.method, Auto) and equations.redundant is None:
-        return "which rows are redundant is not known"
     if not is_explicit(solver):
         return f"{type(solver).__name__} is no explicit Runge-Kutta method"
     if jax.default_backend() != "cpu":
@@ -152,6 +150,10 @@ def _run_operation(
 
 
 def _programs(equations: TextbookEquations) -> ScenePrograms:
-    """Return the programs of a scene: with pivots that are refused, where the method falls back on a rank-revealing one."""
+    """Return the programs of a scene: with pivots that are refused, where the method falls back on a rank-revealing one.
+
+    `Elimination` drops the rows that depend on others, whether they are known or not; to all else they are told.
+    """
     policy = RankPolicy.REFUSE if isinstance(equations.method, Auto) else RankPolicy.DROP
-    return scene_programs(equations.mechanism, equations.redundant or (), equations.baumgarte is not None, policy)
+    redundant = () if equations.redundant is None and isinstance(equations.method, Elimination) else equations.redundant
+    return scene_programs(equations.mechanism, redundant, equations.baumgarte is not None, policy)

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.scales import rank_tolerance
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.layout import INFO, OUTPUTS
-from udkjax.native.operations import RunStates
+from udkjax.native.operations import MarkRows, RunStates
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
@@ -59,21 +60,21 @@ def serves_derivatives(active: Problem) -> bool:
     return not any(x is True for x in jax.tree.leaves(others))
 
 
-def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any]:
+def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
     """The numbers of a run, or a change of them; zeros stand for one row of what has samples."""
     of = problem if change is None else change
-    return problem.compiled.samples.stand_in(of.equations.mechanism), of.equations.baumgarte
+    return problem.compiled.samples.stand_in(of.equations.mechanism), of.equations.baumgarte, of.marks
 
 
-def _marks_of(problem: Any, active: Any) -> tuple[Any, Any]:
-    """Mark the numbers that are active."""
-    return problem.compiled.samples.stand_in(active.equations.mechanism, marks=True), active.equations.baumgarte
+def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
+    """Tell which numbers are active."""
+    return problem.compiled.samples.stand_in(active.equations.mechanism, marks=True), active.equations.baumgarte, active.marks
 
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
     operation, n = _operation(problem, active), len(problem.q)
-    tangents = number_tangents(_numbers_of(problem), _marks_of(problem, active), _numbers_of(problem, change))
+    tangents = number_tangents(_numbers_of(problem), _active_of(problem, active), _numbers_of(problem, change))
     along = jnp.asarray(numbers_as_vector(tangents))
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     directions = [along, dq, dv]
@@ -96,7 +97,7 @@ def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: A
     found = native_p.bind(*_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
     numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
-    mechanism, baumgarte = cotangent_tree(numbersbar[0], _numbers_of(problem), _marks_of(problem, active))
+    mechanism, baumgarte, _ = cotangent_tree(numbersbar[0], _numbers_of(problem), _active_of(problem, active))
     if operation.sampled:
         mechanism = problem.compiled.samples.with_cotangents(mechanism, active.equations.mechanism, found[len(OUTPUTS) + 3][0])
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
@@ -110,7 +111,7 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
     assert run is not None  # who comes here has asked whether there is one
     if active is None:
         return run
-    which = active_numbers(_numbers_of(problem), _marks_of(problem, active))
+    which = active_numbers(_numbers_of(problem), _active_of(problem, active))
     if not reverse:
         return run.with_tangents(which)
     breaks = problem.compiled.breakpoints
@@ -131,17 +132,35 @@ def _inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> lis
         "fallback_tol": scene.fallback_tol,
         "max_steps": problem.max_steps,
     }
-    return pack(operation, scene.numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
+    numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
+    return pack(operation, numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
 
 
 class SceneInputs(NamedTuple):
     """The inputs of machine code that a mechanism decides on, whatever its states are."""
 
-    numbers: list[Any]  # all numbers of the scene, and two thresholds of pivots
+    numbers: list[Any]  # all numbers of the scene, and the gains
+    thresholds: list[Any]  # two, of pivots
     rows: Any  # the scales of the rows of Psi
     breaks: Any  # times (s) where the motion is not smooth, in their order
     samples: list[Any]  # the rows of all that has samples
     fallback_tol: Any
+
+
+def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp) -> Any:
+    """Return a mark for each row of Psi, one where it is independent near a state; None where that is known beforehand."""
+    operation = compiled.plan.operation
+    if operation is None or not operation.code.marks_rows:
+        return None
+    equations: Any = compiled.equations
+    mechanism = equations.mechanism.at(t)
+    finding = MarkRows(scene_programs(mechanism).with_all_rows)
+    tol = rank_tolerance(mechanism)
+    settings = {"length": length, "omega": rate}
+    numbers = [*mechanism.numbers, tol**2, 0.0]
+    given = pack(finding, numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp.zeros(0), xp)
+    found = call_known(finding, given, 2) if xp is np else native_p.bind(*given, operation=finding, times=2)
+    return found[0][0]
 
 
 def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
@@ -155,8 +174,9 @@ def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleTyp
     drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
     numbers = samples.stand_in(equations.mechanism), equations.baumgarte
     further = [samples.rows(xp)] if samples.samples else []
-    given = [*jax.tree.leaves(numbers), drop_tol, safe_tol]
-    return SceneInputs(given, equations.scales.rows, samples.breakpoints(xp), further, fallback_tol)
+    thresholds = [drop_tol, safe_tol]
+    rows, breaks = equations.scales.rows, samples.breakpoints(xp)
+    return SceneInputs(jax.tree.leaves(numbers), thresholds, rows, breaks, further, fallback_tol)
 
 
 @cached_by_identity

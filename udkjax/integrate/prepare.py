@@ -15,6 +15,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.assembly import Closure, State
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.outcome import increases, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
@@ -140,6 +141,7 @@ def prepare_run(
         length=length,
         rate=rate,
         max_steps=choices.max_steps,
+        marks=mark_rows(compiled, ts[0], q, v, length, rate, xp),
     )
     missed = xp.asarray(False)
     if closure is not None and compiled.plan.is_native:

@@ -27,6 +27,7 @@ class Problem(eqx.Module):
     length: Float[Array, ""] | None
     rate: Float[Array, ""]  # of the system and the run (1/s)
     max_steps: Int[ArrayLike, ""]
+    marks: Float[Array, "m"] | None = None  # of rows of Psi: one for those that are independent; None: machine code knows them
     points: int | None = eqx.field(static=True, default=None)  # that a record for reverse mode has room for; None: by breakpoints
 
     @property

@@ -1,6 +1,5 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
-import warnings
 from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
@@ -30,7 +29,7 @@ from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL
-from udkjax.pinv import Auto, Pseudoinverse
+from udkjax.pinv import Pseudoinverse
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import is_traced, number
 from udkjax.scene.mechanism import Mechanism
@@ -41,10 +40,6 @@ if TYPE_CHECKING:
 
 MAX_STEPS = 100_000
 MAX_EVENTS = 64
-GEOMETRY_TRACED = (
-    "the geometry of the mechanism is traced: its redundant rows are not known, and the run takes singular values, with diffrax, "
-    "hundreds of times slower. Make it of plain numbers and change them by with_parameters, or pass analysis=analyse(...)"
-)
 
 
 @checked
@@ -96,7 +91,7 @@ def simulate(
             `NullSpaceSVD` or `CoordinatePartitioning`; `method` then serves projection and derivatives.
         throw: whether a run that does not reach its end raises; where numbers are traced, it never does.
         progress: True prints how far the run is; a progress meter of diffrax is used as it is.
-        analysis: that of `analyse`, by default made here; a mechanism all of whose numbers are traced needs one to be fast.
+        analysis: that of `analyse`, by default made here.
         engine: "native" is machine code made of the scene's expressions, on the CPU: explicit Runge-Kutta methods with
             elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every solver,
             adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
@@ -148,8 +143,6 @@ def simulate(
         start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
         if analysis is None:
             analysis = analyse(mechanism)
-            if analysis.redundant_rows is None and not is_known and type(choices.method) is Auto and engine == "auto":
-                warnings.warn(GEOMETRY_TRACED, stacklevel=2)
         if state is None and closure is None:
             closure = close(mechanism, start, analysis=analysis)
             if is_known and (moves := moves_from_guess(mechanism, start, closure)):

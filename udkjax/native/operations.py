@@ -20,6 +20,7 @@ from udkjax.native.marching import Marching
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.record import STORED, record_length
+from udkjax.native.row_marks import RowMarks
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
@@ -209,6 +210,19 @@ class CloseCotangents(Close):
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         n = self.coordinates
         return [*super().outputs(inputs, members, times), (members, self.code.number_count), (members, n), (members, n)]
+
+
+@dataclass(frozen=True)
+class MarkRows(Operation):
+    """Mark the rows of Psi that are independent near a position: one for each that is, zero for others."""
+
+    settings: ClassVar[tuple[str, ...]] = RowMarks.settings
+
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return RowMarks(self.code, width, vector)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        return [(members, self.code.row_count)]
 
 
 @dataclass(frozen=True)

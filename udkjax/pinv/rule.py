@@ -5,6 +5,7 @@ and every derivative, forward or reverse and of any order, follow from here. No 
 """
 
 from abc import abstractmethod
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
@@ -47,8 +48,10 @@ def number(value: Scalar | None) -> Float[Array, ""] | None:
     dtype = jnp.result_type(float)
     if isinstance(value, float | int | np.number):
         value = np.asarray(value, dtype)  # JAX would compile a program to convert it
+    known = nullcontext() if isinstance(value, jax.core.Tracer) else jax.ensure_compile_time_eval()  # in a trace, too
     try:
-        return None if value is None else jnp.asarray(value, dtype=dtype)
+        with known:
+            return None if value is None else jnp.asarray(value, dtype=dtype)
     except (TypeError, ValueError):
         what = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
         raise TypeError(f"a threshold (rank_tol, or branch_tol of Auto) must be one number or None, not {what}") from None

@@ -207,7 +207,7 @@ def test_a_traced_pin_keeps_machine_code_and_known_numbers():
         moved = mech.with_parameters({"pin.P": place})
         assert isinstance(moved.bodies["coupler"].mass, Tracer) and not isinstance(moved.bodies["crank"].mass, Tracer)
         sol = udk.simulate(moved, [0.0, 0.1])
-        assert sol.settings["engine"] == "native"  # and no warning that geometry is traced
+        assert sol.settings["engine"] == "native"
         return sol.q[-1, 0]
 
     expected = udk.simulate(mech.with_parameters({"pin.P": (1.5, 2.3)}), [0.0, 0.1]).q[-1, 0]

@@ -165,8 +165,9 @@ class Hybrid(eqx.Module):
         """Return what to integrate in a phase."""
         mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
+        compiled = CompiledMechanism(equations, mechanism.breakpoints, self.plans[phase])
         return Problem(
-            compiled=CompiledMechanism(equations, mechanism.breakpoints, self.plans[phase]),
+            compiled=compiled,
             ts=ts,
             q=q,
             v=v,
@@ -177,6 +178,7 @@ class Hybrid(eqx.Module):
             length=self.length,
             rate=self.rate,
             max_steps=self.max_steps,
+            marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate),
         )
 
     def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
