@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.elements import has_pieces
-from udkjax.equations.formulations import Formulation
+from udkjax.equations.formulations import FormulatedSystem, Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
@@ -21,7 +21,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.held_rows import SampleRows
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
-from udkjax.native.operations import RunStates, Tableau
+from udkjax.native.operations import Accelerate, RunStates, Tableau
 from udkjax.native.primitive import unsupported
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
@@ -40,6 +40,7 @@ class RunPlan:
     solver: "diffrax.AbstractSolver | None"
     projected: bool
     operation: RunStates | None  # of machine code that integrates it
+    evaluation: Accelerate | None  # of machine code that evaluates its equations for diffrax; None: the textbook's own
     why_not_native: str  # why there is none, or it is not taken; empty where it is
     independent_rows: int = 0  # that the method takes
 
@@ -65,6 +66,13 @@ class CompiledMechanism(eqx.Module):
         equations: Any = self.equations
         return SampleRows(equations.mechanism, self.breakpoints)
 
+    @property
+    def textbook(self) -> TextbookEquations:
+        """The equations of a mechanism, whatever formulation is around them."""
+        inner = self.equations.equations if isinstance(self.equations, FormulatedSystem) else self.equations
+        assert isinstance(inner, TextbookEquations)  # of others there is no machine code
+        return inner
+
 
 def compile_mechanism(
     system: Mechanism | ConstrainedSystem,
@@ -85,7 +93,8 @@ def compile_mechanism(
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
     equations = equations_of(system, method, baumgarte, formulation, analysis)
     projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
-    projected, breakpoints, operation, rows = equations.constrained and projects, system.breakpoints, None, 0
+    projected, breakpoints = equations.constrained and projects, system.breakpoints
+    operation, evaluation, rows = None, None, 0
     why = "it was asked for" if engine == "diffrax" else _reason_for_diffrax(equations, solver, adjoint, meter)
     if not why:
         assert isinstance(equations, TextbookEquations)  # there is a reason for diffrax where they are not
@@ -93,9 +102,12 @@ def compile_mechanism(
         rows = len(equations.scales.rows) - len((equations.redundant or ()) if eliminates(equations.method) else ())
         missing = unsupported(operation)
         why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
+    elif engine == "auto":
+        evaluation = _evaluation(equations)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
-    return CompiledMechanism(equations, breakpoints, RunPlan(solver, projected, None if why else operation, why, rows))
+    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows)
+    return CompiledMechanism(equations, breakpoints, plan)
 
 
 @cached_by_identity
@@ -118,10 +130,15 @@ def _reason_for_diffrax(
         return "a progress meter is diffrax's"
     if type(equations) is not TextbookEquations:
         return f"it knows the Udwadia-Kalaba equation of a mechanism, not {type(equations).__name__}"
-    if not eliminates(equations.method) and dense_method(equations.method) is None:
-        return f"it does not know the pseudoinverse {type(equations.method).__name__}"
     if not is_explicit(solver):
         return f"{type(solver).__name__} is no explicit Runge-Kutta method"
+    return _reason_for_textbook(equations)
+
+
+def _reason_for_textbook(equations: TextbookEquations) -> str:
+    """Return why machine code cannot evaluate equations, whatever the scene is; empty where it can."""
+    if not eliminates(equations.method) and dense_method(equations.method) is None:
+        return f"it does not know the pseudoinverse {type(equations.method).__name__}"
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
@@ -147,6 +164,15 @@ def _run_operation(
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
         pseudoinverse=dense_method(equations.method),
     )
+
+
+def _evaluation(equations: AbstractSystem) -> Accelerate | None:
+    """Return the operation that evaluates equations at single states; None where machine code cannot."""
+    inner = equations.equations if isinstance(equations, FormulatedSystem) else equations
+    if type(inner) is not TextbookEquations or not inner.constrained or _reason_for_textbook(inner):
+        return None
+    operation = Accelerate(_programs(inner), dense_method(inner.method))
+    return None if unsupported(operation) else operation
 
 
 def _programs(equations: TextbookEquations) -> ScenePrograms:

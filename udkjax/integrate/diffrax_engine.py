@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import project, project_all, violation
@@ -25,16 +26,17 @@ def integrate_by_diffrax(
 ) -> IntegratorOutput:
     """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
     ts, y0 = _leave_breakpoints(problem), jnp.concatenate([problem.q, problem.v])
+    equations = equations_for_diffrax(problem)
     if problem.compiled.plan.projected:  # machine code does so, and its derivatives are combined with those of this engine
-        y0 = project(problem.equations, ts[0], y0)
+        y0 = project(equations, ts[0], y0)
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
         Constrained(problem.compiled.plan.solver or diffrax.Dopri8(), problem.compiled.plan.projected),
         t0=ts[0],
         t1=ts[-1],
-        dt0=_first_step(problem, y0) if problem.h is None else problem.h,
+        dt0=_first_step(problem, equations, y0) if problem.h is None else problem.h,
         y0=y0,
-        args=problem.equations,
+        args=equations,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
         stepsize_controller=CountingController(_controller(problem)),
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
@@ -48,7 +50,7 @@ def integrate_by_diffrax(
     later = reached & (jnp.arange(len(ts)) > 0)
     ys = jnp.where(later[:, None], ys, y0)  # a run without any accepted step has saved nothing
     if problem.compiled.plan.projected:
-        ys = jnp.concatenate([ys[:1], project_all(problem.equations, ts[1:], ys[1:])])
+        ys = jnp.concatenate([ys[:1], project_all(equations, ts[1:], ys[1:])])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
@@ -79,9 +81,11 @@ def derivative(t: Float[ArrayLike, ""], y: Float[Array, "2n"], equations: Abstra
     return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
 
 
-def _first_step(problem: Problem, y0: Array) -> Array:
-    ts, equations, unit = problem.ts, stop_gradients(problem.equations), jnp.concatenate(problem.units())
-    return first_step(y0, derivative(ts[0], stop_gradients(y0), equations), ts[-1] - ts[0], problem.rtol, problem.atol, unit)
+def _first_step(problem: Problem, equations: AbstractSystem, y0: Array) -> Array:
+    ts, unit = problem.ts, jnp.concatenate(problem.units())
+    return first_step(
+        y0, derivative(ts[0], stop_gradients(y0), stop_gradients(equations)), ts[-1] - ts[0], problem.rtol, problem.atol, unit
+    )
 
 
 def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, unit: Array) -> Array:

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -149,10 +150,10 @@ class SceneInputs(NamedTuple):
 
 def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp) -> Any:
     """Return a mark for each row of Psi, one where it is independent near a state; None where that is known beforehand."""
-    operation = compiled.plan.operation
+    operation = compiled.plan.operation or compiled.plan.evaluation
     if operation is None or not operation.code.marks_rows:
         return None
-    equations: Any = compiled.equations
+    equations = compiled.textbook
     mechanism = equations.mechanism.at(t)
     finding = MarkRows(scene_programs(mechanism).with_all_rows)
     tol = rank_tolerance(mechanism)
@@ -163,20 +164,32 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
     return found[0][0]
 
 
-def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
-    equations: Any = compiled.equations
-    method, samples = equations.method, compiled.samples
+class Thresholds(NamedTuple):
+    """The thresholds of a method in machine code: two of pivots, and that of the method that reveals the rank."""
+
+    drop_tol: Any
+    safe_tol: Any
+    fallback_tol: Any
+
+
+def thresholds(equations: TextbookEquations, policy: RankPolicy) -> Thresholds:
+    """Return the thresholds of the method of some equations."""
+    method: Any = equations.method
     rank_tol = method.rank_tol
     # Elimination, by which derivatives of all methods are taken, has relative thresholds.
     relative_tol = rank_tol if method.relative else rank_tolerance(equations.mechanism)
     safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
-    drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
+    return Thresholds(fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol, safe_tol, fallback_tol)
+
+
+def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
+    equations, samples = compiled.textbook, compiled.samples
+    drop_tol, safe_tol, fallback_tol = thresholds(equations, policy)
     numbers = samples.stand_in(equations.mechanism), equations.baumgarte
     further = [samples.rows(xp)] if samples.samples else []
-    thresholds = [drop_tol, safe_tol]
     rows, breaks = equations.scales.rows, samples.breakpoints(xp)
-    return SceneInputs(jax.tree.leaves(numbers), thresholds, rows, breaks, further, fallback_tol)
+    return SceneInputs(jax.tree.leaves(numbers), [drop_tol, safe_tol], rows, breaks, further, fallback_tol)
 
 
 @cached_by_identity

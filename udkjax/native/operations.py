@@ -21,6 +21,7 @@ from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.record import STORED, record_length
 from udkjax.native.row_marks import RowMarks
+from udkjax.native.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward
 from udkjax.native.trajectory import Trajectory
@@ -210,6 +211,40 @@ class CloseCotangents(Close):
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         n = self.coordinates
         return [*super().outputs(inputs, members, times), (members, self.code.number_count), (members, n), (members, n)]
+
+
+@dataclass(frozen=True)
+class StateOperation(Operation):
+    """A function of single states."""
+
+    pseudoinverse: DenseMethod | None = None  # None: elimination
+
+    settings: ClassVar[tuple[str, ...]] = StateFunction.settings
+    function: ClassVar[type[StateFunction]]
+
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return self.function(self.code, self.pseudoinverse, width, vector)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        return [(members, len(self.function.found) * self.coordinates)]
+
+
+class Accelerate(StateOperation):
+    """Find the accelerations of states."""
+
+    function = StateAccelerations
+
+
+class ProjectStates(StateOperation):
+    """Return states to the constraint manifold."""
+
+    function = StateProjection
+
+
+class FindTangentPart(StateOperation):
+    """Find the part of small changes of states within the constraint manifold."""
+
+    function = StateTangentPart
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,153 @@
+"""Accelerations and projections by machine code are those of the textbook, for each method, element and stabilization."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from tests import elements
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.integrate.compiled_mechanism import compile_mechanism
+from udkjax.integrate.native_engine import mark_rows
+from udkjax.integrate.native_equations import NativeEquations
+from udkjax.integrate.projection import Projection
+
+METHODS = [udk.Auto(), udk.Elimination(), udk.SVD(), udk.Varga(), udk.Householder(), udk.GramSchmidt(), udk.Greville()]
+TIMES = np.linspace(0.0, 1.0, 6)
+
+
+def both(mechanism, method, stabilization=Projection()):
+    """The equations by machine code, and by the textbook."""
+    analysis = udk.analyse(mechanism)
+    compiled = compile_mechanism(mechanism.without_origin, analysis, method, stabilization, solver=udk.BDF())
+    q, v, scales = mechanism.q0.ravel(), mechanism.v0.ravel(), analysis.scales
+    marks = mark_rows(compiled, jnp.zeros(()), q, v, scales.length, jnp.maximum(scales.rate, 1.0))
+    assert compiled.plan.evaluation is not None
+    return NativeEquations(compiled.textbook, marks, compiled.plan.evaluation), compiled.textbook
+
+
+@eqx.filter_jit
+def terms(equations, t, q, v):
+    """D and b with their rows weighted, a_F and M^(-1/2) by the textbook."""
+    mechanism, w = equations.mechanism, equations.scales.weights
+    return (
+        uk.D(mechanism, t, q, w),
+        uk.b(mechanism, t, q, v, equations.baumgarte, w),
+        uk.a_F(mechanism, t, q, v),
+        uk.inverse_sqrt_mass(mechanism),
+    )
+
+
+@eqx.filter_jit
+def evaluate(equations, t, q, v, dq, dv):
+    return equations.accelerations(t, q, v), equations.tangent_part(t, q, v, dq, dv)
+
+
+def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-12):
+    """With a_F + M^(-1/2) D^+ b, with D^+ by NumPy, at a state near the guess; it need not be closed."""
+    random = np.random.default_rng(3)
+    state = udk.assemble(mechanism) if closed else udk.State(mechanism.q0, mechanism.v0)
+    q, v = (x.ravel() + (0 if closed else 0.1) * random.standard_normal(x.size) for x in (state.q, state.v))
+    t, (dq, dv), D = jnp.asarray(0.3), random.standard_normal((2, len(q))), None
+    for method in chosen:
+        native, plain = both(mechanism, method, stabilization)
+        if D is None:
+            D, b, free, root = (np.asarray(x) for x in terms(plain, t, q, v))
+            plus = np.linalg.pinv(D, rcond=1e-4)
+        a, tangent = evaluate(native, t, q, v, dq, dv)
+        expected = free + root * (plus @ b)
+        assert_allclose(a, expected, rtol=0, atol=atol * max(1.0, np.abs(expected).max()), err_msg=str(method))
+        for found, x in zip(tangent, (dq, dv), strict=True):
+            assert_allclose(found, x - root * (plus @ (D @ (x / root))), rtol=0, atol=100 * atol, err_msg=str(method))
+
+
+@pytest.mark.parametrize("name", ["prismatic", "slot", "weld", "distance", "gear", "inner gear", "rack", "cam"])
+def test_joints(name):
+    joints = {k: elements.JOINTS[k] for k in dict.fromkeys(("revolute", name))}
+    agree(udk.Mechanism(elements.BODIES, joints), METHODS)
+
+
+@pytest.mark.parametrize("kind", ["drivers", "forces"])
+@pytest.mark.parametrize("stabilization", [Projection(), udk.Baumgarte(3.0, 7.0)], ids=["none", "Baumgarte"])
+def test_drivers_and_forces(kind, stabilization):
+    joints = {"revolute": elements.JOINTS["revolute"]}
+    drivers = {k: elements.DRIVERS[k] for k in ("turn", "lift")}
+    further = {"drivers": drivers} if kind == "drivers" else {"forces": elements.FORCES}
+    agree(udk.Mechanism(elements.BODIES, joints, **further), METHODS[::2], stabilization)
+
+
+@pytest.mark.parametrize("angle", [-0.7, 0.3, np.pi / 2])
+def test_redundant_rows(angle):
+    agree(udk.library.parallelogram(angle=angle, angular_velocity=0.7), METHODS, closed=True)
+
+
+def test_a_singular_configuration():
+    """All links in line: the rank falls by one, and a is the solution of least norm. Elimination has half the digits there."""
+    chosen = [m for m in METHODS if not isinstance(m, udk.Elimination)]
+    agree(udk.library.parallelogram(angle=0.0, angular_velocity=0.7), chosen, closed=True, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", [udk.Auto(), udk.Varga()], ids=["Auto", "Varga"])
+def test_projection(method):
+    """It satisfies all constraints by the smallest change in the mass metric: that is orthogonal to what they allow."""
+    mechanism = udk.library.parallelogram(angle=-0.7, angular_velocity=0.7)
+    native, plain = both(mechanism, method)
+    state = udk.assemble(mechanism)
+    q0, v0 = state.q.ravel() + 1e-5 * np.sin(np.arange(12)), state.v.ravel() + 1e-5 * np.cos(np.arange(12))
+    q, v = native.project(jnp.zeros(()), q0, v0)
+    psi, psi_dot = plain.violation(jnp.zeros(()), q, v)
+    assert_allclose(psi, 0, atol=1e-14)
+    assert_allclose(psi_dot, 0, atol=1e-14)
+    D, _, _, root = (np.asarray(x) for x in terms(plain, jnp.zeros(()), q, v))
+    for change in (q - q0, v - v0):
+        x = change / root
+        assert np.linalg.norm(x - np.linalg.pinv(D, rcond=1e-4) @ (D @ x)) < 1e-3 * np.linalg.norm(x)
+
+
+def test_batches_and_derivatives():
+    mechanism = udk.library.parallelogram(angle=-0.7, angular_velocity=0.7)
+    native, plain = both(mechanism, udk.Householder())
+    state = udk.assemble(mechanism)
+    q, v, t = state.q.ravel(), state.v.ravel(), jnp.zeros(())
+    vs = jnp.linspace(-1.0, 1.0, 11)[:, None] * v
+    assert_allclose(
+        jax.vmap(lambda v: native.accelerations(t, q, v))(vs), jax.vmap(lambda v: plain.accelerations(t, q, v))(vs), atol=1e-12
+    )
+    forward, plain_forward = (jax.jacfwd(lambda v, e=e: e.accelerations(t, q, v))(v) for e in (native, plain))
+    assert_allclose(forward, plain_forward, atol=1e-12)
+    assert_allclose(jax.jacrev(lambda v: native.accelerations(t, q, v))(v), plain_forward, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "solver", [udk.Adams(), *(pytest.param(s, marks=pytest.mark.slow) for s in (udk.BDF(), diffrax.Kvaerno5()))]
+)
+def test_runs_of_other_solvers_take_the_steps_of_the_plain_form(solver):
+    mechanism = udk.library.parallelogram()
+    one, two = (udk.simulate(mechanism, TIMES, rtol=1e-6, atol=1e-6, solver=solver, engine=e) for e in ("auto", "diffrax"))
+    assert abs(int(one.stats["accepted"]) - int(two.stats["accepted"])) <= 2
+    assert_allclose(one.q, two.q, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_formulation_projects_by_machine_code():
+    mechanism = udk.library.parallelogram()
+    one, two = (
+        udk.simulate(mechanism, TIMES, rtol=1e-7, atol=1e-7, formulation=udk.NullSpaceQR(), engine=e) for e in ("auto", "diffrax")
+    )
+    assert_allclose(one.q, two.q, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_run_through_an_adjoint():
+    def end(mass):
+        moved = udk.library.four_bar().with_parameters({"body.coupler.mass": mass})
+        return udk.simulate(moved, TIMES[:3], adjoint=diffrax.RecursiveCheckpointAdjoint()).q[-1, 0, 2]
+
+    reference = jax.grad(
+        lambda m: udk.simulate(udk.library.four_bar().with_parameters({"body.coupler.mass": m}), TIMES[:3]).q[-1, 0, 2]
+    )
+    assert_allclose(jax.grad(end)(1.3), reference(1.3), rtol=1e-6)
