@@ -99,7 +99,7 @@ def test_a_batch_of_mechanisms(pendulum):
 
 
 def test_a_mechanism_made_within_a_traced_function():
-    """Of a traced mass it is as fast as any other; traced geometry works, and says what it costs."""
+    """Of a traced mass or of traced geometry, it is machine code as any other."""
     ts = np.linspace(0.0, 0.5, 3)
 
     def angle(mass, length):
@@ -117,9 +117,8 @@ def test_a_mechanism_made_within_a_traced_function():
 
     expected = angle(2.0, 1.0)[0]
     assert_allclose(jax.jit(lambda m: traced(m, 1.0))(2.0), expected, atol=1e-12)
-    with pytest.warns(UserWarning, match="with_parameters"):
-        assert_allclose(jax.jit(lambda x: traced(2.0, x))(1.0), expected, atol=1e-6)
-    assert engines[0] == "native" and engines[1].startswith("diffrax")
+    assert_allclose(jax.jit(lambda x: traced(2.0, x))(1.0), expected, atol=1e-6)
+    assert engines == ["native", "native"]
 
 
 def test_one_compilation_serves_all_numbers(compilations, hung):
