@@ -52,12 +52,11 @@ def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-1
     random = np.random.default_rng(3)
     state = udk.assemble(mechanism) if closed else udk.State(mechanism.q0, mechanism.v0)
     q, v = (x.ravel() + (0 if closed else 0.1) * random.standard_normal(x.size) for x in (state.q, state.v))
-    t, (dq, dv), D = jnp.asarray(0.3), random.standard_normal((2, len(q))), None
-    for method in chosen:
-        native, plain = both(mechanism, method, stabilization)
-        if D is None:
-            D, b, free, root = (np.asarray(x) for x in terms(plain, t, q, v))
-            plus = np.linalg.pinv(D, rcond=1e-4)
+    t, (dq, dv) = jnp.asarray(0.3), random.standard_normal((2, len(q)))
+    systems = [both(mechanism, method, stabilization) for method in chosen]
+    D, b, free, root = (np.asarray(x) for x in terms(systems[0][1], t, q, v))
+    plus = np.linalg.pinv(D, rcond=1e-4)
+    for method, (native, _) in zip(chosen, systems, strict=True):
         a, tangent = evaluate(native, t, q, v, dq, dv)
         expected = free + root * (plus @ b)
         assert_allclose(a, expected, rtol=0, atol=atol * max(1.0, np.abs(expected).max()), err_msg=str(method))
@@ -76,8 +75,9 @@ def test_joints(name):
 def test_drivers_and_forces(kind, stabilization):
     joints = {"revolute": elements.JOINTS["revolute"]}
     drivers = {k: elements.DRIVERS[k] for k in ("turn", "lift")}
-    further = {"drivers": drivers} if kind == "drivers" else {"forces": elements.FORCES}
-    agree(udk.Mechanism(elements.BODIES, joints, **further), METHODS[::2], stabilization)
+    moved = udk.Mechanism(elements.BODIES, joints, drivers=drivers)
+    loaded = udk.Mechanism(elements.BODIES, joints, forces=elements.FORCES)
+    agree(moved if kind == "drivers" else loaded, METHODS[::2], stabilization)
 
 
 @pytest.mark.parametrize("angle", [-0.7, 0.3, np.pi / 2])

@@ -1,5 +1,6 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
+import warnings
 from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
