@@ -585,7 +585,7 @@ function followPointers(player, canvas) {
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
-//   engine.measure(parameters, run, efforts)   -> {kinetic, potential, efforts: {driver: values}}
+//   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
 // of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
@@ -740,8 +740,9 @@ class Engine {
       steps: ended.accepted, tried: ended.tried, limited, last};
   }
 
-  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m). */
-  measure(parameters, {ts, q, v, count}, efforts = false) {
+  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
+   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other. */
+  measure(parameters, {ts, q, v, count}, efforts = false, forces = false) {
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
@@ -749,7 +750,8 @@ class Engine {
     module.view(work, module.module.size).fill(0);
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
-      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)]))};
+      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
+      forces: new Float64Array(forces ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // until then the constants hold: samples change them
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
@@ -762,11 +764,18 @@ class Engine {
       copy("v", v.subarray(i * size, (i + 1) * size));
       module.exports.energy(work, work);
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
-      if (!wanted.length) continue;
+      if (!wanted.length && !found.forces.length) continue;
       module.exports.accelerations(work, work);
       for (const {driver, place} of wanted) if (place !== null) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
+      if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
     }
     return found;
+  }
+
+  /** Forces x, y of each joint at the state that was evaluated last. */
+  forces(work, {x0, psi_q}) {
+    const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
+    return this.data.forces.flatMap(({x, y}) => [sum(x), sum(y)]);
   }
 }
 
@@ -787,6 +796,7 @@ class Follower {
     run.symbols = structuredClone(run.symbols);
     run.marks = structuredClone(run.marks);
     run.traces = structuredClone(run.traces);
+    run.arrows = structuredClone(run.reactions);
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
 
@@ -795,6 +805,7 @@ class Follower {
     for (const [k, which, x, y] of rows.frames) put(which < 0 ? run.symbols[k].frame : run.symbols[k].frame[which], 1, x, y);
     for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
     for (const [k, , x, y] of rows.traces) put(run.traces[k], 1, x, y);
+    for (const [k, , x, y] of rows.arrows) put(run.arrows.anchors[k], 1, x, y);
     for (const [k, , x, y] of rows.pins) run.marks[k].at = [numbers[x], numbers[y]];
     for (const [k, place] of rows.angles) run.symbols[k].frame[3] = numbers[place];
     rows.sizes.forEach(([k, place, radius], i) => {
@@ -1006,6 +1017,7 @@ const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be graspe
 // Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
 // same numbers give the same motion.
 const STEP_BYTES = 6e7;
+const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
 const SETTLED = 150;  // ms without a change until the address says the numbers
 
 class Live {
@@ -1015,7 +1027,7 @@ class Live {
     this.run = player.runs[0];
     this.ghost = new Run(data.runs[0]);
     this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame,
-      reactions: this.run.reactions};
+      reactions: this.run.reactions, forces: this.run.forces};
     this.follower = new Follower(this.run, this.data.follow);
     this.values = Float64Array.from(this.data.sliders, s => s.value);
     this.changed = this.dirty = false;
@@ -1085,7 +1097,7 @@ class Live {
     this.panel.show(this.values);
     const {ts, q, v, measures, end, frame} = this.first;
     this.run.replace(ts, q, v, measures, frame);
-    this.showReactions(this.first.reactions);
+    this.showReactions(this.first.reactions, this.first.forces);
     this.follower.follow(this.engine.numbers(null));
     this.player.setEnd(end);
     this.changed = this.dirty = false;
@@ -1148,20 +1160,33 @@ class Live {
   show(run) {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
     const part = {...run, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
-    this.run.replace(part.ts, part.q, part.v, this.measures(part), 1);
-    this.showReactions(null);  // those of the first motion are none of this one
+    const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
+    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1);
+    this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
 
-  showReactions(reactions) {
-    this.run.reactions = reactions;
+  /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
+  reactions(forces) {
+    const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
+    if (!forces.length || !reactions) return null;
+    const largest = Float64Array.from({length: forces.length / each}, (_, i) => {
+      const now = forces.subarray(i * each, (i + 1) * each);
+      return now.reduce((most, x, k) => (k % 2 ? most : Math.max(most, Math.hypot(x, now[k + 1]))), 0);
+    }).sort();
+    const usual = largest[Math.floor(USUAL * (largest.length - 1))] || largest[largest.length - 1];
+    return usual > 0 ? {...this.run.arrows, usual} : null;
+  }
+
+  showReactions(reactions, forces) {
+    Object.assign(this.run, {reactions, forces});
     const button = this.player.buttons.reactions;
     if (button) button.disabled = !reactions;
   }
 
   /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
-  measures(run) {
-    const found = this.engine.measure(this.values, run, true), {length} = this.data.engine.scales;
+  measures(run, found) {
+    const {length} = this.data.engine.scales;
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
     const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,

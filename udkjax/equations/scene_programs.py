@@ -208,6 +208,11 @@ class ScenePrograms:
         return self._layout.psi_q_entries
 
     @property
+    def constant_entry(self) -> int:
+        """The place in `psi_q` of the one that entries refer to which are constants."""
+        return self._layout.one
+
+    @property
     def eliminated_rows(self) -> dict[int, int]:
         """The places of the rows of Psi in the linear systems, of those that are not left out."""
         found = {}

@@ -13,7 +13,7 @@ from udkjax.native import operations, primitive
 from udkjax.native.wasm import wasm_module
 
 SCENES = sorted(udk.library.__all__)
-FAST = ("parallelogram", "slider_crank", "planetary_gear")
+FAST = ("parallelogram", "slider_crank")
 every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
 TIMES = np.linspace(0.0, 2.0, 41)
 SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds
@@ -94,6 +94,7 @@ def test_marching(monkeypatch):
     assert np.all(np.isfinite(wasm[0]))
 
 
+@pytest.mark.slow
 def test_forward_tangents(monkeypatch):
     mechanism = udk.library.parallelogram()
     run, inputs, times = known_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))

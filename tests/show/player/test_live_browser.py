@@ -8,13 +8,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from tests.show.player.test_browser import HOST, PLAYER, on_screen, picture, plain, ring_centre, until
+from udkjax.show.player.measure_curves import reaction_arrows
 from udkjax.show.player.page import as_json, module
 from udkjax.show.player.sketch import THEMES
 
 TS = np.linspace(0.0, 2.0, 41)
 LIVE = f"{PLAYER}.live"
 SCENES = sorted(udk.library.__all__)
-FAST = ("double_pendulum", "slider_crank")
+FAST = ("slider_crank",)
 every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
 
 
@@ -121,6 +122,32 @@ def test_samples_of_loads_and_motions_hold_between_their_times(opened):
         page.evaluate(f"{LIVE}.change({{'gravity[1]': -3.0, 'body.arm.mass': 1.5}})")
         assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(ts), -1), atol=1e-8)
         assert_allclose(measure(page, "torque of motor"), udk.efforts(other, run)["motor"], atol=1e-6)
+
+
+def test_arrows_of_forces_are_those_of_the_new_motion(opened, slider_crank):
+    names = {"pin.P[0]": 0.4, "link.slider.mass": 5.0}
+    animation = udk.animate(slider_crank, udk.simulate(slider_crank, TS), live=list(names), reactions=True)
+    other = slider_crank.with_parameters(names)
+    anchors, forces, unique = reaction_arrows(other, udk.simulate(other, TS))
+    assert all(unique)
+    with opened(animation) as page:
+        before = page.evaluate(f"[...{LIVE}.run.forces]")
+        page.evaluate(f"{LIVE}.change({names})")
+        shown = np.array(page.evaluate(f"[...{LIVE}.run.forces]")).reshape(forces.shape)
+        assert_allclose(shown, forces, atol=1e-6 * np.abs(forces).max())
+        assert_allclose(page.evaluate(f"{LIVE}.run.reactions.anchors"), anchors, atol=1e-12)
+        page.locator(".panel canvas").press("Backspace")
+        assert page.evaluate(f"[...{LIVE}.run.forces]") == before
+
+
+@pytest.mark.slow
+def test_forces_that_redundant_joints_share_are_not_shown_of_a_new_motion(opened):
+    mechanism = udk.library.parallelogram()
+    with opened(udk.animate(mechanism, udk.simulate(mechanism, TS), live=["gravity"], reactions=True, measures=())) as page:
+        button = page.get_by_role("button", name="Reactions")
+        assert button.is_enabled()
+        page.evaluate(f"{LIVE}.change({{'gravity[1]': -5}})")
+        assert button.is_disabled() and page.evaluate(f"{LIVE}.run.reactions") is None
 
 
 def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
@@ -324,6 +351,7 @@ def test_without_webassembly_it_plays_what_was_recorded(opened, live):
         until(page, f"{PLAYER}.time > 0.05")
 
 
+@pytest.mark.slow
 def test_it_is_readable_in_the_dark_and_on_a_telephone(opened, live):
     for width, height, scheme in ((1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")):
         with opened(live, width=width, height=height, color_scheme=scheme) as page:

@@ -16,6 +16,7 @@ from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import compile_known
 from udkjax.integrate.native_engine import packed
+from udkjax.integrate.portable.joint_forces import joint_forces
 from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
 from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
@@ -179,6 +180,7 @@ def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram
         {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", "place": places}
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
+    data["forces"] = [] if analysis.redundant_rows or data["why"] else joint_forces(mechanism, code)
     linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
     return _module(linked, places=evaluation.places, size=evaluation.size)
 

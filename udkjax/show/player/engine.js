@@ -5,7 +5,7 @@
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
-//   engine.measure(parameters, run, efforts)   -> {kinetic, potential, efforts: {driver: values}}
+//   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
 // of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
@@ -161,8 +161,9 @@ class Engine {
       steps: ended.accepted, tried: ended.tried, limited, last};
   }
 
-  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m). */
-  measure(parameters, {ts, q, v, count}, efforts = false) {
+  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
+   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other. */
+  measure(parameters, {ts, q, v, count}, efforts = false, forces = false) {
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
@@ -170,7 +171,8 @@ class Engine {
     module.view(work, module.module.size).fill(0);
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
-      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)]))};
+      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
+      forces: new Float64Array(forces ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // until then the constants hold: samples change them
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
@@ -183,11 +185,18 @@ class Engine {
       copy("v", v.subarray(i * size, (i + 1) * size));
       module.exports.energy(work, work);
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
-      if (!wanted.length) continue;
+      if (!wanted.length && !found.forces.length) continue;
       module.exports.accelerations(work, work);
       for (const {driver, place} of wanted) if (place !== null) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
+      if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
     }
     return found;
+  }
+
+  /** Forces x, y of each joint at the state that was evaluated last. */
+  forces(work, {x0, psi_q}) {
+    const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
+    return this.data.forces.flatMap(({x, y}) => [sum(x), sum(y)]);
   }
 }
 

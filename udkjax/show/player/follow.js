@@ -8,6 +8,7 @@ export class Follower {
     run.symbols = structuredClone(run.symbols);
     run.marks = structuredClone(run.marks);
     run.traces = structuredClone(run.traces);
+    run.arrows = structuredClone(run.reactions);
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
 
@@ -16,6 +17,7 @@ export class Follower {
     for (const [k, which, x, y] of rows.frames) put(which < 0 ? run.symbols[k].frame : run.symbols[k].frame[which], 1, x, y);
     for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
     for (const [k, , x, y] of rows.traces) put(run.traces[k], 1, x, y);
+    for (const [k, , x, y] of rows.arrows) put(run.arrows.anchors[k], 1, x, y);
     for (const [k, , x, y] of rows.pins) run.marks[k].at = [numbers[x], numbers[y]];
     for (const [k, place] of rows.angles) run.symbols[k].frame[3] = numbers[place];
     rows.sizes.forEach(([k, place, radius], i) => {

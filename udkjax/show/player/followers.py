@@ -3,7 +3,8 @@
 Places of symbols in the frames of bodies are numbers of the scene: points of joints and springs, radii of wheels, directions of
 rails. Those that equal one follow it:
 
-    frames, traces, pins    [symbol, trace or mark; which of its anchors; the places in the vector of all numbers of x and y]
+    frames                  [symbol; which of its two anchors, or -1; the places in the vector of all numbers of x and y]
+    traces, pins, arrows    [trace, mark or arrow of a force; 0; places of x and y]
     points                  [symbol, point of its line, places of x and y]
     angles                  [symbol, place]
     sizes                   [symbol, place, the radius as it is]: all its lengths grow with a radius
@@ -29,7 +30,7 @@ def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence
     known = _points(mechanism, places)
     angles = {_rounded(e.axis): int(places.joints[name].axis) for name, e in mechanism.joints.items() if hasattr(e, "axis")}
     radii = _radii(mechanism, places)
-    found: Json = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": []}
+    found: Json = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": [], "arrows": []}
     for k, symbol in enumerate(symbols):
         frame = symbol["frame"]
         pair = len(frame) == 2
@@ -45,7 +46,8 @@ def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence
         if symbol["layer"] == "wheel" and (radius := radii.get(frame[0])) is not None:
             found["sizes"].append([k, *radius])
     marks = [[mark["body"], *mark.get("at", ())] if "body" in mark else [] for mark in record["marks"]]
-    for name, anchors in (("traces", record["traces"]), ("pins", marks)):
+    arrows = record["reactions"]["anchors"] if record["reactions"] else []
+    for name, anchors in (("traces", record["traces"]), ("pins", marks), ("arrows", arrows)):
         for k, anchor in enumerate(anchors):
             if len(anchor) == 3 and (place := known.get(_key(*anchor))) is not None:
                 found[name].append([k, 0, *place])

@@ -13,6 +13,7 @@ const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be graspe
 // Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
 // same numbers give the same motion.
 const STEP_BYTES = 6e7;
+const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
 const SETTLED = 150;  // ms without a change until the address says the numbers
 
 export class Live {
@@ -22,7 +23,7 @@ export class Live {
     this.run = player.runs[0];
     this.ghost = new Run(data.runs[0]);
     this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame,
-      reactions: this.run.reactions};
+      reactions: this.run.reactions, forces: this.run.forces};
     this.follower = new Follower(this.run, this.data.follow);
     this.values = Float64Array.from(this.data.sliders, s => s.value);
     this.changed = this.dirty = false;
@@ -92,7 +93,7 @@ export class Live {
     this.panel.show(this.values);
     const {ts, q, v, measures, end, frame} = this.first;
     this.run.replace(ts, q, v, measures, frame);
-    this.showReactions(this.first.reactions);
+    this.showReactions(this.first.reactions, this.first.forces);
     this.follower.follow(this.engine.numbers(null));
     this.player.setEnd(end);
     this.changed = this.dirty = false;
@@ -155,20 +156,33 @@ export class Live {
   show(run) {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
     const part = {...run, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
-    this.run.replace(part.ts, part.q, part.v, this.measures(part), 1);
-    this.showReactions(null);  // those of the first motion are none of this one
+    const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
+    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1);
+    this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
 
-  showReactions(reactions) {
-    this.run.reactions = reactions;
+  /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
+  reactions(forces) {
+    const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
+    if (!forces.length || !reactions) return null;
+    const largest = Float64Array.from({length: forces.length / each}, (_, i) => {
+      const now = forces.subarray(i * each, (i + 1) * each);
+      return now.reduce((most, x, k) => (k % 2 ? most : Math.max(most, Math.hypot(x, now[k + 1]))), 0);
+    }).sort();
+    const usual = largest[Math.floor(USUAL * (largest.length - 1))] || largest[largest.length - 1];
+    return usual > 0 ? {...this.run.arrows, usual} : null;
+  }
+
+  showReactions(reactions, forces) {
+    Object.assign(this.run, {reactions, forces});
     const button = this.player.buttons.reactions;
     if (button) button.disabled = !reactions;
   }
 
   /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
-  measures(run) {
-    const found = this.engine.measure(this.values, run, true), {length} = this.data.engine.scales;
+  measures(run, found) {
+    const {length} = this.data.engine.scales;
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
     const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
