@@ -61,6 +61,14 @@ def test_a_driver_beyond_the_reach_of_its_linkage(scale, choices, ts):
     assert "Projection" not in solution.cause
 
 
+def test_a_run_does_not_go_on_beyond_the_reach_of_its_linkage():
+    """A full turn leads back into reach, but no motion leads there."""
+    solution = failed(four_bar(motor=[START, 3.0]), [0.0, 2 * np.pi / 3], rtol=1e-6, atol=1e-6)
+    assert solution.result == udk.Result.drift
+    assert float(solution.time) == pytest.approx((TOGGLE - START) / 3.0, rel=1e-2)
+    assert "the linkage reaches" in solution.cause and solution.stats["steps"] < 2000
+
+
 def test_the_reach_of_a_length_and_the_error_of_a_run():
     """A ram between two links of 1 m each: they are in line at 2 m."""
     link = lambda angle, at: udk.Body(1.0, 0.1, at, angle)  # noqa: E731

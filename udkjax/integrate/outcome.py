@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.steps import DONE, LEAST_ATOL, LOOK_AHEAD, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.steps import DONE, LEAST_ATOL, LOOK_AHEAD, LOST, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 
 
 class FinishedRun(NamedTuple):
@@ -40,6 +40,7 @@ def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[
     """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
     code = xp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = xp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
+    code = xp.where(run.raw.status == LOST, Result.drift, code)
     code = xp.where(run.raw.status == DONE, Result.successful, code)
     code, time, reached = _drift(run, code, xp)
     first = xp.arange(len(run.ts)) == 0

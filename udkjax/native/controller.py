@@ -6,7 +6,7 @@ import numpy as np
 
 from udkjax.native.ir import BOOL, DOUBLE, Function, Value
 from udkjax.native.layout import Lane
-from udkjax.native.manifold import velocity_tolerance
+from udkjax.native.manifold import largest_violation, velocity_tolerance
 from udkjax.native.module import Module
 from udkjax.native.power import power
 from udkjax.native.singular import is_clear, step_around, time_to_singularity
@@ -15,6 +15,8 @@ from udkjax.native.steps import (
     EXPECTED,
     GAP,
     GROW,
+    LOST,
+    LOST_TOL,
     NEAREST_STAGE,
     POINTS,
     RESTART_FACTOR,
@@ -84,6 +86,7 @@ def write_decide(module: Module):
     code = where(code.is_(float(RUNNING)) & stepping & (tried >= s.max_steps), STEP_LIMIT, code)
     code = where(stepping & bad & begin & ~accept, where(code.is_(float(RUNNING)), STEP_TOO_SMALL, code), code)
     code = where(accept & (s.last > 0.5), DONE, code)
+    lost = f.variable(0.0)
     # --- where it stands
     with f.if_(f.any_of(accept)):
         for k in range(POINTS - 1):
@@ -94,9 +97,13 @@ def write_decide(module: Module):
         s.where(accept, distance0=s.distance1)
         s.where(accept, distance1=s.distance2)
         s.where(accept, distance2=s.distance)
+        if module.m and module.plan.projected:
+            module.invoke(f, "psi")
+            lost.value = f.select(accept & (largest_violation(module, f) > LOST_TOL), yes, 0.0)
         if module.m:
             s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))
         module.record_step(f, s, accept)
+    code = where((lost.value > 0.5) & code.is_(float(RUNNING)), LOST, code)
     s.where(accept & stepped, rate=rate)
     if module.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)

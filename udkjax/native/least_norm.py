@@ -10,7 +10,7 @@ from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 
 LEAST_NORM = "least_norm"
 SWEEPS = 30  # at most; some six or eight do
-ROUNDING = 1e-15  # cosines of angles between rows that are orthogonal but for rounding
+ORTHOGONAL = 1e-15  # cosines of angles between rows that are orthogonal but for rounding
 
 
 def least_norm() -> Function:
@@ -37,7 +37,7 @@ def least_norm() -> Function:
         sweep.value = sweep.value + 1
         with f.each(m) as i, f.each(m, i + 1) as j:
             a, c, g = dot(i, i), dot(j, j), dot(i, j)
-            with f.if_(f.abs(g) > f.intrinsic("sqrt", a) * f.intrinsic("sqrt", c) * ROUNDING):
+            with f.if_(f.abs(g) > f.intrinsic("sqrt", a) * f.intrinsic("sqrt", c) * ORTHOGONAL):
                 turned.value = f.const(1, INT)
                 zeta = (c - a) / (g * 2.0)
                 root = f.intrinsic("sqrt", f.fma(zeta, zeta, 1.0))

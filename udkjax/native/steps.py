@@ -48,8 +48,12 @@ POINTS = 4  # states that an interpolating polynomial goes through: with three, 
 SHORTEST_LAST = 0.25
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
-# What a run may be. `NOT_FINITE`: its step became too small because of a number that is not finite.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE = range(5)
+# The states of a run. `NOT_FINITE`: its step became too small because of a number that is not finite. `LOST`: it left the
+# constraint manifold.
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST = range(6)
+# Each row of Psi over its scale, after a step whose end was projected, which leaves some 1e-12: a row so far open is one that no
+# position near it closes, as where a driver asks for more than a linkage reaches. Behind that there is no motion to follow.
+LOST_TOL = 1e-2
 
 LOOK_AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 

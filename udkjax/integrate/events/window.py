@@ -18,7 +18,7 @@ from udkjax.integrate.events.detection import INTERVALS, NODES, ROOT, SECOND_OF_
 from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.steps import DONE, NOT_FINITE, STEP_LIMIT
+from udkjax.native.steps import DONE, LOST, NOT_FINITE, STEP_LIMIT
 
 PER_TIME = 16  # intervals in the shortest time in which anything changes
 FINER = 8  # times as fine as a window that is too coarse is the next one
@@ -247,4 +247,4 @@ def step_search(hybrid: Hybrid, result: WindowResult, values: ConditionValues) -
 def _failure(raw: IntegratorOutput) -> Int[Array, ""]:
     code = jnp.where(raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = jnp.where(raw.status == NOT_FINITE, Result.not_finite, code)
-    return jnp.where(raw.status == DONE, Result.drift, code)
+    return jnp.where((raw.status == DONE) | (raw.status == LOST), Result.drift, code)

@@ -11,7 +11,7 @@ The rows of R are nearly orthogonal from the first, so that fewer rounds do (Drm
 from dataclasses import dataclass
 
 from udkjax.native.ir import INT, Operand, Value
-from udkjax.native.least_norm import ROUNDING, SWEEPS
+from udkjax.native.least_norm import ORTHOGONAL, SWEEPS
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q_transposed, pivoted_qr, qr_matrices
 
@@ -41,7 +41,7 @@ class SVDCode(DenseMethod):
             with f.each(d.steps) as i, f.each(d.steps, i + 1) as j:
                 one, two = d.row("D", i), d.row("D", j)
                 a, c, g = squares.entry(i), squares.entry(j), d.dot(one, two)
-                turns = g * g > a * c * (ROUNDING * ROUNDING)
+                turns = g * g > a * c * (ORTHOGONAL * ORTHOGONAL)
                 with f.if_(f.any_of(turns)):
                     turned.value = 1
                     zeta = (c - a) / f.select(turns, g * 2.0, 1.0)

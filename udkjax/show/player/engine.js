@@ -13,7 +13,7 @@
 import {bytesOf} from "./motion.js";
 
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
-const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite"};
+const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed"};
 const EPS = 2 ** -52;
 
 const numbersOf = text => new Float64Array(bytesOf(text).buffer);

@@ -33,7 +33,7 @@ NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad") 
 INITIAL = "Initial state"
 INITIAL_FIELDS = ("velocity", "angular_velocity")  # and of bodies their position and angle, which assembly starts from
 SIZES = ("length", "radius", "width", "thickness", "radii")  # lengths that are never negative; all others are places
-ROUNDING = 1e-9  # of the scene's units: a number below it stands for zero
+LEAST_VALUE = 1e-9  # of the scene's units: a number below it stands for zero
 LARGEST_GRAVITY = 20.0  # m/s2: twice that of the earth
 
 
@@ -105,7 +105,7 @@ def label_of(name: str) -> str:
 def usual_range(name: str, unit: str, value: float, length: float, rate: float) -> tuple[float, float]:
     """Return the range of a slider: positions go as far as a mechanism is large, other numbers to a few times their values."""
     by_unit = {"m/s": length * rate, "rad/s": rate, "m": length, "rad": 1.0}
-    size = abs(value) if abs(value) > ROUNDING * by_unit.get(unit, 0.0) else 0.0
+    size = abs(value) if abs(value) > LEAST_VALUE * by_unit.get(unit, 0.0) else 0.0
     if unit == "m/s2":
         return -max(LARGEST_GRAVITY, 2 * size), max(LARGEST_GRAVITY, 2 * size)
     if unit in NOT_NEGATIVE or (unit == "m" and re.split(r"[.\[]", name)[-2 if "[" in name else -1] in SIZES):
