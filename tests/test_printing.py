@@ -70,6 +70,7 @@ def objects() -> dict[str, object]:
         udk.ConstrainedSystem(mass=jnp.diag, force=anything),
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
         *(drawing, drawing.links["bar"], udk.Held(ts, 0.1)),
+        *(udk.PathGoal("P", [[0, 0], [1, 1]]), udk.PoseGoal("a", [[0, 0, 0.1]]), udk.FunctionGoal("a", [0.1], [0.2])),
         *((batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])), batch({"gravity": np.zeros((2, 2))}, [0.1])),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
@@ -81,7 +82,14 @@ def _workspace() -> object:
     return udk.workspace(mech, {f"body.{name}.angle": np.array([0.1, 0.2]) for name in mech.body_names}, mech.body_names[0])
 
 
-ELSEWHERE = {"Estimate", "GradientCheck", "Design"}  # tests/study/identify: they take a fit
+ELSEWHERE = {
+    "Estimate",
+    "GradientCheck",
+    "Design",
+    "Designs",
+    "FoundDesign",
+    "DesignSearch",
+}  # tests/study: they take a fit or a search
 ABSTRACT = {"Constraint", "Joint", "Motion", "ForceElement"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
 

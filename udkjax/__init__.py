@@ -105,6 +105,13 @@ if TYPE_CHECKING:  # the public names, for type checkers and editors; a test com
     from udkjax.study.branches import branches as branches
     from udkjax.study.channel_values import path as path
     from udkjax.study.continuation import Reached as Reached
+    from udkjax.study.design import Designs as Designs
+    from udkjax.study.design import DesignSearch as DesignSearch
+    from udkjax.study.design import FoundDesign as FoundDesign
+    from udkjax.study.design import FunctionGoal as FunctionGoal
+    from udkjax.study.design import PathGoal as PathGoal
+    from udkjax.study.design import PoseGoal as PoseGoal
+    from udkjax.study.design import design as design
     from udkjax.study.diagnosis import Diagnosis as Diagnosis
     from udkjax.study.diagnosis import diagnose as diagnose
     from udkjax.study.drive import Coordinate as Coordinate
@@ -171,6 +178,7 @@ _NAMES = {
         ConstrainedSystem Baumgarte Analysis analyse accelerations violation energy efforts reactions
         unique_reactions uniqueness singular_values
         Augmented NullSpaceQR NullSpaceSVD CoordinatePartitioning""",
+    "udkjax.study.design": "design DesignSearch Designs FoundDesign PathGoal PoseGoal FunctionGoal",
     "udkjax.study.diagnosis": "diagnose Diagnosis",
     "udkjax.study.explain": "explain",
     "udkjax.study.explanation": "Explanation",

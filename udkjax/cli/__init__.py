@@ -19,6 +19,7 @@ COMMANDS = (
     "studio",
     "sweep",
     "identify",
+    "design",
     "kinematics",
     "inverse",
     "reactions",

@@ -21,6 +21,7 @@ from udkjax.expressions.differential import Differential
 from udkjax.expressions.elimination import SymbolicFactors
 
 Model = Callable[..., dict[str, jax.Array]]
+TracedModel = Callable[..., list[np.ndarray]]
 
 
 class Sizes(NamedTuple):
@@ -44,8 +45,8 @@ class PositionPrograms:
     """Programs of a driven mechanism.
 
     Args:
-        model: `model(x, s, q, d)` returns "psi" (m,), "q0" (n,) and "s0" (), a closed position of the numbers x and the value
-            there, and "measures" (G,), by JAX.
+        model: A model, traced by `trace_model`: `model(x, s, q, d)` returns "psi" (m,), "q0" (n,) and "s0" (), a closed
+            position of the numbers x and the value there, and "measures" (G,), by JAX.
         parameters: The number of free numbers x.
         coordinates: The number n of coordinates.
         data: The number of data d of a position.
@@ -55,6 +56,7 @@ class PositionPrograms:
         positions: Whether the first n measures are q itself.
         derivatives: Whether measures have derivatives.
         rows: The scales of the m rows of Psi, by which what redundant rows leave is judged; by default one.
+        chosen: Which of the model's measures; by default all.
 
     Raises:
         ValueError: The positions do not follow from the driver's value.
@@ -62,7 +64,7 @@ class PositionPrograms:
 
     def __init__(
         self,
-        model: Model,
+        model: TracedModel,
         parameters: int,
         coordinates: int,
         data: int = 0,
@@ -70,15 +72,14 @@ class PositionPrograms:
         positions: bool = False,
         derivatives: bool = True,
         rows: Sequence[float] | np.ndarray | None = None,
+        chosen: slice | None = None,
     ):
         graph = self._graph = Graph()
         self._x = _inputs(graph, "x", "parameter", parameters)
         self._s = graph.input("s", "value")
         self._q = _inputs(graph, "q", "position", coordinates)
         self._d = _inputs(graph, "d", "data", data)
-        examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
-        traced = trace(lambda *given: [model(*given)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
-        psi, q0, s0, measures = traced(
+        psi, q0, s0, measures = model(
             graph, np.array(self._x, object), np.array(self._s, object), np.array(self._q, object), np.array(self._d, object)
         )
         self._psi, self._q0, self._s0 = list(psi.flat), list(q0.flat), s0.item()
@@ -87,7 +88,7 @@ class PositionPrograms:
         place = {v.index: k for k, v in enumerate(self._q)}
         entries = [{place[k]: a for k, a in self._differential.row(r).items() if k in place} for r in self._psi]
         self._factors = SymbolicFactors(graph, entries, coordinates)
-        self._measures = [*(self._q if positions else []), *measures.flat]
+        self._measures = [*(self._q if positions else []), *measures.ravel()[chosen or slice(None)]]
         self._transmission = self._find_transmission() if transmission else None
         count = len(self._measures) + transmission
         self.sizes = Sizes(parameters, coordinates, data, count)
@@ -107,6 +108,8 @@ class PositionPrograms:
         state = [*constants, self._s, *self._q]
         self.prologue = ScalarProgram(self._graph, self._x, [*constants, *self._q0, self._s0])
         """x; the constants, q0 and s0."""
+        self.drawn_value = ScalarProgram(self._graph, self._x, [self._s0])
+        """x; s0."""
         self.newton = ScalarProgram(self._graph, state, newton)
         """The constants, s and q; q after a Newton step, dq/ds, what changes its sign where branches meet, and the violation."""
         self.measure = ScalarProgram(self._graph, [*state, *self._d], outputs)
@@ -179,6 +182,12 @@ class PositionPrograms:
                 entries.append(row[j])
         slopes = cotangents(graph, entries, seeds, variables) if entries else [zero] * len(variables)
         return tau, [tau * slope for slope in slopes]
+
+
+def trace_model(model: Model, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
+    """Trace a model once, for any number of programs; the arguments are those of `PositionPrograms`."""
+    examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
+    return trace(lambda *given: [model(*given)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
 
 
 def _inputs(graph: Graph, name: str, group: str, count: int) -> list[Scalar]:

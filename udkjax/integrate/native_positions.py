@@ -2,14 +2,16 @@
 
 from typing import Any
 
-from udkjax.equations.position_programs import Model, PositionPrograms
+from udkjax.equations.position_programs import PositionPrograms, TracedModel
 from udkjax.native.positions import PositionCode
 from udkjax.native.program import UnsupportedError
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 
 
-def compile_programs(mechanism: Mechanism, model: Model, parameters: int, coordinates: int, **choices: Any) -> PositionPrograms:
+def compile_programs(
+    mechanism: Mechanism, model: TracedModel, parameters: int, coordinates: int, **choices: Any
+) -> PositionPrograms:
     """Return the programs of a model; raise `SceneError` where positions do not follow."""
     try:
         return PositionPrograms(model, parameters, coordinates, **choices)

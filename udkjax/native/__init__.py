@@ -14,7 +14,8 @@ How the code of a run is made, and where to look:
 6. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `program_derivative` and
    `prologue`; `closing`, `closing_derivatives` and `corrections` are a module that assembles a mechanism instead, `marching` one
    that follows its positions.
-7. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules
+7. `positions` is a module of its own: batches of positions with derivatives, from the programs of equations/position_programs.py.
+8. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules
    and shapes there are; `primitive` makes them a primitive of JAX with its batching rule. `udkjax.integrate` calls that and knows
    the rules of differentiation.
 8. `wasm` compiles the same text for pages, where `evaluation` finds accelerations and energies at single states.

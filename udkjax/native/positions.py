@@ -22,6 +22,8 @@ from udkjax.native.program import consecutive, write
 # A Newton step below so many units of a coordinate is the last: the next one would be its square.
 LAST_STEP = 1e-7
 LONGEST_CORRECTION = 0.5  # units: a position that Newton's method moves farther is not the one that was predicted
+LONGEST_OF_MARCH = 0.1  # likewise, of a step of a march: more, and it is taken in smaller ones
+SHORTEST = 1 / 128  # of the longest step of a march: a member that cannot go on by that much has come to its end
 MOST_CORRECTIONS = 12
 FARTHEST = 4.0  # times the step before: farther, the cubic through two positions is no prediction
 MOST_SUBSTEPS = 1000  # between two positions: beyond, the values are in another unit
@@ -76,7 +78,7 @@ class PositionCode:
             Positions; not a number where one was not reached.
         """
         members, count, sizes = len(x), s.shape[-1], self.programs.sizes
-        data = np.zeros((count, 0)) if data is None else data
+        data = np.zeros((count, sizes.data)) if data is None else data
         given = {"x": x, "s": s, "data": data, "unit": unit, "guess": np.zeros(1) if guess is None else guess}
         arrays = {name: np.ascontiguousarray(a, np.float64) for name, a in given.items()}
         arrays |= {
@@ -161,8 +163,10 @@ class _Text:
     # --- functions
 
     def _close(self) -> Function:
-        """`close(work)`: q by Newton's method at s; `end` becomes the last step, not a number where there is no position."""
-        f, n = Function("close", [(POINTER, "work")], self.width), self.programs.sizes.coordinates
+        """`close(work, most)`: q by Newton's method at s; `end` becomes the last step, or not a number where it fails."""
+        arguments = [(POINTER, "work"), (DOUBLE, "most")]
+        f, n = Function("close", arguments, self.width), self.programs.sizes.coordinates
+        most = f.given["most"]
         todo = f.variable(f.select(self._load(f, "end").is_(self._load(f, "end")), f.const(1.0, DOUBLE, self.width), 0.0))
         rounds = f.variable(0, INT, 1)
         with f.while_(lambda: f.any_of(todo.value > 0.5) & (rounds.value < MOST_CORRECTIONS)):
@@ -171,7 +175,7 @@ class _Text:
             with f.each(n) as i:
                 step = f.abs(self._load(f, "new", i) - self._load(f, "q", i)) / self._load(f, "unit", i)
                 size.value = f.select(step <= size.value, size.value, step)  # what is not a number stays
-            goes = (todo.value > 0.5) & (size.value < LONGEST_CORRECTION)
+            goes = (todo.value > 0.5) & (size.value < f.repeat(most, self.width))
             with f.each(n) as i:
                 self._put(f, "q", f.select(goes, self._load(f, "new", i), self._load(f, "q", i)), i)
             last = f.select(todo.value > 0.5, f.select(goes, size.value, np.nan), self._load(f, "end"))
@@ -224,18 +228,19 @@ class _Text:
         f.call("prologue", work)
         self._put(f, "end", f.const(0.0, DOUBLE, width))
         before, sign = f.variable(0.0), f.variable(0.0)
+        longest = f.variable(self._field(f, "longest", DOUBLE), width=1)
         with f.if_(marches):
             self._put(f, "s", self._load(f, "s0"))
             with f.each(n) as i:
                 self._put(f, "q", self._load(f, "q0", i), i)
-            f.call("close", work)
+            f.call("close", work, f.const(LONGEST_CORRECTION))
             sign.value = self._load(f, "sign")
         with f.each(count) as j:
             self._gather(f, addresses("s", self._field(f, "s stride"), 1, j), "target", 1)
             self._gather(f, addresses("data", self._field(f, "data stride"), p.sizes.data, j), "d", p.sizes.data)
             f.choose(
                 marches,
-                lambda: self._march(f, before, sign),
+                lambda: self._march(f, before, sign, longest),
                 lambda: self._close_guess(f, addresses("guess", count * n, n, j)),
             )
             f.call("measure", work)
@@ -246,24 +251,51 @@ class _Text:
         self._gather(f, guesses, "q", self.programs.sizes.coordinates)
         self._put(f, "s", self._load(f, "target"))
         self._put(f, "end", f.const(0.0, DOUBLE, self.width))
-        f.call("close", f.given["work"])
+        f.call("close", f.given["work"], f.const(LONGEST_CORRECTION))
 
-    def _march(self, f: Function, before: Variable, sign: Variable):
-        """Go on to the target, in steps that are short enough."""
-        longest = self._field(f, "longest", DOUBLE)
-        way = self._load(f, "target") - self._load(f, "s")
-        most = f.reduce("fmax", f.abs(f.select(self._load(f, "end") >= 0.0, way, 0.0)))
-        steps = f.intrinsic("ceil", f.min(most / longest, f.const(float(MOST_SUBSTEPS))))
-        steps = f.max(steps, f.const(1.0))
-        step = way / f.repeat(steps, self.width)
-        whole = f.op(f"fptosi double {steps.name} to i64", INT)
-        with f.each(whole):
-            self._predict(f, step, before.value)
+    def _march(self, f: Function, before: Variable, sign: Variable, longest: Variable):
+        """Go on to the target, in steps that are halved where a lane loses its way, and grow again."""
+        n, goes_on = self.programs.sizes.coordinates, f.variable(1.0, width=1)
+        limit = self._field(f, "longest", DOUBLE)
+
+        def restore(alive: Value, step: Value, size: Value):
+            for name in ("q", "rate"):
+                with f.each(n) as i:
+                    self._put(f, name, self._load(f, f"{name} before", i), i)
+            self._put(f, "s", self._load(f, "s") - step)
+            self._put(f, "end", alive)
+            before.value = 0.0
+            longest.value = size * 0.5
+
+        def accept(step: Value, steps: Value):
             before.value = step
+            longest.value = f.min(longest.value * 2.0, limit)
+            goes_on.value = f.select((steps > 1.5) & (rounds.value < MOST_SUBSTEPS), f.const(1.0), 0.0)
+
+        rounds = f.variable(0, INT, 1)
+        with f.while_(lambda: goes_on.value > 0.5):
+            rounds.value = rounds.value + 1
+            alive = self._load(f, "end")
+            way = f.select(alive >= 0.0, self._load(f, "target") - self._load(f, "s"), 0.0)
+            most = f.reduce("fmax", f.abs(way))
+            steps = f.intrinsic("ceil", f.min(most / longest.value, f.const(float(MOST_SUBSTEPS))))
+            steps = f.max(steps, f.const(1.0))
+            step = way / f.repeat(steps, self.width)
+            self._predict(f, step, before.value)
             self._put(f, "s", self._load(f, "s") + step)
-            f.call("close", f.given["work"])
-            turned = self._load(f, "sign") * sign.value <= 0.0
-            self._put(f, "end", f.select(turned, np.nan, self._load(f, "end")))
+            f.call("close", f.given["work"], f.const(LONGEST_OF_MARCH))
+            end = self._load(f, "end")
+            lost = (self._load(f, "sign") * sign.value <= 0.0) | end.is_not(end)
+            self._put(f, "end", f.select(lost, np.nan, end))
+            size = most / steps
+            again = f.any_of(lost & (alive >= 0.0)) & (size > limit * SHORTEST) & (rounds.value < MOST_SUBSTEPS)
+            f.choose(
+                again,
+                lambda alive=alive, step=step, size=size: restore(alive, step, size),
+                lambda step=step, steps=steps: accept(step, steps),
+            )
+        arrived = f.abs(self._load(f, "s") - self._load(f, "target")) <= LAST_STEP * limit
+        self._put(f, "end", f.select(arrived, self._load(f, "end"), np.nan))
         self._put(f, "s", self._load(f, "target"))
 
     def _predict(self, f: Function, step: Value, before: Value):

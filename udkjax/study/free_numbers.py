@@ -58,7 +58,7 @@ class FreeNumbers:
     def split(self, x: Array | np.ndarray) -> dict[str, Array | np.ndarray]:
         """Return the numbers by name, of a vector (..., P)."""
         parts = zip(self.names, self.values, self.starts, self.starts[1:], strict=False)
-        return {name: x[..., a:b].reshape(*x.shape[:-1], *np.shape(value)) for name, value, a, b in parts}
+        return {name: x[..., a:b].reshape((*x.shape[:-1], *np.shape(value))) for name, value, a, b in parts}
 
     def join(self, values: Mapping[str, object]) -> Float[np.ndarray, "M P"]:
         """Return vectors, of batches (M, ...) by name; raise `SceneError` where one is missing or of another shape."""

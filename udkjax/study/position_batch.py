@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
 from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_programs import trace_model
 from udkjax.integrate.native_positions import compile_programs, position_code
 from udkjax.printing import PrintedTable, PrintsTable, prints_table, units
 from udkjax.scene.arguments import checked
@@ -70,9 +71,11 @@ class PositionBatch:
     def __init__(self, mechanism: Mechanism, driver: Drive, free: Sequence[str], derivatives: bool = False):
         self.free = FreeNumbers(mechanism, free)
         self._driven = drive(mechanism, driver)
+        coordinates = 3 * len(mechanism.body_names)
         model = position_model(self.free, driver, lambda *_: jnp.zeros(0))
+        traced = trace_model(model, self.free.count, coordinates)
         self._programs = compile_programs(
-            mechanism, model, self.free.count, 3 * len(mechanism.body_names), positions=True, derivatives=derivatives,
+            mechanism, traced, self.free.count, coordinates, positions=True, derivatives=derivatives,
             rows=np.asarray(self._driven.analysis.scales.rows),
         )  # fmt: skip
         self._code, self._unit = position_code(mechanism, self._programs), coordinate_units(self._driven)

@@ -1,0 +1,13 @@
+"""Design by gradient: mechanisms of which a point, a link or an output moves as wanted.
+
+`design` is the door and `DesignSearch` what it compiles. `goals` say what is wanted, `limits` what must hold; `problem` evaluates
+trials in lanes; `starts` are where searches begin, `search` improves them, and `found` is what comes out, moved by `kinematics`.
+"""
+
+from udkjax.study.design.design import DesignSearch as DesignSearch
+from udkjax.study.design.design import design as design
+from udkjax.study.design.found import Designs as Designs
+from udkjax.study.design.found import FoundDesign as FoundDesign
+from udkjax.study.design.goals import FunctionGoal as FunctionGoal
+from udkjax.study.design.goals import PathGoal as PathGoal
+from udkjax.study.design.goals import PoseGoal as PoseGoal

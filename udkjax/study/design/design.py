@@ -1,0 +1,192 @@
+"""Design by gradient: mechanisms of which a point, a link or an output moves as wanted."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from udkjax.scene.arguments import checked
+from udkjax.scene.checks import SceneError
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import require_count, require_number
+from udkjax.study.design.found import Designs, FoundDesign, verified
+from udkjax.study.design.goals import Goal
+from udkjax.study.design.limits import LengthLimits, Range, read_bounds
+from udkjax.study.design.polish import polish
+from udkjax.study.design.problem import Problem
+from udkjax.study.design.search import KEPT_TO, State, improve, loss_of
+from udkjax.study.design.starts import find_starts
+from udkjax.study.drive import Drive
+from udkjax.study.free_numbers import FreeNumbers
+
+SAMPLES = 8  # random mechanisms for each start: the best of them are taken
+# Steps of a search, and the share of the trials that goes on afterwards: most have shown by then where they lead.
+STAGES = ((20, 0.5), (30, 0.3), (120, 0.4))
+FEWEST = 16  # trials that go on, at least; as many are polished in the end
+POLISHING = 40  # Newton steps, of which some five are usual at each hardness of the limits
+ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are one
+
+
+class DesignSearch:
+    """A design that is compiled once and searched as often as wanted, such as from several seeds.
+
+    Args:
+        drawing: see `design`.
+        goal: see `design`.
+        free: see `design`.
+        bounds: see `design`.
+        lengths: see `design`.
+        transmission: see `design`.
+        rotation: see `design`.
+        driver: see `design`.
+
+    Raises:
+        SceneError: see `design`.
+    """
+
+    @checked
+    def __init__(
+        self,
+        drawing: Drawing | Mechanism,
+        goal: Goal,
+        free: Sequence[str] | None = None,
+        bounds: Mapping[str, Any] | None = None,
+        lengths: Mapping[tuple[str, str], Range] | None = None,
+        transmission: float = 0.0,
+        rotation: bool | None = None,
+        driver: Drive = None,
+    ):
+        mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
+        require_number("transmission", transmission, "not negative")
+        if transmission >= np.pi / 2:
+            raise ValueError(f"transmission must be an angle below a right one (rad), not {transmission:g}")
+        numbers = FreeNumbers(mechanism, _all_pins(mechanism) if free is None else free)
+        driver = _only_driver(mechanism) if driver is None else driver
+        goal.check(mechanism)
+        goal.check_line(mechanism)
+        found = read_bounds(numbers, bounds or {}, _places(mechanism, goal), mechanism.name)
+        limits = LengthLimits(numbers, {} if lengths is None else lengths)
+        self.problem = Problem(mechanism, goal, numbers, driver, found, limits, float(np.sin(transmission)), rotation)
+
+    def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
+        """Search from so many random mechanisms; return the best that differ.
+
+        Args:
+            starts: from how many.
+            seed: of the random mechanisms; the same seed gives the same result.
+            results: how many designs, at most.
+            threads: how many; by default as many as there are cores.
+        """
+        for name, value in (("starts", starts), ("results", results)):
+            require_count(name, value)
+        require_count("seed", seed, 0)
+        problem = self.problem
+        trials = find_starts(problem, starts, SAMPLES * starts, np.random.default_rng(seed), threads)
+        if not len(trials.x):
+            return Designs((), np.zeros(0), starts)
+        state = search(problem, improve(problem, trials, STAGES[0][0], threads), threads)
+        loss = loss_of(state.found.r)
+        excess = np.max(state.found.limits, axis=1, initial=-np.inf)
+        good = np.flatnonzero(state.found.is_there & (excess <= 100 * KEPT_TO * problem.scale))
+        order = good[np.argsort(loss[good], kind="stable")]
+        return Designs(tuple(_distinct(problem, state, order, loss, results)), loss[order], starts)
+
+
+def search(problem: Problem, state: State, threads: int | None) -> State:
+    """Go on with the best trials, stage by stage."""
+    shares = [share for _, share in STAGES]
+    for share, (steps, _) in zip(shares, STAGES[1:], strict=False):
+        count = max(FEWEST, int(share * len(state.merit)))
+        merit = np.where(state.found.is_there, state.merit, np.inf)
+        state = state.take(np.argsort(merit, kind="stable")[:count])
+        state = improve(problem, state.trials, steps, threads, state)
+    merit = np.where(state.found.is_there, state.merit, np.inf)
+    return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST]), POLISHING, threads)
+
+
+def _distinct(problem: Problem, state: State, order: np.ndarray, loss: np.ndarray, results: int) -> list[FoundDesign]:
+    found: list[FoundDesign] = []
+    seen: list[np.ndarray] = []
+    for k in order:
+        if len(found) == results:
+            break
+        x, s, q = (a[k] for a in state.trials)
+        signature = np.append(problem.signature(x, q[0]), 0.0)
+        if any(np.max(np.abs(signature - other)) < ALIKE * problem.scale for other in seen):
+            continue
+        one = verified(problem, x, s, q, float(loss[k]))
+        if one is not None:
+            found.append(one)
+            seen.append(signature)
+    return found
+
+
+@checked
+def design(
+    drawing: Drawing | Mechanism,
+    goal: Goal,
+    free: Sequence[str] | None = None,
+    bounds: Mapping[str, Any] | None = None,
+    lengths: Mapping[tuple[str, str], Range] | None = None,
+    transmission: float = 0.0,
+    rotation: bool | None = None,
+    driver: Drive = None,
+    starts: int = 300,
+    seed: int = 0,
+    results: int = 5,
+) -> Designs:
+    """Find mechanisms of the structure of a drawing that meet a goal, by least squares from many starts at once.
+
+    Random mechanisms within the bounds are turned once; the best of them, moved and scaled to the goal as a whole where that is
+    free, are improved by Levenberg and Marquardt's method, all side by side in machine code, with exact derivatives by all free
+    numbers. Branches are kept, positions come in their order, limits hold. What is returned has been moved by `kinematics`.
+
+    Args:
+        drawing: the structure: a drawing, or a mechanism with one degree of freedom once its drivers hold. Its pins say nothing
+            but how links are joined, where they are free.
+        goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`.
+        free: names of the numbers that are free, such as `pin.A` or `pin.C[0]`; by default all pins.
+        bounds: (low, high) by the names of free numbers; each end one number, or of the number's shape (m).
+        lengths: (least, most) distances (m) by two pins.
+        transmission: the least angle (rad) between the transmission and none: of a four-bar, by how much the transmission angle
+            stays away from 0 and pi; over the whole turn if there is one.
+        rotation: whether the driver has to make a whole turn; by default where it is an angle.
+        driver: a driver or coordinate as of `kinematics`; by default the only driver.
+        starts: from how many mechanisms.
+        seed: of these; the same seed gives the same result.
+        results: how many designs, at most.
+
+    Returns:
+        `Designs`, the best first; none where nothing was found within the limits.
+
+    Raises:
+        SceneError: names, bounds or lengths are wrong, positions do not follow from the driver, or machine code has no
+            instruction for something in the mechanism.
+        ValueError: another argument cannot be used.
+    """
+    found = DesignSearch(drawing, goal, free, bounds, lengths, transmission, rotation, driver)
+    return found(starts, seed, results)
+
+
+def _all_pins(mechanism: Mechanism) -> list[str]:
+    if mechanism.drawing is None:
+        raise SceneError(["free: name the numbers that are free; only of a drawing all pins are by default"], mechanism.name)
+    return [f"pin.{name}" for name in mechanism.drawing.groups["pin"]]
+
+
+def _only_driver(mechanism: Mechanism) -> str:
+    names = mechanism.driver_names
+    if len(names) != 1:
+        there = f"there are {', '.join(names)}" if names else "there is none in the scene"
+        raise SceneError([f"driver: name the driver or a coordinate, such as body.crank.angle: {there}"], mechanism.name)
+    return names[0]
+
+
+def _places(mechanism: Mechanism, goal: Goal) -> np.ndarray:
+    """Return the places that say where, and of what size, the mechanism may be."""
+    if goal.has_place:
+        fixed = [] if mechanism.drawing is None else [np.asarray(p.position) for p in mechanism.drawing.groups["pin"].values()]  # pyright: ignore
+        size = np.ptp(goal.targets[:, :2], axis=0).max()
+        return goal.targets[:, :2] if size > 0 or not fixed else np.vstack([goal.targets[:, :2], *fixed])
+    return np.asarray(mechanism.q0)[:, :2]

@@ -1,0 +1,147 @@
+"""Results of a design: mechanisms that meet the goal, verified by their own motion."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.printing import PrintedTable, PrintsTable, format_numbers
+from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.study.channels import locate
+from udkjax.study.design.problem import TURN, Problem
+from udkjax.study.drive import Drive
+from udkjax.study.free_numbers import FreeNumbers
+from udkjax.study.kinematics import Kinematics, kinematics
+
+BETWEEN = 16  # values of a motion from one position of the goal to the next
+AGREEMENT = 1e-6  # relative difference, and of the squared scale, between the loss of a search and that of the motion
+
+
+class FoundDesign(PrintsTable):
+    """A mechanism that was found, drawn at the first position of the goal where its pins are free.
+
+    Attributes:
+        loss: the sum of the squares of the residuals (m^2; of a function rad^2 or m^2), of its motion.
+        mechanism: the mechanism, to be run, animated or saved.
+        values: of the driver at the positions of the goal (J,) (rad, m).
+        residuals: (J, G), of its motion, which `kinematics` follows over these values.
+        transmission: the least over the positions, from 0 to 1; of a four-bar the sine of the transmission angle.
+        turns: whether the driver makes a whole turn.
+        parameters: the numbers that were free, by name.
+        driver: what drives it.
+    """
+
+    loss: float
+    mechanism: Mechanism
+    values: Float[np.ndarray, "J"]
+    residuals: Float[np.ndarray, "J G"]
+    transmission: float
+    turns: bool
+    parameters: dict[str, np.ndarray]
+    driver: Drive = eqx.field(static=True)
+
+    def motion(self, count: int = 361) -> Kinematics:
+        """Return a motion of it, by `kinematics`: a whole turn from the first position, or from there to the last one.
+
+        Args:
+            count: of values.
+        """
+        last = self.values[0] + TURN if self.turns else self.values[-1]
+        return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
+
+    @property
+    def drawing(self) -> AbstractDrawing | None:
+        """The drawing, where the design began with one."""
+        return self.mechanism.drawing
+
+    def _table(self) -> PrintedTable:
+        rows = [("loss", f"{self.loss:.6g}"), ("largest residual", f"{np.max(np.abs(self.residuals)):.3g}")]
+        rows += [("transmission", f"{self.transmission:.3g}"), ("turns", "yes" if self.turns else "no")]
+        pins = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
+        rows += [(f"pin.{name}", format_numbers(pin.position, "m")) for name, pin in pins.items()]  # pyright: ignore
+        return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
+
+
+class Designs(PrintsTable):
+    """Different mechanisms that meet a goal, the best first: a sequence of `FoundDesign`.
+
+    Attributes:
+        found: the designs.
+        losses: of all trials that ended within the limits, sorted; the more often the best was found, the less is left to find.
+        starts: from how many mechanisms the search began.
+    """
+
+    found: tuple[FoundDesign, ...]
+    losses: Float[np.ndarray, "k"]
+    starts: int = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def __getitem__(self, k: int) -> FoundDesign:
+        return self.found[k]
+
+    def __iter__(self) -> Iterator[FoundDesign]:
+        return iter(self.found)
+
+    def _table(self) -> PrintedTable:
+        rows = [("starts", str(self.starts)), ("within the limits", str(len(self.losses)))]
+        for k, one in enumerate(self.found):
+            turns = ", turns" if one.turns else ""
+            rows.append((str(k + 1), f"loss {one.loss:.6g}, transmission {one.transmission:.3g}{turns}"))
+        return PrintedTable(f"{len(self.found)} designs", rows)
+
+
+def verified(problem: Problem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
+    """Return a trial as a design whose loss is that of its motion; None where its motion does not bear it out."""
+    mechanism = problem.free.moved(jnp.asarray(x[: problem.free.count]))
+    mechanism = redrawn(problem, mechanism, q[0].reshape(-1, 3))
+    values = s + float(problem.goal.origin(mechanism)) + (x[problem.free.count] if problem.shifted else 0.0)
+    drawn = float(problem.drawn(mechanism))
+    if problem.driven.is_angle:
+        values = values + TURN * np.round((drawn - values[0]) / TURN)
+    moved = follow(mechanism, problem.driver, drawn, values)
+    if moved is None:
+        return None
+    numbers = FreeNumbers(mechanism, problem.free.names)
+    residuals = problem.residuals(np.append(numbers.vector, x[problem.free.count :]), moved.reshape(len(s), -1))
+    found = float(np.sum(residuals**2))
+    if not abs(found - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
+        return None
+    turns = problem.turns(x)
+    if problem.rotation and not turns:
+        return None
+    tau = problem.transmission_at(x, s, q)
+    parameters = dict(zip(numbers.names, numbers.values, strict=True))
+    return FoundDesign(found, mechanism, values, residuals, tau, turns, parameters, problem.driver)
+
+
+def follow(mechanism: Mechanism, driver: Drive, drawn: float, values: np.ndarray) -> np.ndarray | None:
+    """Return positions (J, bodies, 3) of a motion from the drawn position over values; None where it does not get there."""
+    ends = np.append(drawn, values)
+    along = np.concatenate([np.linspace(a, b, BETWEEN, endpoint=False) for a, b in zip(ends, values, strict=False)])
+    motion = kinematics(mechanism, driver, np.append(along, values[-1]))
+    if not np.all(motion.reached):
+        return None
+    return np.asarray(motion.q)[BETWEEN::BETWEEN]
+
+
+def redrawn(problem: Problem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:
+    """Return the mechanism drawn in a position, where all of its moving pins are free; else as it is."""
+    drawing = mechanism.drawing
+    if drawing is None:
+        return mechanism
+    pins = drawing.groups["pin"]
+    fixed = set(drawing.ground)  # pyright: ignore[reportAttributeAccessIssue]
+    moving = [name for name in pins if name not in fixed]
+    if not {f"pin.{name}" for name in moving} <= {*problem.free.names} or problem.has_outlines:
+        return mechanism
+    places = {}
+    for name in moving:
+        body, local = locate(mechanism, f"pin.{name}")
+        x, y, angle = q[mechanism.body_names.index(body)]
+        c, s = np.cos(angle), np.sin(angle)
+        places[f"pin.{name}"] = np.array([x + c * local[0] - s * local[1], y + s * local[0] + c * local[1]])
+    return mechanism.with_parameters(places)

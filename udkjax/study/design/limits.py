@@ -1,0 +1,137 @@
+"""Limits of a design: bounds of free numbers, lengths between pins, and the least transmission."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.expressions import Graph, ScalarProgram, trace
+from udkjax.expressions.differential import Differential
+from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.free_numbers import FreeNumbers
+
+Range = tuple[float, float]
+# How far a position stays from where branches meet over a turn that has to be complete, whatever transmission is asked for:
+# sine of the transmission angle of a four-bar. Closer, machine parts with clearances do not know their branch.
+LEAST_TRANSMISSION = 1e-3
+DEFAULT_REACH = 2.0  # times the extent of targets and drawing: how far pins are searched, where there are no bounds
+DEFAULT_FACTOR = 4.0  # other numbers: from this fraction of their values to this multiple
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """The ends of the ranges of free numbers (P,): `low` and `high` are kept, `first` and `last` are where searches start."""
+
+    low: np.ndarray
+    high: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+
+def read_bounds(
+    free: FreeNumbers, given: Mapping[str, object], places: np.ndarray, name: str, reach: float = DEFAULT_REACH
+) -> Bounds:
+    """Return the bounds of all free numbers; raise `SceneError` where one is not a range.
+
+    Args:
+        free: the numbers.
+        given: (low, high) by the name of a free number; each end is a number, or has its shape.
+        places: (k, 2) where the design is about (m).
+        name: of the mechanism, for errors.
+        reach: of the search for pins without bounds, in extents of the places.
+    """
+    low, high = np.full(free.count, -np.inf), np.full(free.count, np.inf)
+    centre, extent = 0.5 * (places.min(0) + places.max(0)), max(float(np.max(np.ptp(places, axis=0))), 1e-12)
+    problems = [f"bounds: {quote(key)} is not free{suggestion(key, free.names)}" for key in given if key not in free.names]
+    first, last = np.empty(free.count), np.empty(free.count)
+    for key, value, a, b in zip(free.names, free.values, free.starts, free.starts[1:], strict=False):
+        shape = np.shape(value)
+        if key.startswith("pin.") and shape in ((2,), ()):
+            middle = centre if shape else centre[int(key[-2])] if key.endswith(("[0]", "[1]")) else 0.0
+            first[a:b], last[a:b] = middle - reach * extent, middle + reach * extent
+        else:
+            ends = np.stack([np.ravel(value) / DEFAULT_FACTOR, np.ravel(value) * DEFAULT_FACTOR])
+            first[a:b], last[a:b] = ends.min(0), ends.max(0)
+        if key in given:
+            try:
+                one, two = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in given[key])  # pyright: ignore
+            except (TypeError, ValueError):
+                problems.append(f"bounds.{key}: must be a pair (low, high), each a number or of the shape {shape}")
+                continue
+            if not np.all(one <= two):  # also of what is not a number
+                problems.append(f"bounds.{key}: low must not exceed high")
+            low[a:b], high[a:b] = one, two
+            apart = (one > last[a:b]) | (two < first[a:b])  # from where a search would start otherwise
+            first[a:b], last[a:b] = (
+                np.where(apart, np.maximum(one, two - extent), np.maximum(one, first[a:b])),
+                np.where(apart, np.minimum(two, one + extent), np.minimum(two, last[a:b])),
+            )
+    if problems:
+        raise SceneError(problems, name)
+    return Bounds(low, high, first, last)
+
+
+class LengthLimits:
+    """Ranges of distances between pins of a drawing: rows c(x) (K,) in m that must not exceed zero, and their derivatives.
+
+    Args:
+        free: the free numbers x.
+        lengths: (least, most) in m by two pins.
+
+    Raises:
+        SceneError: there is no drawing, no such pin, or no such range.
+    """
+
+    def __init__(self, free: FreeNumbers, lengths: Mapping[tuple[str, str], Range]):
+        mechanism = free.mechanism
+        ranges = [_read_range(mechanism, pins, ends) for pins, ends in lengths.items()]
+        if problems := [p for found in ranges for p in found[3]]:
+            raise SceneError(problems, mechanism.name)
+        self._program, self.count = None, sum(np.isfinite(e) and e > 0 for _, *ends, _ in ranges for e in ends)
+        if not self.count:
+            return
+
+        def rows(x: Array) -> Array:
+            pins, found = free.moved(x).drawing.pins, []  # pyright: ignore
+            for (a, b), low, high, _ in ranges:
+                way = pins[b] - pins[a]
+                length = jnp.sqrt(way @ way)
+                found += [low - length] if low > 0 else []
+                found += [length - high] if np.isfinite(high) else []
+            return jnp.stack(found)
+
+        graph = Graph()
+        x = np.array([graph.input(k, "x") for k in range(free.count)], object)
+        found = list(trace(rows, jnp.zeros(free.count))(graph, x)[0].flat)
+        differential, zero = Differential(graph, found, list(x)), graph.constant(0.0)
+        slopes = [differential.row(c).get(v.index, zero) for c in found for v in x]
+        self._program, self._free = ScalarProgram(graph, list(x), [*found, *slopes]), free.count
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return c (M, K) and dc/dx (M, K, P) of vectors (M, P), of which the first entries are the free numbers."""
+        members, P = x.shape
+        slopes = np.zeros((members, self.count, P))
+        if self._program is None:
+            return np.zeros((members, 0)), slopes
+        found = np.stack(self._program.by_numpy(list(x[:, : self._free].T)), 1)
+        slopes[:, :, : self._free] = found[:, self.count :].reshape(members, self.count, self._free)
+        return found[:, : self.count], slopes
+
+
+def _read_range(mechanism: Mechanism, pins: Sequence[str], ends: Range) -> tuple[tuple[str, ...], float, float, list[str]]:
+    known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
+    where, problems = f"lengths[{', '.join(map(str, pins))}]", []
+    if isinstance(pins, str) or len(pins) != 2:
+        problems.append(f'lengths: {quote(str(pins))} must be two pins, such as ("A", "B")')
+    else:
+        problems += [f"{where}: no pin named {quote(p)}{suggestion(p, known)}" for p in pins if p not in known]
+    try:
+        low, high = (float(x) for x in ends)
+    except (TypeError, ValueError):
+        return tuple(pins), 0.0, np.inf, [*problems, f"{where}: must be a pair (least, most) in m"]
+    if not 0 <= low <= high:
+        problems.append(f"{where}: must be zero or more, the least before the most, not {low:g} and {high:g}")
+    return tuple(pins), low, high, problems
