@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.design.problem import Trials
+from udkjax.study.design.design_problem import Trials
 from udkjax.study.design.search import loss_of
 
 DATA = json.loads((Path(__file__).parents[2] / "data" / "path_synthesis.json").read_text())["cases"]

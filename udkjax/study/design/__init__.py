@@ -1,7 +1,8 @@
 """Design by gradient: mechanisms of which a point, a link or an output moves as wanted.
 
-`design` is the door and `DesignSearch` what it compiles. `goals` say what is wanted, `limits` what must hold; `problem` evaluates
-trials in lanes; `starts` are where searches begin, `search` improves them, and `found` is what comes out, moved by `kinematics`.
+`design` is the door and `DesignSearch` what it compiles. `goals` say what is wanted, `limits` what must hold; `design_problem`
+evaluates trials in lanes; `starts` are where searches begin, `search` and `polish` improve them, and `found` is what comes out,
+moved by `kinematics`. `goal_file` reads designs from files.
 """
 
 from udkjax.study.design.design import DesignSearch as DesignSearch

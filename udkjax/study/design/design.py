@@ -10,12 +10,12 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_count, require_number
+from udkjax.study.design.design_problem import DesignProblem
 from udkjax.study.design.found import Designs, FoundDesign, verified
 from udkjax.study.design.goals import Goal
 from udkjax.study.design.limits import LengthLimits, Range, read_bounds
 from udkjax.study.design.polish import polish
-from udkjax.study.design.problem import Problem
-from udkjax.study.design.search import KEPT_TO, State, improve, loss_of
+from udkjax.study.design.search import KEPT_TO, SearchState, improve, loss_of
 from udkjax.study.design.starts import find_starts
 from udkjax.study.drive import Drive
 from udkjax.study.free_numbers import FreeNumbers
@@ -67,7 +67,7 @@ class DesignSearch:
         goal.check_line(mechanism)
         found = read_bounds(numbers, bounds or {}, _places(mechanism, goal), mechanism.name)
         limits = LengthLimits(numbers, {} if lengths is None else lengths)
-        self.problem = Problem(mechanism, goal, numbers, driver, found, limits, float(np.sin(transmission)), rotation)
+        self.problem = DesignProblem(mechanism, goal, numbers, driver, found, limits, float(np.sin(transmission)), rotation)
 
     def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
         """Search from so many random mechanisms; return the best that differ.
@@ -93,7 +93,7 @@ class DesignSearch:
         return Designs(tuple(_distinct(problem, state, order, loss, results)), loss[order], starts)
 
 
-def search(problem: Problem, state: State, threads: int | None) -> State:
+def search(problem: DesignProblem, state: SearchState, threads: int | None) -> SearchState:
     """Go on with the best trials, stage by stage."""
     shares = [share for _, share in STAGES]
     for share, (steps, _) in zip(shares, STAGES[1:], strict=False):
@@ -105,7 +105,7 @@ def search(problem: Problem, state: State, threads: int | None) -> State:
     return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST]), POLISHING, threads)
 
 
-def _distinct(problem: Problem, state: State, order: np.ndarray, loss: np.ndarray, results: int) -> list[FoundDesign]:
+def _distinct(problem: DesignProblem, state: SearchState, order: np.ndarray, loss: np.ndarray, results: int) -> list[FoundDesign]:
     found: list[FoundDesign] = []
     seen: list[np.ndarray] = []
     for k in order:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.study.channels import locate
-from udkjax.study.design.problem import TURN, Problem
+from udkjax.study.design.design_problem import TURN, DesignProblem
 from udkjax.study.drive import Drive
 from udkjax.study.free_numbers import FreeNumbers
 from udkjax.study.kinematics import Kinematics, kinematics
@@ -94,7 +94,7 @@ class Designs(PrintsTable):
         return PrintedTable(f"{len(self.found)} designs", rows)
 
 
-def verified(problem: Problem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
+def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
     """Return a trial as a design whose loss is that of its motion; None where its motion does not bear it out."""
     mechanism = problem.free.moved(jnp.asarray(x[: problem.free.count]))
     mechanism = redrawn(problem, mechanism, q[0].reshape(-1, 3))
@@ -128,7 +128,7 @@ def follow(mechanism: Mechanism, driver: Drive, drawn: float, values: np.ndarray
     return np.asarray(motion.q)[BETWEEN::BETWEEN]
 
 
-def redrawn(problem: Problem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:
+def redrawn(problem: DesignProblem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:
     """Return the mechanism drawn in a position, where all of its moving pins are free; else as it is."""
     drawing = mechanism.drawing
     if drawing is None:

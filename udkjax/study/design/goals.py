@@ -49,7 +49,7 @@ def _values(value: Any) -> np.ndarray | None:
 
 
 class Goal(PrintsTable):
-    """What is wanted of a motion; `targets` has a row for each position.
+    """A wish about a motion; `targets` has a row for each position.
 
     Where `values` are given, each position has its value of the driver (rad, m); otherwise positions come in their order, at
     values that are found. `start` "free": values count from one that is found; `line`: they count from the direction from one

@@ -8,15 +8,15 @@ differences of gradients, all of which are trials of one batch. Steps go downhil
 
 import numpy as np
 
-from udkjax.study.design.problem import Evaluation, Problem, Trials
-from udkjax.study.design.search import ACTIVE_SETS, ROUNDING, State, goes_on, harden, merit_of
+from udkjax.study.design.design_problem import DesignProblem, TrialResiduals, Trials
+from udkjax.study.design.search import ACTIVE_SETS, ROUNDING, SearchState, goes_on, harden, merit_of
 
 DIFFERENCE = 1e-7  # of the unknowns' scales: small enough for mechanisms that just turn; rounding leaves 1e-8 of a Hessian
 FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, of the largest eigenvalue
 CONVERGED = 1e-13  # relative fall of the merit that a step promises
 
 
-def polish(problem: Problem, state: State, steps: int, threads: int | None = None) -> State:
+def polish(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
     """Improve all trials of a state by so many Newton steps at most."""
     members, sign = len(state.merit), np.sign(state.found.transmission[:, 0])
     shift, done = np.full(members, FIRST_SHIFT), ~state.found.is_there
@@ -29,9 +29,15 @@ def polish(problem: Problem, state: State, steps: int, threads: int | None = Non
 
 
 def _newton_step(
-    problem: Problem, state: State, active: np.ndarray, sign: np.ndarray, shift: np.ndarray, done: np.ndarray, threads: int | None
+    problem: DesignProblem,
+    state: SearchState,
+    active: np.ndarray,
+    sign: np.ndarray,
+    shift: np.ndarray,
+    done: np.ndarray,
+    threads: int | None,
 ):
-    trials, found = state.trials.take(active), Evaluation(*(a[active] for a in state.found))
+    trials, found = state.trials.take(active), TrialResiduals(*(a[active] for a in state.found))
     u, weight = state.multipliers[active], state.weight[active]
     z, units = _join(problem, trials)
     pressed = found.limits + u > 0
@@ -75,7 +81,7 @@ def _newton_step(
     done[ended[~wrong]] = True
 
 
-def _downhill(problem: Problem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return the step of each trial, along which unknowns at their bounds that would leave them stay."""
     held = np.zeros(g.shape, bool)
     of_x = g[:, : problem.unknowns]
@@ -86,7 +92,7 @@ def _downhill(problem: Problem, trials: Trials, H: np.ndarray, g: np.ndarray, sh
     return np.where(held, 0.0, -np.einsum("mki,mi->mk", V, along))
 
 
-def _join(problem: Problem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
+def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
     """Return z (M, N) and its units (N,)."""
     units = np.ones(problem.unknowns)
     units[: problem.free.count] = problem.sizes
@@ -95,13 +101,13 @@ def _join(problem: Problem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([trials.x, trials.s], 1), np.append(units, np.ones(trials.s.shape[1]))
 
 
-def _split(problem: Problem, z: np.ndarray, trials: Trials) -> Trials:
+def _split(problem: DesignProblem, z: np.ndarray, trials: Trials) -> Trials:
     x = np.clip(z[:, : problem.unknowns], problem.low, problem.high)
     return Trials(x, z[:, problem.unknowns :] if problem.local else trials.s, trials.q)
 
 
 def _gradient(
-    problem: Problem, found: Evaluation, multipliers: np.ndarray, weight: np.ndarray, pressed: np.ndarray
+    problem: DesignProblem, found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray, pressed: np.ndarray
 ) -> np.ndarray:
     excess = weight[:, None] ** 2 * (found.limits + multipliers) * pressed
     by_x = np.einsum("mjgp,mjg->mp", found.by_unknowns, found.r) + np.einsum("mkp,mk->mp", found.limits_by_unknowns, excess)
@@ -111,7 +117,7 @@ def _gradient(
 
 
 def _hessian(
-    problem: Problem,
+    problem: DesignProblem,
     trials: Trials,
     z: np.ndarray,
     units: np.ndarray,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from udkjax.study.design.problem import MARGIN_WEIGHT, Evaluation, Problem, Trials
+from udkjax.study.design.design_problem import MARGIN_WEIGHT, DesignProblem, TrialResiduals, Trials
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
 RELAX, TIGHTEN = 0.2, 4.0  # of the damping, after a step that is taken and one that is not
@@ -31,11 +31,11 @@ GAP_SHARE = 0.45  # of the gap to the next value that a value may move by in one
 
 
 @dataclass
-class State:
+class SearchState:
     """Trials on their way: with all that is known where they are."""
 
     trials: Trials
-    found: Evaluation
+    found: TrialResiduals
     multipliers: np.ndarray
     weight: np.ndarray
     margin: np.ndarray
@@ -43,11 +43,11 @@ class State:
     merit: np.ndarray
     settled: np.ndarray
 
-    def take(self, which: np.ndarray) -> "State":
+    def take(self, which: np.ndarray) -> "SearchState":
         """Return some of them."""
-        found = Evaluation(*(a[which] for a in self.found))
+        found = TrialResiduals(*(a[which] for a in self.found))
         rest = (self.multipliers, self.weight, self.margin, self.damping, self.merit, self.settled)
-        return State(self.trials.take(which), found, *(a[which] for a in rest))
+        return SearchState(self.trials.take(which), found, *(a[which] for a in rest))
 
 
 def loss_of(r: np.ndarray) -> np.ndarray:
@@ -55,7 +55,9 @@ def loss_of(r: np.ndarray) -> np.ndarray:
     return np.einsum("mjg,mjg->m", r, r)
 
 
-def improve(problem: Problem, trials: Trials, steps: int, threads: int | None = None, state: State | None = None) -> State:
+def improve(
+    problem: DesignProblem, trials: Trials, steps: int, threads: int | None = None, state: SearchState | None = None
+) -> SearchState:
     """Improve trials by so many steps at most; return where they got, those that have no positions with an infinite merit.
 
     `state` is that of the trials, where they have been improved before.
@@ -70,25 +72,25 @@ def improve(problem: Problem, trials: Trials, steps: int, threads: int | None = 
     return state
 
 
-def _first_state(problem: Problem, trials: Trials, threads: int | None) -> State:
+def _first_state(problem: DesignProblem, trials: Trials, threads: int | None) -> SearchState:
     members = len(trials.x)
     margin = np.full(members, max(problem.least**2, FIRST_MARGIN))
     found = problem.evaluate(trials, margin, threads)
     multipliers = np.zeros_like(found.limits)
     weight, damping, merit = np.full(members, FIRST_WEIGHT), np.full(members, FIRST_DAMPING), np.full(members, np.inf)
-    state = State(trials, found, multipliers, weight, margin, damping, merit, ~found.is_there)
+    state = SearchState(trials, found, multipliers, weight, margin, damping, merit, ~found.is_there)
     state.merit[found.is_there] = merit_of(found, multipliers, weight)[found.is_there]
     return state
 
 
-def merit_of(found: Evaluation, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def merit_of(found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the loss with what limits add to it (M,)."""
     excess = weight[:, None] * np.maximum(found.limits + multipliers, 0.0)
     return loss_of(found.r) + np.einsum("mk,mk->m", excess, excess)
 
 
-def _step(problem: Problem, state: State, active: np.ndarray, sign: np.ndarray, threads: int | None):
-    trials, found = state.trials.take(active), Evaluation(*(a[active] for a in state.found))
+def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: np.ndarray, threads: int | None):
+    trials, found = state.trials.take(active), TrialResiduals(*(a[active] for a in state.found))
     dx, ds = _find_step(problem, trials, found, state.multipliers[active], state.weight[active], state.damping[active])
     new = Trials(np.clip(trials.x + dx, problem.low, problem.high), trials.s + ds, trials.q)
     there = problem.evaluate(new, state.margin[active], threads)
@@ -110,7 +112,7 @@ def _step(problem: Problem, state: State, active: np.ndarray, sign: np.ndarray, 
     _settle(problem, state, done)
 
 
-def _settle(problem: Problem, state: State, done: np.ndarray):
+def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
     """Trials that go no farther have settled, unless a limit is still exceeded or pressed on in vain: multipliers change then."""
     again = done[goes_on(problem, state, done)]
     state.settled[done] = True
@@ -118,7 +120,7 @@ def _settle(problem: Problem, state: State, done: np.ndarray):
     state.damping[again] = np.minimum(state.damping[again], FIRST_DAMPING)
 
 
-def goes_on(problem: Problem, state: State, which: np.ndarray) -> np.ndarray:
+def goes_on(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
     """Return of trials that go no farther whether they should, once limits have changed."""
     limits, u = state.found.limits[which], state.multipliers[which]
     wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > KEPT_TO * problem.scale
@@ -128,7 +130,7 @@ def goes_on(problem: Problem, state: State, which: np.ndarray) -> np.ndarray:
     return wrong
 
 
-def harden(problem: Problem, state: State, which: np.ndarray):
+def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
     """Update the multipliers of some trials, harden their limits, and bring their margins nearer to what is asked for."""
     harder = np.minimum(state.weight[which] * HARDEN, MOST_WEIGHT)
     softer = (state.weight[which] / harder)[:, None] ** 2
@@ -139,11 +141,16 @@ def harden(problem: Problem, state: State, which: np.ndarray):
         unit = MARGIN_WEIGHT * problem.scale
         state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
     state.margin[which] = margin
-    state.merit[which] = merit_of(Evaluation(*(a[which] for a in state.found)), state.multipliers[which], harder)
+    state.merit[which] = merit_of(TrialResiduals(*(a[which] for a in state.found)), state.multipliers[which], harder)
 
 
 def _find_step(
-    problem: Problem, trials: Trials, found: Evaluation, multipliers: np.ndarray, weight: np.ndarray, damping: np.ndarray
+    problem: DesignProblem,
+    trials: Trials,
+    found: TrialResiduals,
+    multipliers: np.ndarray,
+    weight: np.ndarray,
+    damping: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     members, P = trials.x.shape
     J, r = found.by_unknowns.reshape(members, -1, P), found.r.reshape(members, -1)

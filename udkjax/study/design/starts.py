@@ -1,4 +1,4 @@
-"""Where searches start: random mechanisms, turned once, moved and scaled to their targets, with values assigned in order.
+"""Starts of searches: random mechanisms, turned once, moved and scaled to their targets, with values assigned in order.
 
 Of each the curve of a whole turn is known, and so is what it would be if the mechanism were moved, turned and scaled: a place p
 becomes a p + b, in complex numbers. The best a and b for an assignment of values to targets are a linear least-squares problem;
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.study.design.problem import TURN_VALUES, Problem, Trials, Turn
+from udkjax.study.design.design_problem import TURN_VALUES, DesignProblem, Trials, Turn
 
 PHASES = 12  # first values that are tried, around a turn
 SPANS = (1.0, 0.6, 0.3)  # of a turn, from the first value to the last, that are tried for open curves
@@ -24,7 +24,7 @@ class _Fitted(NamedTuple):
     cost: np.ndarray
 
 
-def find_starts(problem: Problem, count: int, samples: int, rng: np.random.Generator, threads: int | None = None) -> Trials:
+def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random.Generator, threads: int | None = None) -> Trials:
     """Return the `count` best of some random mechanisms, as trials; fewer where fewer have all positions."""
     x = np.zeros((samples, problem.unknowns))
     x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
@@ -34,7 +34,7 @@ def find_starts(problem: Problem, count: int, samples: int, rng: np.random.Gener
         x, turn = x[reached], Turn(*(a[reached] for a in turn))
     if not len(x):
         return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
-    trials, cost = _assign(problem, x, turn, threads) if problem.local else _shift(problem, x, turn)
+    trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
     s, moved = trials
     q, there = problem.march(moved, s, threads)
     best = np.argsort(np.where(there & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
@@ -45,7 +45,7 @@ def find_starts(problem: Problem, count: int, samples: int, rng: np.random.Gener
 # --- values that are unknown
 
 
-def _assign(problem: Problem, x: np.ndarray, turn: Turn, threads: int | None) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     target = problem.data[:, 0] + 1j * problem.data[:, 1]
     curve = turn.measures[:, :-1, 0] + 1j * turn.measures[:, :-1, 1]
     moves = problem.can_move
@@ -114,7 +114,7 @@ def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fit
 # --- values that are given
 
 
-def _shift(problem: Problem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     goal, moves = problem.goal, problem.can_move
     values = np.asarray(goal.values)
     x, start = x.copy(), turn.s[:, 0]

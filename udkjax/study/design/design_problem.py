@@ -36,7 +36,7 @@ class Trials(NamedTuple):
         return Trials(*(a[which] for a in self))
 
 
-class Evaluation(NamedTuple):
+class TrialResiduals(NamedTuple):
     """Residuals of M trials with their derivatives.
 
     Attributes:
@@ -70,7 +70,7 @@ class Turn(NamedTuple):
     reached: np.ndarray
 
 
-class Problem:
+class DesignProblem:
     """A goal for a mechanism: what is unknown, and programs that evaluate trials.
 
     The unknowns x are the free numbers; the value from which values of the driver count, where that is free; and further ones of
@@ -143,7 +143,7 @@ class Problem:
             raise SceneError([f"free: {listed} cannot change what the goal measures: leave it out"], self.mechanism.name)
 
     def _point_program(self) -> ScalarProgram:
-        """What is measured, then the places of all pins, of the unknowns and q; or without a drawing q and the unknowns."""
+        """Return the program of the measures, then of the places of all pins, or without a drawing of q and the unknowns."""
         names = [] if self.mechanism.drawing is None else list(self.mechanism.drawing.groups["pin"])  # pyright: ignore
 
         def points(x: Array, q: Array) -> Array:
@@ -236,7 +236,7 @@ class Problem:
 
     @property
     def can_move(self) -> str:
-        """What may be done to the mechanism as a whole to bring it to its targets: "anything", "no turn", or "nothing"."""
+        """Moves of the mechanism as a whole that may bring it to its targets: "anything", "no turn", or "nothing"."""
         drawing = self.mechanism.drawing
         names = [] if drawing is None else [f"pin.{name}" for name in drawing.groups["pin"]]  # pyright: ignore
         if not self.goal.has_place or not names or not set(names) <= {*self.free.names}:
@@ -266,7 +266,7 @@ class Problem:
         """True if transmission is limited."""
         return self.rotation or self.least > LEAST_TRANSMISSION
 
-    def evaluate(self, trials: Trials, margin: np.ndarray, threads: int | None = None) -> Evaluation:
+    def evaluate(self, trials: Trials, margin: np.ndarray, threads: int | None = None) -> TrialResiduals:
         """Evaluate residuals and limits of trials, each position closed from that of the trial.
 
         The rows of limits are those of lengths, and then of transmission tau, margin (M,) - tau^2: where branches meet it is the
@@ -288,10 +288,10 @@ class Problem:
             limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
             by_x = table[:, :, G, 2:]  # values that are unknowns are held: what moves them is another residual's matter
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
-        return Evaluation(found.q, r, by_value, by_unknowns, tau, limits, slopes, is_there)
+        return TrialResiduals(found.q, r, by_value, by_unknowns, tau, limits, slopes, is_there)
 
     def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far the least transmission of a turn falls short, its derivative (at the worst value), and whether it turns.
+        """Return by how much the least transmission of a turn falls short, its derivative, and whether it turns.
 
         Near its least value tau^2 is a parabola: through three values of the turn, and then by its slope.
         """
