@@ -98,6 +98,15 @@ def test_ten_seconds_are_simulated_where_no_run_is_given():
     assert animation.data["runs"][0]["measures"][0]["name"] == "violation"
 
 
+def test_the_tolerances_are_those_of_the_run(live):
+    pendulum = udk.library.simple_pendulum()
+    exact = udk.simulate(pendulum, np.linspace(0.0, 0.5, 6), rtol=1e-11, atol=1e-10)
+    settings = udk.animate(pendulum, exact, measures=(), live=["gravity"]).data["live"]["engine"]["settings"]
+    assert (settings["rtol"], settings["atol"]) == (1e-11, 1e-10)
+    settings = live.data["live"]["engine"]["settings"]  # of a motion that knows none
+    assert (settings["rtol"], settings["atol"]) == (1e-8, 1e-8)
+
+
 def test_the_torque_of_a_driver_is_among_its_measures(live):
     assert "torque of motor" in [m["name"] for m in live.data["runs"][0]["measures"]]
 
@@ -107,6 +116,9 @@ def test_what_cannot_be_live_says_why(slider_crank, run):
         udk.animate(slider_crank, run, live=["pin.Q"])
     with pytest.raises(ValueError, match="one mechanism and one solution"):
         udk.animate(slider_crank, {"one": run, "two": run}, live=True)
+    unstable = udk.simulate(slider_crank, np.linspace(0.0, 0.1, 3), stabilization=None, drift_tol=1.0)
+    with pytest.raises(ValueError, match="solves by projection, and the run has stabilization=NoneType"):
+        udk.animate(slider_crank, unstable, live=True)
     with_events: Any = SimpleNamespace(ts=run.ts, q=run.q, v=run.v, events=object())
     with pytest.raises(ValueError, match="events cannot be solved anew"):
         udk.animate(slider_crank, with_events, live=True)

@@ -19,6 +19,7 @@ from udkjax.show.player.live_parameters import Live, sliders_of
 from udkjax.show.player.measure_curves import ShownMotion
 from udkjax.show.player.packing import Json
 
+TOLERANCE = 1e-8  # rtol and atol of a run that does not know its own: those of `simulate`
 SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteristic time: the scene's own initial state
 
 
@@ -31,9 +32,13 @@ def live_data(mechanism: Mechanism, solution: ShownMotion, record: Mapping, symb
     """
     if getattr(solution, "events", None) is not None:
         raise ArgumentError("live: a run with events cannot be solved anew in a page; leave out live, or the events")
+    stabilization = getattr(solution, "settings", {}).get("stabilization", "Projection")
+    if stabilization != "Projection":
+        raise ArgumentError(f"live: a page solves by projection, and the run has stabilization={stabilization}: leave out live")
     sliders = sliders_of(mechanism, live)
+    rtol, atol = (float(getattr(solution, name, TOLERANCE)) for name in ("rtol", "atol"))
     try:
-        engine = portable_engine(mechanism, [slider.name for slider in sliders])
+        engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol)
     except UnsupportedError as error:
         raise ArgumentError(f"live: a page has no instruction for {error}: name the numbers to change, without those") from None
     if engine.data["why"]:
