@@ -88,8 +88,10 @@ export class FindingsPanel {
 
   /** A button that makes a fix, where the drawing has something for it. */
   freeing(fix) {
-    const {studio} = this, changed = studio.motion.mover && applyFix(studio.document, fix, studio.motion.mover.scene);
-    return changed ? [make("button", {type: "button", class: "small", "aria-label": `free ${fix.constraint}`, onclick: () => studio.commit(changed, [])}, "Do it")] : [];
+    const {studio} = this, {mover} = studio.motion, changed = () => applyFix(studio.document, fix, mover.bodies());
+    const isStale = () => this.element.classList.contains("stale");
+    return mover && changed() ? [make("button", {type: "button", class: "small", "aria-label": `free ${fix.constraint}`,
+      onclick: () => (isStale() ? studio.say("the drawing has changed: wait until it is looked at anew") : studio.commit(changed(), []))}, "Do it")] : [];
   }
 
   set({constraints, count, permanent, fixes}, pins) {

@@ -121,6 +121,14 @@ export class Mover {
     return {...best, words: ""};
   }
 
+  /** Names, frames, masses (kg) and inertias (kg m2) of the bodies as they are drawn now. */
+  bodies() {
+    const {scene, engine, drawn} = this, frames = scene.bodies.map((_, k) => Array.from(drawn.slice(3 * k, 3 * k + 3)));
+    if (!engine) return {...scene, frames};
+    const numbers = engine.numbers(this.parameters), [masses, inertias] = [0, 1].map(i => engine.data.masses.map(places => numbers[places[i]]));
+    return {bodies: scene.bodies, frames, masses, inertias};
+  }
+
   motions(q) { return motionsOf(q, this.drawn, this.order); }
 
   /** Energies (J) over a run. */
