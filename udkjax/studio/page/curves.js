@@ -61,7 +61,7 @@ export class CurvesPanel {
     if (!names.includes(this.chosen)) this.chosen = groups[0] ?? names[0] ?? "";
     this.select.replaceChildren(...names.map(name => make("option", {value: name}, name)));
     this.select.value = this.chosen;
-    this.select.disabled = !names.length;
+    this.select.hidden = !names.length;
     this.listed = names.join();
   }
 
