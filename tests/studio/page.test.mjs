@@ -122,9 +122,18 @@ test("a periodic spline goes through its values and has no corner where it close
 
 test("slots keep their pins on the line of two pins that move", () => {
   let found = {...fourBar(), slot: [{pin: "C", along: ["A", "B"], on: "link1"}]};
-  found = d.settleSlots(d.movePin(found, "B", [0.05, 0]));
+  found = d.settle(d.movePin(found, "B", [0.05, 0]));
   assert.deepEqual(found.pins.C, [120, 0]);
-  assert.equal(d.settleSlots(found), found);
+  assert.equal(d.settle(found), found);
+});
+
+test("pins between the ends of a bar stay on it", () => {
+  const [made, name] = actions.addPinToLink(fourBar(), 1, [0.075, 0.065]), moved = d.settle(d.movePin(made, "C", [0.13, 0.04]));
+  const [x, y] = moved.pins[name], [[bx, by], [cx, cy]] = [moved.pins.B, moved.pins.C];
+  assert.ok(Math.abs((cx - bx) * (y - by) - (cy - by) * (x - bx)) < 1e-8);
+  assert.ok(x > bx && x < cx);
+  const folded = d.settle(d.movePin(made, "C", [0.03, 0.05])).pins[name];  // which would leave it outside
+  assert.ok(folded[1] > 40 && folded[1] < 50);
 });
 
 test("copies have pins of their own", () => {

@@ -500,3 +500,16 @@ def test_arrows_move_what_is_selected_by_steps_of_the_grid(studio):
     for _ in range(4):
         studio.page.keyboard.press("Control+z")
     assert studio.document["pins"]["B"] == [60, 130]
+
+
+@pytest.mark.slow
+def test_a_pin_between_the_ends_of_a_bar_stays_on_it_and_what_cannot_move_is_said_not_to(studio):
+    draw_five_bar(studio)
+    studio.tool("v")
+    studio.drag((80, 100), (80, 80))
+    (bx, by), (fx, fy), (dx, dy) = (studio.document["pins"][pin] for pin in "BFD")
+    assert abs((dx - bx) * (fy - by) - (dy - by) * (fx - bx)) < 1e-6
+    studio.settle()
+    assert "it cannot move" in studio.findings  # three cranks that are no parallelogram
+    assert studio.js("studio.motion.end") == 0
+    assert "loops closed" in studio.status()

@@ -67,8 +67,8 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
     except SceneError as error:
         return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None}
     moving = engine_of(mechanism, found) if engine == "wasm" else {}
-    if engine == "recorded" or moving.get("why"):
-        moving |= {"motion": recorded_motion(mechanism)}
+    if engine == "recorded":
+        moving = {"motion": recorded_motion(mechanism)}
     return {"text": text, "document": found, "problems": [], "scene": scene_of(mechanism), **moving}
 
 

@@ -7,6 +7,8 @@ export const LISTS = ["link", "slide", "slot", "gear", "cam", "motor", "spring",
 // Keys of tables that name pins and links.
 const PIN_KEYS = ["pin", "pins", "along", "between"], LINK_KEYS = ["link", "on", "links", "of", "carrier", "bodies", "body"];
 const GROUND = "ground";
+const OFF_LINE = 1e-9;  // of the length of a line: a pin that is nearer lies on it
+const INNER = 0.05;  // of a bar: how near to its ends a pin between them comes
 
 export const EMPTY = {format: 2, units: {length: "mm", angle: "deg"}, ground: [], pins: {}};
 
@@ -84,18 +86,32 @@ export function shiftPins(document, names, dx, dy) {
   return found;
 }
 
-/** The document with the pins of slots put onto their lines: those through two pins, which may have moved. */
-export function settleSlots(document) {
+/** The document with pins put onto the lines that hold them: those between the ends of bars, and those of slots through two pins. */
+export function settle(document) {
   let found = document;
+  for (const {pins = [], width, inertia, outline} of list(document, "link")) {
+    if (width === undefined || inertia !== undefined || outline || pins.length < 3) continue;
+    for (const pin of pins.slice(1, -1)) found = ontoLine(found, pin, [pins[0], pins.at(-1)], true);
+  }
   for (const slot of list(document, "slot")) {
-    const ends = (slot.along ?? []).map(pin => placeOf(found, pin)), at = placeOf(found, slot.pin);
-    if (ends.length !== 2 || !ends.every(Boolean) || !at) continue;
-    const foot = project(at, ...ends);
-    if (Math.hypot(foot[0] - at[0], foot[1] - at[1]) > 1e-9 * Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1])) {
-      found = movePin(found, slot.pin, foot);
-    }
+    if (slot.along?.length === 2) found = ontoLine(found, slot.pin, slot.along);
   }
   return found;
+}
+
+/** The document with a pin on the line through two others, and between them where it must be. */
+function ontoLine(document, pin, along, between = false) {
+  const ends = along.map(name => placeOf(document, name)), at = placeOf(document, pin);
+  if (!ends.every(Boolean) || !at) return document;
+  const [dx, dy] = [ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]], square = dx * dx + dy * dy;
+  let foot = project(at, ...ends);
+  const s = square > 0 ? ((foot[0] - ends[0][0]) * dx + (foot[1] - ends[0][1]) * dy) / square : 0;
+  if (between && !(s > INNER && s < 1 - INNER)) {
+    const inner = Math.min(Math.max(s, INNER), 1 - INNER);
+    foot = [ends[0][0] + inner * dx, ends[0][1] + inner * dy];
+  }
+  const off = Math.hypot(foot[0] - at[0], foot[1] - at[1]);
+  return off > OFF_LINE * Math.sqrt(square) ? movePin(document, pin, foot) : document;
 }
 
 /** The point of the line through a and b that is nearest to p. */

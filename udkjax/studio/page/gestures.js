@@ -1,7 +1,7 @@
 // Mouse, pen and fingers on the drawing. A gesture makes at most one entry of undo, and none where nothing moved; one that is
 // taken away (another finger, Esc, a lost pointer) leaves the drawing as it was.
 
-import {mergePins, movePin, placeOf, pinsOfItems, settleSlots, shiftPins} from "./document.js";
+import {mergePins, movePin, placeOf, pinsOfItems, settle, shiftPins} from "./document.js";
 import {itemAt, itemsWithin, pinAt, same} from "./picking.js";
 import {toolOf} from "./tools.js";
 import {toMetres, zoomAt, ZOOM_STEP} from "./view.js";
@@ -115,7 +115,7 @@ export class Gestures {
     }
     now.onto = pins.length === 1 ? pinAt(studio.canvas.placesOf(before, pins), pixel, event.pointerType === "touch", pins[0]) : null;
     if (now.onto) found = movePin(before, pins[0], placeOf(before, now.onto));
-    studio.propose(settleSlots(found));
+    studio.propose(settle(found));
     studio.preview = now.onto ? {onto: now.onto} : null;
   }
 
@@ -150,7 +150,7 @@ export class Gestures {
   drop({pins, onto, before}) {
     const {studio} = this;
     if (onto) {
-      studio.commit(settleSlots(mergePins(before, pins[0], onto)), [{kind: "pin", name: onto}]);
+      studio.commit(settle(mergePins(before, pins[0], onto)), [{kind: "pin", name: onto}]);
     } else studio.commit(studio.document);
   }
 

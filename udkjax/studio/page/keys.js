@@ -1,6 +1,6 @@
 // The keyboard: what users of drawing programs expect.
 
-import {duplicate, pinsOfItems, removeElements, settleSlots, shiftPins} from "./document.js";
+import {duplicate, pinsOfItems, removeElements, settle, shiftPins} from "./document.js";
 import {TOOLS} from "./tools.js";
 
 const TIME_STEPS = 100;  // of an arrow, in a run
@@ -48,7 +48,7 @@ const plain = studio => ({
 /** Move what is selected by a step of the grid; without it, or away from the drawing, the arrows go through time. */
 function nudge(studio, x, y) {
   const pins = pinsOfItems(studio.document, studio.selection), step = studio.gridUnit();
-  if (pins.length && !studio.isMoved) return studio.commit(settleSlots(shiftPins(studio.document, pins, x * step, y * step)));
+  if (pins.length && !studio.isMoved) return studio.commit(settle(shiftPins(studio.document, pins, x * step, y * step)));
   studio.motion.pause();
   return studio.motion.seek(studio.motion.t + (x || y) * studio.motion.end / TIME_STEPS);
 }

@@ -86,11 +86,12 @@ export class Mover {
       const {times, q, v, cause} = this.recorded;
       return {ts: times, q, v, count: times.length, done: !cause, words: cause, violation: []};
     }
-    const state = from ?? this.start();
-    if (!state.closed) return {ts: [0], q: state.q, v: state.v, count: 1, done: false, words: "the loops do not close as drawn", violation: [state.violation]};
+    const state = from ?? this.start(), still = {ts: [0], q: state.q, v: state.v, count: 1, done: false, violation: [state.violation]};
+    if (state.closed && this.engine.data.why) return {...still, words: this.engine.data.why};
+    if (!state.closed) return {...still, words: "the loops do not close as drawn"};
     const times = Float64Array.from({length: INSTANTS}, (_, k) => this.duration * k / (INSTANTS - 1));
     const found = this.engine.run(this.parameters, state, times);
-    return found.count ? found : {...found, ts: [0], q: state.q, v: state.v, count: 1};
+    return found.count ? found : {...still, words: found.words};
   }
 
   /** The state of a run at a time, closed: between its instants it is interpolated, which leaves loops open by a little. */

@@ -73,8 +73,12 @@ export class Sync {
     studio.motion.showWaiting();
     await new Promise(done => { setTimeout(done, BREATH); });
     if (isLate()) return;
-    const compiled = await ask("compile", {text, engine: hasWasm ? "wasm" : "recorded"});
+    let compiled = await ask("compile", {text, engine: hasWasm ? "wasm" : "recorded"});
     if (isLate()) return;
+    if (!compiled.problems.length && !compiled.engine && !compiled.motion) {  // what machine code has no instruction for
+      compiled = {...await ask("compile", {text, engine: "recorded"}), why: compiled.why};
+      if (isLate()) return;
+    }
     if (compiled.problems.length) return void studio.findings.showProblems(compiled.problems);
     const mover = await Mover.load(document, compiled, loadEngine);
     if (isLate()) return;
