@@ -199,6 +199,31 @@ def test_loops_that_cannot_be_closed_are_said_and_the_last_motion_stays(opened):
         assert "0 degrees of freedom here, 1 at first" in note(page) or "do not close" in note(page)
 
 
+def test_where_the_first_motion_failed_other_numbers_may_come_to_its_end(opened):
+    """A crank that a motor turns cannot turn fully with a short rod; with a longer one it can."""
+    drawing = udk.Drawing(
+        pins={"O": (0.0, 0.0), "A": (0.5, 0.0), "B": (0.9, 0.3)},
+        links={
+            "crank": {"pins": ["O", "A"], "mass": 1.0},
+            "rod": {"pins": ["A", "B"], "mass": 1.0},
+            "block": {"pins": ["B"], "mass": 1.0, "inertia": 0.1},
+        },
+        slides=[{"link": "block", "direction": [1, 0]}],
+        ground=["O"],
+        motors={"motor": {"pin": "O", "speed": 4.0}},
+    )
+    mechanism = drawing.mechanism()
+    run = udk.simulate(mechanism, TS, throw=False)
+    assert not run.result.is_success
+    with pytest.warns(udk.show.player.animation.FailedRunWarning):
+        animation = udk.animate(mechanism, run, live=["pin.B"])
+    with opened(animation) as page:
+        assert len(shown_q(page)) < len(TS)
+        page.evaluate(f"{LIVE}.change({{'pin.B[0]': 2.0}})")
+        assert_allclose(shown_q(page)[:, 2], 4.0 * TS, atol=1e-7)
+        assert page.evaluate(f"{PLAYER}.live.player.data.end") == TS[-1]
+
+
 def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
     with opened(live) as page:
         first, values = shown_q(page), page.evaluate(f"[...{LIVE}.values]")

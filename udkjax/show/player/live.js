@@ -24,6 +24,7 @@ export class Live {
     this.ghost = new Run(data.runs[0]);
     this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame,
       reactions: this.run.reactions, forces: this.run.forces};
+    this.times = this.data.times ? Float64Array.from(this.data.times) : this.run.ts;  // all of them, where the first motion failed
     this.follower = new Follower(this.run, this.data.follow);
     this.values = Float64Array.from(this.data.sliders, s => s.value);
     this.changed = this.dirty = false;
@@ -105,16 +106,16 @@ export class Live {
   // Motion
 
   solve() {
-    const {engine, first, values} = this;
+    const {engine, times, values} = this;
     this.dirty = false;
     this.drop();
-    const start = performance.now(), state = engine.close(values, {t: first.ts[0], ...this.data.start});
+    const start = performance.now(), state = engine.close(values, {t: times[0], ...this.data.start});
     if (state.closed) {
-      const T = first.ts.length, n = engine.size;
-      const run = {ts: first.ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+      const T = times.length, n = engine.size;
+      const run = {ts: times, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
       this.job = {run, state, rank: state.rank, from: 0, steps: 0, tried: 0, start};
       this.follower.follow(engine.numbers(values));
-      this.player.setEnd(first.end);
+      this.player.setEnd(times[T - 1]);
       this.goAhead();
     } else {
       const gap = this.lengthOf(state.violation);
@@ -266,7 +267,7 @@ export class Live {
 
   /** Solve on from where the hand lets go, for as long as the first motion is. */
   goOn(state) {
-    const {engine, first, record} = this, n = engine.size, times = first.ts.map(t => t - first.ts[0] + state.t);
+    const {engine, record} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
     const run = engine.run(this.values, state, times);
     for (let k = 1; k < run.count; k++) {
       record.ts.push(run.ts[k]);

@@ -1,7 +1,7 @@
 """The data that a live page has besides: the engine of its mechanism, sliders, and symbols that follow what they change.
 
 live     engine (udkjax/integrate/portable), sliders (live_parameters.py), follow (followers.py), start: the state that closing
-         begins with, or null where that is the scene's own guess
+         begins with, or null where that is the scene's own guess; times: all of a motion that failed, or null
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +18,7 @@ from udkjax.show.player.followers import followers
 from udkjax.show.player.live_parameters import Live, sliders_of
 from udkjax.show.player.measure_curves import ShownMotion
 from udkjax.show.player.packing import Json
+from udkjax.show.player.player_data import MOST_INSTANTS
 
 TOLERANCE = 1e-8  # rtol and atol of a run that does not know its own: those of `simulate`
 SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteristic time: the scene's own initial state
@@ -48,7 +49,18 @@ def live_data(mechanism: Mechanism, solution: ShownMotion, record: Mapping, symb
         "sliders": [slider.data for slider in sliders],
         "follow": followers(mechanism, record, symbols),
         "start": _start(mechanism, solution),
+        "times": _times(solution),
     }
+
+
+def _times(solution: ShownMotion) -> list[float] | None:
+    """Return the times of a run that failed, to whose end other numbers may come; None where all of it is shown."""
+    ts = np.asarray(solution.ts, float)
+    if len(ts) < 2:
+        raise ArgumentError("live: the run has one instant, and no motion to solve anew")
+    if np.isfinite(np.asarray(solution.q)).all():
+        return None
+    return np.interp(np.linspace(0, len(ts) - 1, min(len(ts), MOST_INSTANTS)), np.arange(len(ts)), ts).tolist()
 
 
 def _start(mechanism: Mechanism, solution: ShownMotion) -> Json | None:
