@@ -15,6 +15,7 @@ from udkjax.expressions.scalar_program import ScalarProgram
 
 # What an output does with the number in its place: replace it, be added to it, stay if it is larger, or if it is not true.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
+ADD_ONE_BY_ONE = "add one by one"  # in loops by NumPy
 
 
 class Address(NamedTuple):
@@ -137,9 +138,15 @@ class NumpyLoops:
                     (part.array(x.array), _places(x, part.table)) if kernel.program.uses(s) else unused
                     for s, x in zip(kernel.program.inputs, kernel.inputs, strict=True)
                 ]
-                outputs = [(part.array(x.array), _places(x, part.table), x.update) for x in kernel.outputs]
+                outputs = [self._output(part, address) for address in kernel.outputs]
                 self._parts.append((kernel.program, inputs, outputs))
         self._written = {name for *_, outputs in self._parts for name, *_ in outputs}
+
+    @staticmethod
+    def _output(part: KernelLoop, address: Address) -> tuple[str, np.ndarray, str]:
+        """Return where the results of a loop go, and what they do there: those that share a place are added one by one."""
+        places, update = _places(address, part.table), address.update
+        return part.array(address.array), places, ADD_ONE_BY_ONE if update == ADD and len(set(places)) < len(places) else update
 
     def __call__(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the arrays as the program leaves them; what is given stays as it is."""
@@ -151,6 +158,8 @@ class NumpyLoops:
                 results = [program]
             for x, (name, places, update) in zip(results, outputs, strict=True):
                 if update == ADD:
+                    found[name][places] += x
+                elif update == ADD_ONE_BY_ONE:
                     np.add.at(found[name], places, x)
                 else:
                     found[name][places] = x

@@ -91,12 +91,18 @@ class ScalarProgram:
 
     def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Evaluate the program on arrays (rows,), element by element, without compiling anything."""
-        rows = len(values[0]) if values else 1
+        shape = (len(values[0]) if values else 1,)
         with np.errstate(all="ignore"):
-            if any(self.graph.nodes[i].kind == "call" for i in self.order):  # of an array primitive: one row after the other
-                found = [self([float(v[k]) for v in values]) for k in range(rows)]
+            if self._calls_arrays:  # one row after the other
+                found = [self([float(v[k]) for v in values]) for k in range(shape[0])]
                 return [np.array(x, float) for x in zip(*found, strict=True)]
-            return [np.broadcast_to(np.asarray(x), (rows,)) for x in _run_steps(self._steps_on_arrays, values)]
+            found = _run_steps(self._steps_on_arrays, values)
+        return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in found]
+
+    @cached_property
+    def _calls_arrays(self) -> bool:
+        """True if the program calls primitives of whole arrays."""
+        return any(self.graph.nodes[i].kind == "call" for i in self.order)
 
     def depends_on(self, flags: Sequence[bool]) -> tuple[bool, ...]:
         """Return for each output whether it depends on any of the inputs that are flagged."""

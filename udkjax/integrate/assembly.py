@@ -35,7 +35,7 @@ from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import poses_table
-from udkjax.scene.fields import is_traced, number, number_called
+from udkjax.scene.fields import is_traced, is_within_jit, number, number_called
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import suspicions
@@ -118,8 +118,8 @@ def close(
     """
     if is_traced((mechanism, t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
-        within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
-        return (_close if within_jit else _close_compiled)(mechanism.without_origin.at(t), analysis, t, state)
+        close = _close if is_within_jit() else _close_compiled  # in which known numbers are traced, too
+        return close(mechanism.without_origin.at(t), analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
         analysis = None  # that of the known mechanism, which lasts
     return _closure_of_known(mechanism, np.asarray(t).item(), state, analysis)

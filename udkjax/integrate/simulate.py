@@ -32,7 +32,7 @@ from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import is_traced, number
+from udkjax.scene.fields import is_traced, is_within_jit, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 
@@ -208,8 +208,7 @@ def _run(
                 return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
     given = bare, analysis, number(ts), state, closure, choices.arrays()
-    within_jit = isinstance(jax.device_put(0.0), Tracer)  # where a program of its own would trace the known numbers, too
-    return _simulate(*given) if within_jit else _compiled(*given)
+    return _simulate(*given) if is_within_jit() else _compiled(*given)  # in which known numbers are traced, too
 
 
 def _simulate(

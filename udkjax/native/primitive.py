@@ -74,7 +74,7 @@ class LoadedCode:
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
         fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
         call = (ctypes.c_int64 * len(self._fields))(*[fields[name] for name in self._fields])
-        threads = min(os.cpu_count() or 1, members)
+        threads = min(members, os.cpu_count() or 1) if members > 1 else 1
         if threads == 1:
             self._run(ctypes.addressof(call))
         else:

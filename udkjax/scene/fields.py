@@ -35,6 +35,11 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
+def is_within_jit() -> bool:
+    """Return whether a program is being traced, whose constants known numbers become."""
+    return isinstance(jax.device_put(0.0), Tracer)
+
+
 def library_for(tree: Any) -> ModuleType:
     """Return NumPy where nothing in a tree is traced: there each operation of JAX would be a program to compile; else JAX's."""
     return jnp if is_traced(tree) else np

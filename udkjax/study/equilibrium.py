@@ -1,7 +1,7 @@
 """Static equilibria: positions where the loads and the constraints' forces balance, F = Psi_q^T lambda, stable or not."""
 
 import math
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,22 +10,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Scalar
-from udkjax.equations import loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.load_scale import LoadScale, load_scale
 from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.integrate.assembly import State, close
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.pinv import SVD
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import library_for, number, stored
+from udkjax.scene.fields import is_traced, is_within_jit, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.curve import Curve
+from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Driven
-from udkjax.study.linearization import Linearization, linearize
+from udkjax.study.linearization import Linearization, linearize, linearize_by, load_scale_by, with_unit_mass
 from udkjax.study.positions import distinct, random_positions
 from udkjax.study.sequential import sequential
 
@@ -35,7 +34,9 @@ FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: what is left is round
 NEUTRAL_STIFFNESS = 1e-10  # of the largest stiffness: one below it resists nothing
 SMALLEST_STIFFNESS = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
 
-Trial: TypeAlias = tuple[Array, Array, Array, Array]  # the part of a step, how many were tried, whether it is better, q
+# The share of a step, how many were tried, whether it is better, q and the linearization there.
+Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
+Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization there, steps, whether the last was better
 
 
 class Equilibrium(PrintsTable):
@@ -130,8 +131,12 @@ def equilibrium(
     free = degrees_of_freedom(analysis)
     t = number(t)
     q = close(mechanism, t, state, analysis=analysis).state.q
-    start = number(library_for(q).ravel(q))
-    return _equilibrium(rest_curve(mechanism, analysis), analysis, t, start, free, stable)
+    given = mechanism.without_origin, analysis, t, number(library_for(q).ravel(q))
+    if is_traced(given) or is_within_jit():
+        return _compiled(*given, free, stable)
+    at, start = np.asarray(t), np.asarray(given[-1])
+    with np.errstate(all="ignore"):
+        return jax.device_put(_equilibrium(given[0], analysis, at, start, free, stable, BY_NUMPY))
 
 
 @checked
@@ -163,83 +168,100 @@ def degrees_of_freedom(analysis: Analysis) -> int:
     return free
 
 
-def rest_curve(mechanism: Mechanism, analysis: Analysis) -> Curve:
+def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> AbstractCurve:
     """Return the positions of the mechanism as a curve, with time in place of a driver's value."""
-    return Curve.of(Driven(mechanism.without_origin, analysis, "", -1, number(1.0)))
+    return (Curve if by is BY_JAX else KnownCurve).of(Driven(mechanism, analysis, "", -1, number(1.0)))
 
 
-def omega2(at: Linearization) -> Float[Array, "f"]:
+def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:
     """Return omega^2 of the undamped linearization, (rad/s)^2, ascending."""
-    if not len(at.mass):
-        return jnp.zeros(0)
-    L = jnp.linalg.cholesky(at.mass)
-    A = jax.scipy.linalg.solve_triangular(L, at.stiffness, lower=True)
-    A = jax.scipy.linalg.solve_triangular(L, A.T, lower=True)
-    return jnp.linalg.eigvalsh(0.5 * (A + A.T))
+    xp, (_, K) = by.xp, with_unit_mass(at, by)
+    return xp.linalg.eigvalsh(0.5 * (K + K.T)) if len(K) else xp.zeros(0)
 
 
 @eqx.filter_jit
-def _equilibrium(
-    curve: Curve, analysis: Analysis, t: Float[Array, ""], start: Float[Array, "n"], free: int, stable: bool
+def _compiled(
+    mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], start: Float[Array, "n"], free: int, stable: bool
 ) -> Equilibrium:
-    q = sequential(_settle, *stop_gradients((curve, analysis, t, start)), free, stable)
-    q = _rest_position(curve, analysis, t, q, free)
-    at, scale = linearize(curve.mechanism, analysis, free, t, q), load_scale(curve.mechanism, analysis.scales, t, q)
-    left = jnp.linalg.norm(at.force) / jnp.where(scale.force > 0, scale.force, 1.0)
-    closed = curve.is_closed(jnp.append(q, t) / curve.units)
-    balanced, bodies = closed & (left <= FORCE_TOL), curve.mechanism.body_names
-    return Equilibrium(q.reshape(-1, 3), at.multipliers, omega2(at), left, balanced, SMALLEST_STIFFNESS * scale.stiffness, bodies)
+    return _equilibrium(mechanism, analysis, t, start, free, stable, BY_JAX)
+
+
+def _equilibrium(
+    mechanism: Mechanism, analysis: Analysis, t: Any, start: Any, free: int, stable: bool, by: ControlFlow
+) -> Equilibrium:
+    curve = _rest_curve(mechanism, analysis, by)
+    scale = load_scale_by(by, mechanism, analysis.scales, t, start)
+    if by is BY_NUMPY:
+        q = _settle(curve, mechanism, analysis, scale, t, start, free, stable)
+    else:
+        q = sequential(_settle, *stop_gradients((curve, mechanism, analysis, scale, t, start)), free, stable)
+        assert isinstance(curve, Curve)
+        q = _rest_position(curve, analysis, t, q, free)
+    xp, at, scale = by.xp, linearize_by(by, mechanism, analysis, free, t, q), load_scale_by(by, mechanism, analysis.scales, t, q)
+    left = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
+    balanced = curve.is_closed(xp.append(q, t) / curve.units) & (left <= FORCE_TOL)
+    neutral, bodies = SMALLEST_STIFFNESS * scale.stiffness, mechanism.body_names
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, _omega2(at, by), left, balanced, neutral, bodies)
 
 
 def _settle(
-    curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
+    curve: AbstractCurve,
+    mechanism: Mechanism,
+    analysis: Analysis,
+    scale: LoadScale,
+    t: Float[Array, ""],
+    q: Float[Array, "n"],
+    free: int,
+    stable: bool,
 ) -> Float[Array, "n"]:
     """Take Newton steps until nothing gets better."""
     if not free:
         return q
-    scale = load_scale(curve.mechanism, analysis.scales, t, q)
+    by, xp = curve.by, curve.by.xp
 
     def at(q: Float[Array, "n"]) -> Linearization:
-        return linearize(curve.mechanism, analysis, free, t, q)
+        return linearize_by(by, mechanism, analysis, free, t, q)
 
-    def body(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        q, k, _ = state
-        here = at(q)
-        step = here.directions @ _towards_rest(here, scale, stable)
-        longest = analysis.scales.size(step)
-        step = step * jnp.where(longest > LONGEST_STEP, LONGEST_STEP / jnp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
-        size = jnp.linalg.norm(here.force)
+    def body(state: Settling) -> Settling:
+        q, here, k, _ = state
+        step = here.directions @ _towards_rest(here, scale, stable, curve)
+        longest = xp.max(xp.abs(step / curve.units[:-1]))
+        step = step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
+        size = xp.linalg.norm(here.force)
 
         def trial(state: Trial) -> Trial:
-            scale, j, *_ = state
-            X, closed = curve.correct(jnp.append(q + scale * step, t) / curve.units, fixed=True)
+            share, j, *_ = state
+            X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
-            force = loads.force(curve.mechanism, t, new, jnp.zeros_like(new))
+            there = at(new)
             # Work done on the way, by the trapezoidal rule, or what is left of the loads along free directions.
-            work = 0.5 * (loads.force(curve.mechanism, t, q, jnp.zeros_like(q)) + force) @ (new - q)
-            better = (work > 0 if stable else False) | (jnp.linalg.norm(at(new).force) < size)
-            return 0.5 * scale, j + 1, closed & better, new
+            work = 0.5 * (here.loads + there.loads) @ (new - q)
+            better = (work > 0 if stable else False) | (xp.linalg.norm(there.force) < size)
+            return 0.5 * share, j + 1, closed & better, new, there
 
         def worse(state: Trial) -> Bool[Array, ""]:
             return (state[1] < STEP_HALVINGS) & ~state[2]
 
-        _, _, better, new = jax.lax.while_loop(worse, trial, (jnp.ones(()), jnp.asarray(0), jnp.asarray(False), q))
-        better &= size > FORCE_ROUNDING * scale.force
-        return jnp.where(better, new, q), k + 1, better
+        first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, here
+        _, _, better, new, there = by.while_loop(worse, trial, first)
+        better = better & (size > FORCE_ROUNDING * scale.force)
+        new, there = jax.tree.map(lambda x, y: xp.where(better, x, y), (new, there), (q, here))
+        return new, there, k + 1, better
 
-    return jax.lax.while_loop(lambda s: (s[1] < MAX_STEPS) & s[2], body, (q, jnp.asarray(0), jnp.asarray(True)))[0]
+    start = q, at(q), xp.asarray(0), xp.asarray(True)
+    return by.while_loop(lambda s: (s[2] < MAX_STEPS) & s[3], body, start)[0]
 
 
-def _towards_rest(here: Linearization, scale: LoadScale, stable: bool) -> Float[Array, "f"]:
+def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
     """Return the step eta of the linearization; only downhill, where the equilibrium is to be stable."""
-    rounding = SMALLEST_STIFFNESS * scale.stiffness
+    xp, rounding = curve.by.xp, SMALLEST_STIFFNESS * scale.stiffness
     if not stable:
-        resists = jnp.max(jnp.abs(here.stiffness)) > rounding
-        return SVD(NEUTRAL_STIFFNESS).plus(jnp.where(resists, here.stiffness, 0.0)) @ here.force
-    values, vectors = jnp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
-    values = jnp.abs(values)
-    values = jnp.maximum(values, jnp.maximum(NEUTRAL_STIFFNESS * jnp.max(values), rounding))
-    return vectors @ (vectors.T @ here.force / jnp.where(values > 0, values, 1.0))
+        resists = xp.max(xp.abs(here.stiffness)) > rounding
+        return curve.plus(xp.where(resists, here.stiffness, 0.0), NEUTRAL_STIFFNESS) @ here.force
+    values, vectors = xp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
+    values = xp.abs(values)
+    values = xp.maximum(values, xp.maximum(NEUTRAL_STIFFNESS * xp.max(values), rounding))
+    return vectors @ (vectors.T @ here.force / xp.where(values > 0, values, 1.0))
 
 
 @eqx.filter_custom_jvp
@@ -260,7 +282,7 @@ def _(primals, tangents):
         if not free:
             return closed
         here, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)
-        return closed + here.directions @ _towards_rest(here, scale, False)
+        return closed + here.directions @ _towards_rest(here, scale, False, curve)
 
     given = (curve, t)
     none = jax.tree.map(jnp.zeros_like, eqx.filter(given, eqx.is_inexact_array))

@@ -1,6 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import Numbers, library_for, number, stored
+from udkjax.scene.fields import Numbers, is_within_jit, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Points, Reached, follow, no_points
 from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
@@ -213,7 +214,7 @@ def _call(function: Callable[..., Result], driven: Driven, *given: Any) -> Resul
     """Call a function of what is given, and of the control flow: by NumPy, where all is known, else as one compiled program."""
     if not is_known((driven, given)):
         return _compiled(function, driven, *given)
-    with jax.ensure_compile_time_eval():
+    with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext():
         driven, given = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, (driven, given))
         return jax.device_put(function(driven, *given, BY_NUMPY))
 

@@ -8,18 +8,24 @@ The second part of K, the constraints' curvature under load, is what makes a pen
 constraints lambda is of least norm; N^T K N does not depend on that choice. No derivative is taken by differences.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.load_scale import LoadScale, load_scale
+from udkjax.equations.scales import RANK_TOL, Scales
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.control_flow import BY_JAX, ControlFlow
 from udkjax.study.free_directions import null_space
 
 
@@ -31,6 +37,7 @@ class Linearization(NamedTuple):
     damping: Float[Array, "f f"]
     stiffness: Float[Array, "f f"]
     force: Float[Array, "f"]  # N^T F: zero at rest
+    loads: Float[Array, "n"]  # F at rest
     multipliers: Float[Array, "m"]  # lambda (N, N m)
 
 
@@ -58,4 +65,40 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
     K = jax.jacfwd(residual_force)(q)
     C = -jax.jacfwd(lambda v: F(q, v))(still)
     M = loads.mass(mechanism)
-    return Linearization(N, N.T @ (M[:, None] * N), N.T @ C @ N, N.T @ K @ N, N.T @ F(q, still), multipliers)
+    force = F(q, still)
+    return Linearization(N, N.T @ (M[:, None] * N), N.T @ C @ N, N.T @ K @ N, N.T @ force, force, multipliers)
+
+
+def linearize_by(
+    by: ControlFlow, mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike, q: Float[Array, "n"]
+) -> Linearization:
+    """Return what `linearize` does, within a program of JAX; or, of known numbers, by a program of its own for NumPy to go on."""
+    if by is BY_JAX:
+        return linearize(mechanism, analysis, free, t, q)
+    return jax.tree.map(np.asarray, _linearize(mechanism, analysis, free, t, q))
+
+
+_linearize = eqx.filter_jit(linearize)
+_load_scale = eqx.filter_jit(load_scale)
+
+
+def load_scale_by(by: ControlFlow, mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Float[Array, "n"]) -> LoadScale:
+    """Return what `load_scale` does, likewise."""
+    if by is BY_JAX:
+        return load_scale(mechanism, scales, t, q)
+    return jax.tree.map(np.asarray, _load_scale(mechanism, scales, t, q))
+
+
+def with_unit_mass(at: Linearization, by: ControlFlow) -> tuple[Array, Array]:
+    """Return damping and stiffness in directions N L^(-T) in which the mass matrix L L^T is the unit matrix."""
+    if not len(at.mass):
+        return at.damping, at.stiffness
+    solve = solver_of_mass(at, by)
+    damping, stiffness = (solve(solve(A).T).T for A in (at.damping, at.stiffness))
+    return damping, stiffness
+
+
+def solver_of_mass(at: Linearization, by: ControlFlow) -> Callable[[Any], Any]:
+    """Return A -> L^(-1) A with the mass matrix L L^T."""
+    L = by.xp.linalg.cholesky(at.mass)
+    return partial(jax.scipy.linalg.solve_triangular, L, lower=True) if by is BY_JAX else partial(np.linalg.solve, L)

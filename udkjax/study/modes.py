@@ -1,22 +1,25 @@
 """Vibration about a position of rest: frequencies, damping and mode shapes of the linearized mechanism."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.structure import ArrayLibrary
 from udkjax.integrate.assembly import State
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import library_for, number, stored
+from udkjax.scene.fields import is_traced, is_within_jit, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.study.equilibrium import degrees_of_freedom, equilibrium
-from udkjax.study.linearization import linearize
+from udkjax.study.linearization import linearize_by, solver_of_mass, with_unit_mass
 
 
 class Modes(PrintsTable):
@@ -85,43 +88,45 @@ def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, ana
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
-    return _modes(mechanism.without_origin, analysis, free, t, number(library_for(state.q).ravel(state.q)))
+    given = mechanism.without_origin, analysis, t, number(library_for(state.q).ravel(state.q))
+    if is_traced(given) or is_within_jit():
+        return _compiled(*given, free)
+    with np.errstate(all="ignore"):
+        return jax.device_put(_modes(given[0], analysis, np.asarray(t), np.asarray(given[-1]), free, BY_NUMPY))
 
 
 @eqx.filter_jit
-def _modes(mechanism: Mechanism, analysis: Analysis, free: int, t: Float[Array, ""], q: Float[Array, "n"]) -> Modes:
-    at = linearize(mechanism, analysis, free, t, q)
+def _compiled(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Modes:
+    return _modes(mechanism, analysis, t, q, free, BY_JAX)
+
+
+def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, by: ControlFlow) -> Modes:
+    xp, at, rest = by.xp, linearize_by(by, mechanism, analysis, free, t, q), q.reshape(-1, 3)
     if not free:
-        none = jnp.zeros((0, *q.reshape(-1, 3).shape))
-        return Modes(jnp.zeros(0), none, jnp.zeros(0, complex), none + 0j, q.reshape(-1, 3), jnp.zeros(()), mechanism.body_names)
-    L = jnp.linalg.cholesky(at.mass)
-    solve = jax.scipy.linalg.solve_triangular
-    N = solve(L, at.directions.T, lower=True).T  # of which N^T M N is one
-    C, K = (solve(L, solve(L, A, lower=True).T, lower=True).T for A in (at.damping, at.stiffness))
-    omega2, eta = jnp.linalg.eigh(0.5 * (K + K.T))
+        none = xp.zeros((0, *rest.shape))
+        return Modes(xp.zeros(0), none, xp.zeros(0, complex), none + 0j, rest, xp.zeros(()), mechanism.body_names)
+    N = solver_of_mass(at, by)(at.directions.T).T  # of which N^T M N is one
+    C, K = with_unit_mass(at, by)
+    omega2, eta = xp.linalg.eigh(0.5 * (K + K.T))
     shapes = (N @ eta).T.reshape(free, -1, 3)
     # In units of the fastest: what is far from one costs an eigenvalue its digits.
-    unit = jax.lax.stop_gradient(jnp.sqrt(jnp.max(jnp.abs(K), initial=0.0)))
-    unit = jnp.where(unit > 0, unit, 1.0)
-    companion = jnp.block([[jnp.zeros_like(K), jnp.eye(free)], [-K / unit**2, -C / unit]])
-    s = _sort(jnp.linalg.eigvals(companion))
-    values, vectors = jnp.linalg.eig(jax.lax.stop_gradient(companion))
-    damped = (jax.lax.stop_gradient(N) @ vectors[:free, _order(values)]).T
-    damped = damped / jnp.linalg.norm(damped, axis=1, keepdims=True)
+    unit = stop_gradients(xp.sqrt(xp.max(xp.abs(K), initial=0.0)))
+    unit = xp.where(unit > 0, unit, 1.0)
+    companion = xp.block([[xp.zeros_like(K), xp.eye(free)], [-K / unit**2, -C / unit]])
+    s = xp.asarray(xp.linalg.eigvals(companion), complex)
+    values, vectors = xp.linalg.eig(stop_gradients(companion))
+    damped = (stop_gradients(N) @ vectors[:free, _order(values, xp)]).T
+    damped = xp.asarray(damped / xp.linalg.norm(damped, axis=1, keepdims=True), complex)
     return Modes(
         omega2,
         shapes,
-        unit * s,
+        unit * s[_order(s, xp)],
         damped.reshape(2 * free, -1, 3),
-        q.reshape(-1, 3),
-        jnp.max(jnp.abs(at.force), initial=0.0),
+        rest,
+        xp.max(xp.abs(at.force), initial=0.0),
         mechanism.body_names,
     )
 
 
-def _order(s: Complex[Array, "k"]) -> Int[Array, "k"]:
-    return jnp.lexsort((s.real, s.imag))
-
-
-def _sort(s: Complex[Array, "k"]) -> Complex[Array, "k"]:
-    return s[_order(s)]
+def _order(s: Complex[Array, "k"], xp: ArrayLibrary) -> Int[Array, "k"]:
+    return xp.lexsort((s.real, s.imag))
