@@ -14,6 +14,7 @@ NAMES = (
     "gradients",
     "mechanisms",
     "startup",
+    "waiting",
     "scaling",
     "sweep",
     "identification",

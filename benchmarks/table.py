@@ -109,6 +109,10 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"{name}: closed positions of a four-bar a second and core", "mechanisms", least, rate, True)
     for name, target in STARTS.items():
         yield Claim(f"start: {name}, s", "startup", target, value("seconds", name=name))
+    for name, target in WAITS.items():
+        yield Claim(f"cold: {name}, s", "waiting", target, value("seconds", name=name))
+    yield Claim("simulate of known numbers, warm, ms", "waiting", 0.6, value("milliseconds", name="simulate of known numbers"))
+    yield Claim("control step of known numbers, warm, ms", "waiting", 0.6, value("milliseconds", name="step"))
     for scene in SCENES:
         for run in RUNS:
             target = 3.0 if scene == LARGEST else 1.5 if run == "first" else 2.5
@@ -123,6 +127,18 @@ IDENTIFIED = (
     "excavator, driven",
     "linkage, crossing",
 )
+WAITS = {
+    "eager grad": 1.5,
+    "eager vmap over 8": 1.0,
+    "hessian of a four-bar": 10.0,
+    "first event": 1.5,
+    "gradient of an event's time": 5.0,
+    "travel": 1.5,
+    "udkjax kinematics": 2.0,
+    "udkjax statics": 1.5,
+    "udkjax modes": 1.5,
+    "udkjax animate": 2.5,
+}
 STARTS = {
     "import udkjax and simulate": 1.5,
     "udkjax --help": 0.4,

@@ -100,7 +100,7 @@ def compile_mechanism(
         assert isinstance(equations, TextbookEquations)  # there is a reason for diffrax where they are not
         operation = _run_operation(equations, solver, projected, breakpoints)
         rows = len(equations.scales.rows) - len((equations.redundant or ()) if eliminates(equations.method) else ())
-        missing = unsupported(operation)
+        missing = unsupported(operation.code)
         why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
     elif engine == "auto":
         evaluation = _evaluation(equations)

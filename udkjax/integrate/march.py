@@ -39,7 +39,7 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")
-    return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis))
+    return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis).code)
 
 
 def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:

@@ -25,7 +25,7 @@ def can_close(mechanism: Mechanism) -> bool:
     """Return whether machine code can close a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
-    return not unsupported(_close(mechanism))
+    return not unsupported(_close(mechanism).code)
 
 
 def close(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:

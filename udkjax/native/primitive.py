@@ -3,6 +3,7 @@
 import ctypes
 import math
 import os
+from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -17,9 +18,11 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
+from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native import machine
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INPUTS, OUTPUTS
+from udkjax.native.loops import LoopWriter
 from udkjax.native.module import Module
 from udkjax.native.operations import Operation
 from udkjax.native.program import UnsupportedError
@@ -40,10 +43,17 @@ def generate(operation: Operation, width: int, several: bool) -> Module:
     return module
 
 
-def unsupported(operation: Operation) -> str:
-    """Return what an operation takes that machine code has no instruction for; empty where there is nothing."""
+@lru_cache(maxsize=256)
+def unsupported(code: ScenePrograms) -> str:
+    """Return what a scene takes that machine code has no instruction for; empty where there is nothing.
+
+    The kernels of its elements are written once each, as loops take them: which operation needs them, in which form, may come to
+    be something else than what is compiled, and is much longer.
+    """
+    loops, at = LoopWriter(1), defaultdict(lambda: ("work", 0))
     try:
-        generate(operation, 1, False)
+        for name in ("prologue", "accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else [])):
+            loops.write(getattr(code, name), name, ("work",), at)
     except UnsupportedError as error:
         return str(error)
     return ""

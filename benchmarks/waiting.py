@@ -1,0 +1,111 @@
+"""How long one waits for what is asked once: eager transformations, events, kinematics, statics and modes, and commands.
+
+Each in a fresh process, first with nothing cached, then with what that has left on disk; and the second call within a process.
+"""
+
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common import machine, report
+from benchmarks.startup import waited
+
+TIMES = 3
+SCENE = """
+import jax, jax.numpy as jnp, numpy as np
+import udkjax as udk
+mechanism, ts = udk.library.{scene}(), np.linspace(0.0, 5.0, 101)
+names = [name for name in mechanism.parameters() if name.endswith(".mass")][:2]
+masses = [float(mechanism.parameters()[name]) for name in names]
+def states(*values):
+    return udk.simulate(mechanism.with_parameters(dict(zip(names, values))), ts, throw=False).q
+def angle(*values):
+    return states(*values)[-1, 0, 2]
+"""
+EVENT = """
+import jax, numpy as np
+import udkjax as udk
+body = udk.Body(1.0, 0.1, [1.0, 0.0])
+pin = udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-1.0, 0.0]])
+mechanism, ts = udk.Mechanism({"rod": body}, {"pin": pin}), np.linspace(0.0, 2.0, 21)
+lowest = udk.Event(lambda t, frames: frames["rod"].angle + np.pi / 2, udk.Stop())
+def time(inertia):
+    changed = mechanism.with_parameters({"body.rod.inertia": inertia})
+    return udk.simulate(changed, ts, events=lowest, max_events=1).events.time[0]
+"""
+COMMAND = "import sys; sys.argv = ['udkjax', *{words!r}.split()]; from udkjax.cli import main; main()"
+FOUR_BAR = "examples/four_bar.toml"
+CASES = {
+    "eager grad": SCENE.format(scene="parallelogram") + "print(jax.grad(angle, argnums=(0, 1))(*masses))",
+    "eager vmap over 8": SCENE.format(scene="parallelogram")
+    + "print(jax.vmap(states)(*(jnp.linspace(0.9, 1.1, 8) * x for x in masses)).shape)",
+    "hessian of a four-bar": SCENE.format(scene="four_bar") + "print(jax.hessian(angle)(*masses))",
+    "first event": EVENT + "print(time(0.1))",
+    "gradient of an event's time": EVENT + "print(jax.grad(time)(0.1))",
+    "travel": "import udkjax as udk; print(udk.travel(udk.library.four_bar(), 'body.crank.angle'))",
+    "udkjax kinematics": COMMAND.format(words=f"kinematics {FOUR_BAR} --driver body.crank.angle"),
+    "udkjax statics": COMMAND.format(words=f"statics {FOUR_BAR}"),
+    "udkjax modes": COMMAND.format(words=f"modes {FOUR_BAR}"),
+    "udkjax animate": COMMAND.format(words=f"animate {FOUR_BAR} --out {{folder}}/page.html --t1 5"),
+}
+QUICK = ("travel",)  # by itself where nothing is measured
+
+
+def waits(name: str, code: str, bytecode: Path) -> dict[str, Any]:
+    """Return how long a process takes, wall and CPU (s), with nothing cached and again: medians."""
+    runs: dict[str, list[dict[str, float]]] = {"cold": [], "again": []}
+    for _ in range(TIMES):
+        with tempfile.TemporaryDirectory() as cache:
+            for found in runs.values():
+                found.append(waited(code.replace("{folder}", cache), Path(cache), bytecode))
+    row: dict[str, Any] = {"name": name}
+    for kind, found in runs.items():
+        prefix = "" if kind == "cold" else "again_"
+        row |= {prefix + key: statistics.median(run[key] for run in found) for key in found[0]}
+    return row
+
+
+def call_times(smoke: bool) -> list[dict[str, Any]]:
+    """Return how long calls with known numbers take, warm (ms of CPU): medians."""
+    import udkjax as udk
+
+    mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, 5.0, 101)
+    state, figures = udk.assemble(mechanism), []
+    calls = {
+        "simulate of known numbers": lambda: udk.simulate(mechanism, ts),
+        "step": lambda: udk.step(mechanism, state, {}, 0.01),
+    }
+    for name, call in calls.items():
+        call()
+        times = []
+        for _ in range(3 if smoke else 300):
+            start = time.process_time()
+            call()
+            times.append(time.process_time() - start)
+        figures.append({"name": name, "milliseconds": 1e3 * statistics.median(times)})
+    return figures
+
+
+def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+    """Print how long each case takes."""
+    about, figures = machine(), call_times(smoke)
+    for row in figures:
+        print(f"{row['name']:28} {row['milliseconds']:8.3f} ms of CPU")
+    print(f"{'a process':28} {'s':>7} {'CPU s':>7} {'again, s':>9} {'CPU s':>7}")
+    with tempfile.TemporaryDirectory() as bytecode:
+        waited("import udkjax, diffrax, tyro", Path(bytecode), Path(bytecode))
+        for name, code in CASES.items():
+            if smoke and name not in QUICK:
+                continue
+            row = waits(name, code, Path(bytecode))
+            figures.append(row)
+            numbers = (
+                f"{row['seconds']:7.2f} {row['cpu_seconds']:7.2f} {row['again_seconds']:9.2f} {row['again_cpu_seconds']:7.2f}"
+            )
+            print(f"{name:28} {numbers}", flush=True)
+    report(about, figures, out)
+    return figures
