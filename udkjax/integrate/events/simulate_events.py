@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
 from udkjax.scene.checks import quote
+from udkjax.scene.fields import is_traced, is_within_jit
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -69,13 +70,16 @@ def simulate_events(
     """
     listed, phases = _prepare(mechanism, events, analysis)
     given = Given(phases, listed, ts, state, closure, choices, max_events)
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(given))
     found, reasons = _run(*eqx.partition(given, eqx.is_array))
-    count = None if traced else int(found.count)
-    if count is not None and np.isfinite(found.unresolved).any():
+    names = tuple(e.name for e in listed)
+    if is_traced(given):
+        solution = _solution if is_within_jit() else _compiled_solution
+        return solution(mechanism, names, given, found, reasons, None)
+    found = jax.tree.map(np.asarray, found)  # of which each operation of JAX would be a program to compile
+    if np.isfinite(found.unresolved).any():
         fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
-    return _solution(mechanism, tuple(e.name for e in listed), given, found, reasons, count)
+    return jax.device_put(_solution(mechanism, names, given, found, reasons, int(found.count)))
 
 
 Prepared = tuple[tuple[Event, ...], Phases]
@@ -142,6 +146,7 @@ def _solution(
     count: int | None,
 ) -> Solution:
     """Return the solution; its events are `count`, or padded to the most that there may be where that is None."""
+    xp: Any = jnp if count is None else np
     bodies, choices = (-1, len(mechanism.body_names), 3), given.choices
 
     def trim(x: Array, padding: float = np.inf) -> Array:
@@ -175,7 +180,7 @@ def _solution(
     engine = f"diffrax: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"
     settings = dict(choices.settings(why)) | {"max_events": str(given.max_events), "engine": engine}
     with jax.debug_nans(False):  # they stand for outputs behind the end of a run, and alarm nobody
-        q, v = (jnp.where(jnp.isinf(x), jnp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
+        q, v = (xp.where(xp.isinf(x), xp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
     return Solution(
         ts=given.ts,
         q=q,
@@ -189,3 +194,6 @@ def _solution(
         choices=tuple(settings.items()),
         events=listing,
     )
+
+
+_compiled_solution = eqx.filter_jit(_solution)
