@@ -172,7 +172,7 @@ def _evaluation(equations: AbstractSystem) -> Accelerate | None:
     if type(inner) is not TextbookEquations or not inner.constrained or _reason_for_textbook(inner):
         return None
     operation = Accelerate(_programs(inner), dense_method(inner.method))
-    return None if unsupported(operation) else operation
+    return None if unsupported(operation.code) else operation
 
 
 def _programs(equations: TextbookEquations) -> ScenePrograms:
