@@ -28,6 +28,8 @@ def cached_files() -> list[tuple[float, int, Path]]:
     folder, found = cache_folder(), []
     try:
         for file in folder.iterdir() if folder else ():
+            if file.is_dir():  # of programs of JAX
+                continue
             status = file.stat()
             found.append((max(status.st_atime, status.st_mtime), status.st_size, file))
     except OSError:  # not there yet, or another process has just removed a file
