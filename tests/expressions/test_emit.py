@@ -56,14 +56,6 @@ def test_an_operation_is_traced_once_for_each_value_it_has(emit):
     assert names == sorted("sin" if name == "sincos" else name for name, n in program.count().items() for _ in range(n))
 
 
-def test_what_depends_on_some_inputs():
-    graph = Graph()
-    x, y = (graph.input(name, "state") for name in "xy")
-    program = ScalarProgram(graph, [x, y], [x * x, x * y, y + 1.0, graph.constant(2.0), x])
-    assert program.depends_on([True, False]) == (True, True, False, False, True)
-    assert program.depends_on([False, False]) == (False,) * 5
-
-
 @pytest.fixture
 def split():
     """m and l are parameters, q the state: sqrt(m) l (q + 1 / m) + l^2, early by parameters alone."""

@@ -104,14 +104,6 @@ class ScalarProgram:
         """True if the program calls primitives of whole arrays."""
         return any(self.graph.nodes[i].kind == "call" for i in self.order)
 
-    def depends_on(self, flags: Sequence[bool]) -> tuple[bool, ...]:
-        """Return for each output whether it depends on any of the inputs that are flagged."""
-        reached = {s.index for s, m in zip(self.inputs, flags, strict=True) if m}
-        for index in self.order:
-            if any(a.index in reached for a in self.graph.nodes[index].arguments):
-                reached.add(index)
-        return tuple(s.index in reached for s in self.outputs)
-
     def _typed(self, values: Sequence[Value]) -> list[Value]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
         return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]

@@ -15,7 +15,7 @@ Members walk back side by side, in lanes; the next ones follow when all are back
 from collections.abc import Sequence
 
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
-from udkjax.native.layout import Plan
+from udkjax.native.layout import Lane, Plan
 from udkjax.native.prologue import REVERSE, write_prologue_derivative
 from udkjax.native.record import Recorded
 from udkjax.native.runge_kutta import stage_state
@@ -190,7 +190,49 @@ class Reverse(Recorded):
     def _write_backpropagate(self):
         """Walk back all members that are `ready`, and write the cotangents of what they began with."""
         f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
-        n, call, yes = self.n, f.given["call"], f.const(1.0, DOUBLE, f.width)
+        call, yes = f.given["call"], f.const(1.0, DOUBLE, f.width)
+        self._begin_walk(f, s)
+
+        def due() -> Value:
+            s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
+            return f.any_of(s.due > 0.5)
+
+        with f.while_(lambda: f.any_of(s.at > 0.5)):
+            if self.plan.sampled:
+                f.call("find_rows", f.given["work"], call)
+            s.any = f.const(0.0, DOUBLE, f.width)
+            with f.while_(due):
+                s.any = yes
+                self._pull_output(f, s)
+            with f.if_(f.any_of(s.any > 0.5)):
+                f.call("differences_back", f.given["work"])
+            f.call("step_back", f.given["work"])
+            self._move_back(f, s)
+        # What is left is that of the first state as it was given, which is the first output, too.
+        for k in self._each_lane(f, s.ready > 0.5):
+            self._add_output(f, k, f.const(0, INT), "bar point3")
+            for x in "qv":
+                self.copy_lane(f, self._result(f, call, f"{x}bar", k, self.n), 0, f"bar point3 {x}", k)
+            if self.count:
+                f.call("leave_row", f.given["work"], call, k)
+            self.free_record(f, k)
+        s.ready = f.const(0.0, DOUBLE, f.width)
+
+    def _add_state(self, f: Function, k: Value, bars: Value, to: str):
+        """Add cotangents of a state at an address to arrays of lane k."""
+        for x, offset in (("q", 0), ("v", self.n)):
+            with f.each(self.n) as i:
+                place = i * f.width + k + self.start(f"{to} {x}", "work")
+                f.store(f.load(f.given["work"], place) + f.load(bars, i + offset), f.given["work"], place)
+
+    def _add_output(self, f: Function, k: Value, number: Value, to: str):
+        """Add the cotangents of an output of the member in lane k to arrays of that lane."""
+        start = self.member_address(f, f.given["call"], "ysbar", self._lane(f, "member", k))
+        self._add_state(f, k, f.at(start, number * (2 * self.n)), to)
+
+    def _begin_walk(self, f: Function, s: Lane):
+        """Clear all cotangents, and load the last points of the members that are `ready`, with the cotangents of their ends."""
+        call, n = f.given["call"], self.n
         times = f.load(call, self.call_fields.index("times"), base=INT)
         s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
         zeros = [f"bar point{k} {x}" for k in range(POINTS) for x in "qva"] + [f"bar difference{k}" for k in range(3 * POINTS)]
@@ -198,103 +240,70 @@ class Reverse(Recorded):
             with f.each(length) as i:
                 for name in names:
                     f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], i * f.width + self.start(name, "work"), f.width)
-
-        def given(k: Value, number: Value, to: str):
-            """The cotangents of an output of lane k are added to arrays of coordinates."""
-            member = self._lane(f, "member", k)
-            bars = f.at(self.member_address(f, call, "ysbar", member), number * (2 * n))
-            more(k, bars, to)
-
-        def more(k: Value, bars: Value, to: str):
-            for x, offset in (("q", 0), ("v", n)):
-                with f.each(n) as i:
-                    place = i * f.width + k + self.start(f"{to} {x}", "work")
-                    total = f.load(f.given["work"], place) + f.load(bars, i + offset)
-                    f.store(total, f.given["work"], place)
-
         for k in self._each_lane(f, s.ready > 0.5):
-            more(k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "bar point3")
+            self._add_state(f, k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "bar point3")
             with f.if_(self._lane(f, "code", k).is_(float(DONE))):
-                given(k, times - 1, "bar point3")
+                self._add_output(f, k, times - 1, "bar point3")
             for j in range(POINTS):
                 self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
             self._load_head(f, k)
-
-        def due() -> Value:
-            s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
-            return f.any_of(s.due > 0.5)
-
+        cleared = [("numbersbar", f.const(self.code.number_count, INT))]
         if self.plan.sampled:
-            rows = (f.load(call, self.call_fields.index("knots"), base=INT) + 1) * len(self.plan.sampled)
+            rows = f.load(call, self.call_fields.index("knots"), base=INT) + 1
+            cleared.append(("samplesbar", rows * len(self.plan.sampled)))
         for k in self._each_lane(f, s.ready > 0.5):
-            cleared = [("numbersbar", f.const(self.code.number_count, INT))]
-            if self.plan.sampled:
-                cleared.append(("samplesbar", rows))
             for name, length in cleared:
                 to = self._result(f, call, name, k, length)
                 with f.each(length) as i:
                     f.store(0.0, to, i)
-        with f.while_(lambda: f.any_of(s.at > 0.5)):
-            if self.plan.sampled:
-                f.call("find_rows", f.given["work"], call)
-            s.any = f.const(0.0, DOUBLE, f.width)
-            with f.while_(due):
-                s.any = yes
-                with f.each(n) as i:
-                    for x in "qv":
-                        place = i * f.width + self.start(f"bar result {x}", "work")
-                        f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
-                for k in self._each_lane(f, s.due > 0.5):
-                    number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
-                    self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
-                    given(k, number, "bar result")
-                    for x in "qv":
-                        state = f.at(self.member_address(f, call, f"given {x}s", member), number * n)
-                        with f.each(n) as i:
-                            place = i * f.width + k + self.start(f"state {x}", "work")
-                            f.store(f.load(state, i), f.given["work"], place)
-                setattr(s, "state t", s.next)
-                mask = s.due > 0.5
-                self._pull_projection(f, mask)
-                ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
-                with f.each(self.rowcount) as r:
-                    of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
-                    # q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the products pi_k of differences of times.
-                    one, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
-                    for k in range(3 * POINTS):
-                        old = self.vector(f, f"bar difference{k}", r)
-                        self.put(f, f"bar difference{k}", r, f.select(mask, f.fma(one, of_q, f.fma(slope, of_v, old)), old))
-                        slope = f.fma(slope, ahead[k // 3], one)
-                        one = one * ahead[k // 3]
-                s.where(mask, written=s.written - 1.0)
-            with f.if_(f.any_of(s.any > 0.5)):
-                f.call("differences_back", f.given["work"])
-            f.call("step_back", f.given["work"])
-            active = s.at > 0.5
-            with f.each(self.rowcount) as r:
-                for name in ("bar point", "point"):
-                    for k in reversed(range(POINTS)):
-                        for x in "qva":
-                            old = self.vector(f, f"{name}{k} {x}", r)
-                            if k or name == "bar point":
-                                zero = f.const(0.0, DOUBLE, self.plan.vector)
-                                new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
-                                self.put(f, f"{name}{k} {x}", r, f.select(active, new, old))
-            for k in reversed(range(1, POINTS)):
-                s.where(active, **{f"point{k}_t": getattr(s, f"point{k - 1}_t")})
-            s.where(active, at=s.at - 1.0)
-            for k in self._each_lane(f, active):
-                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "point0")
-                self._load_head(f, k)
-        # What is left is that of the first state as it was given, which is the first output, too.
-        for k in self._each_lane(f, s.ready > 0.5):
-            given(k, f.const(0, INT), "bar point3")
+
+    def _pull_output(self, f: Function, s: Lane):
+        """Pull the cotangents of the outputs that are `due` through projection and interpolation, to `bar difference`.
+
+        q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the differences N_k and the products pi_k of differences of times.
+        """
+        call, n, mask = f.given["call"], self.n, s.due > 0.5
+        with f.each(n) as i:
             for x in "qv":
-                self.copy_lane(f, self._result(f, call, f"{x}bar", k, n), 0, f"bar point3 {x}", k)
-            if self.count:
-                f.call("leave_row", f.given["work"], call, k)
-            self.free_record(f, k)
-        s.ready = f.const(0.0, DOUBLE, f.width)
+                place = i * f.width + self.start(f"bar result {x}", "work")
+                f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
+        for k in self._each_lane(f, mask):
+            number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
+            self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
+            self._add_output(f, k, number, "bar result")
+            for x in "qv":
+                state = f.at(self.member_address(f, call, f"given {x}s", member), number * n)
+                with f.each(n) as i:
+                    f.store(f.load(state, i), f.given["work"], i * f.width + k + self.start(f"state {x}", "work"))
+        setattr(s, "state t", s.next)
+        self._pull_projection(f, mask)
+        ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+        with f.each(self.rowcount) as r:
+            of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
+            product, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
+            for k in range(3 * POINTS):
+                old = self.vector(f, f"bar difference{k}", r)
+                new = f.fma(product, of_q, f.fma(slope, of_v, old))
+                self.put(f, f"bar difference{k}", r, f.select(mask, new, old))
+                slope = f.fma(slope, ahead[k // 3], product)
+                product = product * ahead[k // 3]
+        s.where(mask, written=s.written - 1.0)
+
+    def _move_back(self, f: Function, s: Lane):
+        """Shift points and their cotangents by one, and load the point that comes in at the other end."""
+        active, zero = s.at > 0.5, f.const(0.0, DOUBLE, self.plan.vector)
+        with f.each(self.rowcount) as r:
+            for name in ("bar point", "point"):
+                for k in reversed(range(0 if name == "bar point" else 1, POINTS)):
+                    for x in "qva":
+                        new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
+                        self.put(f, f"{name}{k} {x}", r, f.select(active, new, self.vector(f, f"{name}{k} {x}", r)))
+        for k in reversed(range(1, POINTS)):
+            s.where(active, **{f"point{k}_t": getattr(s, f"point{k - 1}_t")})
+        s.where(active, at=s.at - 1.0)
+        for k in self._each_lane(f, active):
+            self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "point0")
+            self._load_head(f, k)
 
     def _write_find_rows(self):
         """`find_rows(work, call)`: the rows of samples that hold where lanes are, each with its constants."""

@@ -50,6 +50,16 @@ class Module(Memory):
         self.constants = len(self.written_out.constants if self.written_out else code.constants)
         self.moving = range(self.constants if any(active) else 0) if self.written_out is None else self.written_out.moving
         """The constants, by their numbers in the layout of the scene, along which there are derivatives."""
+        self._lay_out()
+        self.tangents = self.places  # of one direction of a derivative
+        self.functions: list[Function] = []
+        self.loops = LoopWriter(plan.width, cold=plan.written_out)
+        self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
+        self.rowcount = -(-n * plan.width // plan.vector)
+
+    def _lay_out(self):
+        """Reserve room in memory for all arrays; layout.py says what they hold."""
+        plan, code, n, m = self.plan, self.code, self.n, self.m
         p = self.places = Layout(plan.width, plan.vector)
         for name in LANE_NUMBERS:
             p.add(name)
@@ -94,11 +104,6 @@ class Module(Memory):
                 self._add_arrays("", {"psi_q": code.scratch["psi_q"], "psi_dot": m, "root": n})
             else:
                 self._add_arrays("fallback ", code.with_all_rows.scratch | {"constants": len(code.constants)})
-        self.tangents = self.places  # of one direction of a derivative
-        self.functions: list[Function] = []
-        self.loops = LoopWriter(plan.width, cold=plan.written_out)
-        self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
-        self.rowcount = -(-n * plan.width // plan.vector)
 
     @property
     def drop_tol_place(self) -> int | None:
@@ -206,9 +211,6 @@ class Module(Memory):
         else:
             at = {"numbers": ("numbers", 0), "constants": ("constants", 0)}
             self.loops.write(self.code.prologue, name, ("numbers", "constants"), at, width=1)
-
-    def work_places(self, name: str, count: int) -> list[Place]:
-        return [("work", self.places[name] + k) for k in range(count)]
 
     def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
         f = Function(name, arguments, self.plan.width, cold=name in COLD and not self.is_dense)

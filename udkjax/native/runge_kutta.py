@@ -63,6 +63,11 @@ def write_attempt(module: Module):
             with f.if_(f.any_of(again)):
                 module.invoke(f, "finish_by_fallback")
                 s.where(again, ok=1.0)
+    _measure_error(module, f, s)
+
+
+def _measure_error(module: Module, f: Function, s: Lane):
+    """Compute `error`, the largest of all coordinates over its tolerance: not a number where any of them is none."""
     q0, v0, q1, v1 = "point3 q", "point3 v", "state q", "result v"
     rtol = module.broadcast(f, s.rtol)
     taken = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
