@@ -16,9 +16,10 @@ from udkjax.study.design.design import DesignSearch
 
 CASES = Path(__file__).parents[1] / "tests" / "data" / "path_synthesis.json"
 STARTS, SEEDS = 300, 100
+DIGITS = 1e-6  # that errors were published to
 LINKAGE = udk.Drawing(
     pins={"O": (0, 0), "A": (3, 4), "B": (12, 9), "P": (6, 12), "C": (10, 0)},
-    links={name: {"pins": pins, "mass": 1.0} for name, pins in (("crank", "OA"), ("coupler", "ABP"), ("rocker", "CB"))},
+    links={name: {"pins": list(pins), "mass": 1.0} for name, pins in (("crank", "OA"), ("coupler", "ABP"), ("rocker", "CB"))},
     ground=["O", "C"],
     motors={"motor": {"pin": "O", "speed": 1.0}},
 )
@@ -37,7 +38,7 @@ def search(number: int, case: dict) -> DesignSearch:
     lengths = {(a, b): (0.0, float(most)) for a, b in ("OA", "AB", "CB", "OC", "AP")}
     free = ["pin.A", "pin.B", "pin.P", "pin.C[0]"] if number == 1 else None
     bounds = None if number == 1 else {"pin.O": (-area, area)}
-    return udk.DesignSearch(LINKAGE, udk.PathGoal(point="P", targets=targets, **choices), free, bounds, lengths)
+    return udk.DesignSearch(LINKAGE, udk.PathGoal("P", targets, **choices), free, bounds, lengths)
 
 
 def main(seeds: int = SEEDS, starts: int = STARTS) -> None:
@@ -54,7 +55,7 @@ def main(seeds: int = SEEDS, starts: int = STARTS) -> None:
         x, published = np.array(losses), min(case["published_errors"].values())
         near = np.mean(x <= x.min() + 1e-6 * max(1.0, x.min()))
         print(f"{case['name']}: best {x.min():.8g}, mean {x.mean():.8g}, worst {x.max():.8g}; within 1e-6 of the best {near:.0%}")
-        print(f"    published {published:g}, at least as good {np.mean(x <= published):.0%}")
+        print(f"    published {published:g}, at least as good to its digits {np.mean(x <= published * (1 + DIGITS)):.0%}")
         print(f"    means of fifty runs of evolutionary methods {case['fifty_runs_mean']}")
         print(f"    {np.median(times):.2f} s a run", flush=True)
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
@@ -52,6 +52,12 @@ class FoundDesign(PrintsTable):
         return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
 
     @property
+    def pins(self) -> dict[str, Float[Array, "2"]]:
+        """The places of the pins of the drawing by name (m), none where there is no drawing."""
+        drawn = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
+        return {name: getattr(pin, "position") for name, pin in drawn.items()}  # noqa: B009  # of a drawing, whose class is above
+
+    @property
     def drawing(self) -> AbstractDrawing | None:
         """The drawing, where the design began with one."""
         return self.mechanism.drawing
@@ -59,8 +65,7 @@ class FoundDesign(PrintsTable):
     def _table(self) -> PrintedTable:
         rows = [("loss", f"{self.loss:.6g}"), ("largest residual", f"{np.max(np.abs(self.residuals)):.3g}")]
         rows += [("transmission", f"{self.transmission:.3g}"), ("turns", "yes" if self.turns else "no")]
-        pins = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
-        rows += [(f"pin.{name}", format_numbers(pin.position, "m")) for name, pin in pins.items()]  # pyright: ignore
+        rows += [(f"pin.{name}", format_numbers(place, "m")) for name, place in self.pins.items()]
         return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
 
 

@@ -5,8 +5,9 @@ A goal measures a position by a few numbers (`measure`, in JAX), and says by how
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,8 +26,8 @@ from udkjax.study.drive import Coordinate, value_of
 AnyArray = Any  # of NumPy or JAX
 
 
-def _targets(name: str, columns: int) -> Any:
-    def convert(value: Any) -> np.ndarray:
+def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
+    def convert(value: Numbers) -> np.ndarray:
         found = np.asarray(value, float)
         require_finite(name, found)
         found = found[:, None] if columns == 1 and found.ndim == 1 else found
@@ -38,7 +39,7 @@ def _targets(name: str, columns: int) -> Any:
     return convert
 
 
-def _values(value: Any) -> np.ndarray | None:
+def _values(value: Numbers | None) -> np.ndarray | None:
     if value is None:
         return None
     found = np.asarray(value, float)
@@ -56,10 +57,16 @@ class Goal(PrintsTable):
     pin to another, such as the ground link.
     """
 
-    targets: eqx.AbstractVar[np.ndarray]
-    values: eqx.AbstractVar[np.ndarray | None]
-    start: eqx.AbstractVar[str]
-    line: eqx.AbstractVar[tuple[str, ...]]
+    if TYPE_CHECKING:  # fields of each goal, in an order of its own
+
+        @property
+        def targets(self) -> np.ndarray: ...
+        @property
+        def values(self) -> np.ndarray | None: ...
+        @property
+        def start(self) -> str: ...
+        @property
+        def line(self) -> tuple[str, ...]: ...
 
     def __check_init__(self):
         if self.values is not None and len(self.values) != len(self.targets):

@@ -13,6 +13,7 @@ from udkjax.study.design.design_problem import TURN_VALUES, DesignProblem, Trial
 
 PHASES = 12  # first values that are tried, around a turn
 SPANS = (1.0, 0.6, 0.3)  # of a turn, from the first value to the last, that are tried for open curves
+LEAST_SCALE = 0.03  # of the curve beside its targets: what fits best as a point does not fit at all
 ROUNDS = 2  # of moving to the targets and assigning anew
 CLEAR = 0.02  # transmission over the whole turn, at least: those that come closer to where branches meet end there soon
 
@@ -36,6 +37,7 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
         return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
     trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
     s, moved = trials
+    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # what scaling has made too long
     q, there = problem.march(moved, s, threads)
     best = np.argsort(np.where(there & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
     best = best[there[best]]
@@ -83,6 +85,7 @@ def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np
     dz, dt = z - middle[:, None], target - centre
     size = np.maximum(np.sum(np.abs(dz) ** 2, 1), 1e-300)
     a = np.sum(np.conj(dz) * dt, 1) / size
+    a = np.where(np.abs(a) ** 2 * size > LEAST_SCALE**2 * np.sum(np.abs(dt) ** 2), a, 1.0)  # not shrunk to a point
     if moves == "no turn":
         a = np.maximum(a.real, 1e-3) + 0j
     return a, centre - a * middle, np.sum(np.abs(a[:, None] * dz - dt) ** 2, 1)
