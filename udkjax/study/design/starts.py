@@ -87,7 +87,7 @@ def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np
     a = np.sum(np.conj(dz) * dt, 1) / size
     a = np.where(np.abs(a) ** 2 * size > LEAST_SCALE**2 * np.sum(np.abs(dt) ** 2), a, 1.0)  # not shrunk to a point
     if moves == "no turn":
-        a = np.maximum(a.real, 1e-3) + 0j
+        a = np.maximum(np.real(a), 1e-3) + 0j
     return a, centre - a * middle, np.sum(np.abs(a[:, None] * dz - dt) ** 2, 1)
 
 
