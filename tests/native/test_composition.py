@@ -249,3 +249,29 @@ def test_a_module_is_compiled_in_parts_that_others_share(monkeypatch):
     assert len(parts) == 3 and parts[0] == large
     assert machine.split_module(TEXT + large)[0] == large  # the same text in another module, hence the same file
     assert answer(text) == np.sqrt(10.0)
+
+
+@pytest.mark.slow
+def test_equal_programs_are_equal_texts_in_every_process():
+    """Else the code of derivatives would be compiled anew in each."""
+    program = """
+import udkjax as udk
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.written_out import WrittenOut
+import hashlib
+mechanism = udk.library.parallelogram()
+programs = scene_programs(mechanism, udk.analyse(mechanism).redundant_rows)
+written_out = WrittenOut(programs, [], ["projection"], [True] * programs.number_count, reverse=True)
+program = written_out.derivative("projection").derivative.program
+graph, order = program.graph, program.order
+text = str([(graph.nodes[k].kind, [a.index for a in graph.nodes[k].arguments]) for k in order])
+print(hashlib.sha256(text.encode()).hexdigest())
+"""
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True
+        )
+        for seed in "12"
+    ]
+    assert all(not one.returncode for one in found), found[0].stderr
+    assert found[0].stdout == found[1].stdout

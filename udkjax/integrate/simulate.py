@@ -69,7 +69,8 @@ def simulate(
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. The result has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred
-    runs and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there.
+    runs and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there; one above 0.01 L
+    or 0.01 rad behind a step that was projected ends a run by machine code.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
