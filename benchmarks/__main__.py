@@ -8,6 +8,7 @@ from pathlib import Path
 
 NAMES = (
     "right_hand_side",
+    "methods",
     "integrators",
     "trajectory",
     "batch",

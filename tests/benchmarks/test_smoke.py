@@ -16,6 +16,7 @@ from benchmarks import (  # noqa: E402
     integrators,
     measurements,
     mechanisms,
+    methods,
     right_hand_side,
     sweep,
     table,
@@ -25,6 +26,12 @@ from benchmarks import (  # noqa: E402
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
+
+
+@pytest.mark.slow
+def test_methods(tmp_path):
+    names = [row["name"] for row in methods.main(smoke=True, out=tmp_path / "figures.json")]
+    assert names[0] == "Auto" and "jit of a mechanism" in names
 
 
 @pytest.mark.slow

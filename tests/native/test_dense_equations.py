@@ -44,7 +44,9 @@ def test_the_exact_motion_of_a_redundant_linkage(method, stabilization):
     assert int(run.stats["rejected"]) <= 5
 
 
-@pytest.mark.parametrize("scene", ["slider_crank", "peaucellier", "planetary_gear", "excavator"])
+@pytest.mark.parametrize(
+    "scene", ["slider_crank", "planetary_gear", *(pytest.param(x, marks=pytest.mark.slow) for x in ("peaucellier", "excavator"))]
+)
 @pytest.mark.parametrize("method", METHODS[::3], ids=["SVD", "GramSchmidt"])
 def test_other_mechanisms_move_as_by_elimination(scene, method):
     mechanism = getattr(udk.library, scene)()
@@ -66,7 +68,7 @@ def test_members_of_a_batch_are_single_runs(method):
     assert_allclose(batch[::5], [end(m) for m in masses[::5]], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("method", METHODS[1::3], ids=["Varga", "Greville"])
+@pytest.mark.parametrize("method", [METHODS[1], pytest.param(METHODS[4], marks=pytest.mark.slow)], ids=["Varga", "Greville"])
 def test_derivatives_are_those_of_elimination(method):
     linkage = udk.library.parallelogram()
 
