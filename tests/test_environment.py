@@ -33,6 +33,24 @@ def test_float64_is_on_unless_the_environment_says_no(tmp_path, order, given, dt
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_function_that_asks_first_within_a_trace_is_traced_once(tmp_path):
+    code = """
+import jax
+import udkjax as udk
+
+traces = []
+
+@jax.jit
+def angle(x):
+    traces.append(x)
+    return udk.library.parallelogram(angle=x).q0[0, 2]
+
+angle(0.1), angle(0.2)
+print(len(traces))
+"""
+    assert python(code, HOME=tmp_path) == "1"
+
+
 def test_nothing_of_python_is_changed(tmp_path):
     code = "import sys, gc; before = sys.meta_path[:], gc.isenabled(), gc.get_threshold(); import udkjax as udk; udk.simulate"
     code += "; assert before == (sys.meta_path, gc.isenabled(), gc.get_threshold()); print('as it was')"

@@ -223,5 +223,9 @@ def __dir__():
 
 
 os.environ["JAX_ENABLE_X64"] = os.environ.get("JAX_ENABLE_X64") or "1"
-if os.environ["JAX_ENABLE_X64"].lower() not in ("0", "n", "no", "f", "false", "off") and "jax" in sys.modules:
-    sys.modules["jax"].config.update("jax_enable_x64", True)  # it has read its environment already
+if "jax" in sys.modules:
+    if os.environ["JAX_ENABLE_X64"].lower() not in ("0", "n", "no", "f", "false", "off"):
+        sys.modules["jax"].config.update("jax_enable_x64", True)  # it has read its environment already
+    # Equinox imports this, which adds to what JAX knows its traces by: a function that is traced when a name of this package is
+    # first asked for would be traced and compiled again on its second call.
+    import_module("jax.extend")

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from udkjax.native import machine
 from udkjax.native.least_norm import least_norm
 
 
 @pytest.fixture(scope="module")
 def solve(code):
-    run = code(least_norm())
+    run = code(least_norm(machine.lanes()))
 
     def solved(D, b, tol=1e-9):
         D, b = np.array(D, float), np.array(b, float)

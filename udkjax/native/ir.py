@@ -269,6 +269,14 @@ class Function:
         self.declared.add(f"declare {x.base} @{full}({x.type})")
         return self.op(f"call {x.base} @{full}({x.type} {x.name})", x.base)
 
+    def total(self, x: Value) -> Value:
+        """The sum of all lanes, in any order."""
+        if x.width == 1:
+            return x
+        full = f"llvm.vector.reduce.fadd.v{x.width}f64"
+        self.declared.add(f"declare double @{full}(double, {x.type})")
+        return self.op(f"call reassoc double @{full}(double {self.const(0.0).name}, {x.type} {x.name})", DOUBLE)
+
     def any_of(self, mask: Value) -> Value:
         return self.reduce("or", mask)
 

@@ -13,23 +13,32 @@ SWEEPS = 30  # at most; some six or eight do
 ORTHOGONAL = 1e-15  # cosines of angles between rows that are orthogonal but for rounding
 
 
-def least_norm() -> Function:
-    """`least_norm(D (m, n), b (m, c), x (n, c), m, n, c, tol, rank)`: x = D^+ b, and the rank of D. D and b are turned."""
+def least_norm(vector: int) -> Function:
+    """`least_norm(D (m, n), b (m, c), x (n, c), m, n, c, tol, rank)`: x = D^+ b, and the rank of D. D and b are turned.
+
+    Rows are taken in vectors of so many numbers, and what is left of them one by one.
+    """
     sizes = [(INT, "m"), (INT, "n"), (INT, "c")]
     arguments = [(POINTER, "D"), (POINTER, "b"), (POINTER, "x"), *sizes, (DOUBLE, "tol"), (POINTER, "rank")]
     f = Function(LEAST_NORM, arguments)
     D, b, x, m, n, columns, tol, rank = (f.given[name] for _, name in arguments)
 
-    def dot(i: Value, j: Value) -> Value:
-        total = f.variable(0.0)
-        with f.each(n) as k:
-            total.value = f.fma(f.load(D, i * n + k), f.load(D, j * n + k), total.value)
-        return total.value
+    whole = f.arithmetic("div", n, vector)  # vectors of a row
 
-    def turn(place: Value, one: Value, two: Value, c: Value, s: Value):
-        p, q = f.load(place, one), f.load(place, two)
-        f.store(f.fma(c, p, -(s * q)), place, one)
-        f.store(f.fma(s, p, c * q), place, two)
+    def dot(i: Value, j: Value) -> Value:
+        total, one, two = f.variable(0.0, width=vector), i * n, j * n
+        with f.each(whole) as k:
+            place = k * vector
+            total.value = f.fma(f.load(D, one + place, vector), f.load(D, two + place, vector), total.value)
+        rest = f.variable(f.total(total.value))
+        with f.each(n, whole * vector) as k:
+            rest.value = f.fma(f.load(D, one + k), f.load(D, two + k), rest.value)
+        return rest.value
+
+    def turn(place: Value, one: Value, two: Value, c: Value, s: Value, width: int = 1):
+        p, q = f.load(place, one, width), f.load(place, two, width)
+        f.store(f.fma(c, p, -(s * q)), place, one, width)
+        f.store(f.fma(s, p, c * q), place, two, width)
 
     turned, sweep = f.variable(1, INT), f.variable(0, INT)
     with f.while_(lambda: (turned.value > 0) & (sweep.value < SWEEPS)):
@@ -44,7 +53,9 @@ def least_norm() -> Function:
                 t = f.select(zeta < 0.0, f.const(-1.0), 1.0) / (f.abs(zeta) + root)
                 cosine = 1.0 / f.intrinsic("sqrt", f.fma(t, t, 1.0))
                 sine = cosine * t
-                with f.each(n) as k:
+                with f.each(whole) as k:
+                    turn(D, i * n + k * vector, j * n + k * vector, cosine, sine, vector)
+                with f.each(n, whole * vector) as k:
                     turn(D, i * n + k, j * n + k, cosine, sine)
                 with f.each(columns) as k:
                     turn(b, i * columns + k, j * columns + k, cosine, sine)

@@ -72,11 +72,6 @@ class Memory:
         found = worst.value
         return found if self.plan.width > 1 else f.largest_of(found)
 
-    def total(self, f: Function, x: Value) -> Value:
-        name = f"llvm.vector.reduce.fadd.v{x.width}f64"
-        f.declared.add(f"declare double @{name}(double, {x.type})")
-        return f.op(f"call reassoc double @{name}(double {f.const(0.0).name}, {x.type} {x.name})", DOUBLE)
-
     def address(self, f: Function, name: str) -> Value:
         return f.at(f.given["work"], self.places[name] * self.plan.width)
 

@@ -87,7 +87,7 @@ def _measure_error(module: Module, f: Function, s: Lane):
     with f.each(module.rowcount) as r:
         for x in (*relative(r), module.vector(f, "result a", r)):
             check.value = f.fma(x, 0.0, check.value)
-    total = check.value if module.plan.width > 1 else module.total(f, check.value)
+    total = check.value if module.plan.width > 1 else f.total(check.value)
     s.error = module.largest(f, relative)
     s.where((s.ok < 0.5) | total.is_not(0.0), error=np.nan)
     s.where(~(s.distance >= 0.0), distance=0.0)

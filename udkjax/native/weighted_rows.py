@@ -41,7 +41,7 @@ class WeightedRows(RowEntries):
         super().__init__(module)
         self._module = module
         if all(f.name != LEAST_NORM for f in module.functions):
-            module.functions.append(least_norm())
+            module.functions.append(least_norm(module.plan.vector))
 
     def weight(self, f: Function, row: Value, lane: Operand = 0) -> Value:
         """Return the weight of a row."""

@@ -195,7 +195,7 @@ class DenseMatrices:
                 totals[j] = term(r, totals[j])
         while len(totals) > 1:
             totals = [a + b for a, b in zip(totals[::2], totals[1::2], strict=False)] + totals[len(totals) & ~1 :]
-        return totals[0] if f.width > 1 else self.module.total(f, totals[0])
+        return totals[0] if f.width > 1 else f.total(totals[0])
 
     def dot(self, a: MatrixRow, b: MatrixRow) -> Value:
         """The scalar product of two rows, of each lane."""
