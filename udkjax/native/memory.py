@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
+from udkjax.native.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, Plan
 
 
