@@ -28,8 +28,8 @@ AnyArray = Any  # of NumPy or JAX
 
 def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
     def convert(value: Numbers) -> np.ndarray:
+        require_finite(name, value)
         found = np.asarray(value, float)
-        require_finite(name, found)
         found = found[:, None] if columns == 1 and found.ndim == 1 else found
         if found.ndim != 2 or found.shape[1] != columns or not len(found):
             shape = "(J,)" if columns == 1 else f"(J, {columns})"
@@ -42,8 +42,8 @@ def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
 def _values(value: Numbers | None) -> np.ndarray | None:
     if value is None:
         return None
+    require_finite("values", value)
     found = np.asarray(value, float)
-    require_finite("values", found)
     if found.ndim != 1:
         raise ValueError(f"values must be those of the driver at each position, (J,); the shape is {found.shape}")
     return found

@@ -1,0 +1,67 @@
+"""`udkjax design`: goals in files, what it writes, and what it says about mistakes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.command_line import udkjax
+
+GOALS = Path(__file__).parents[1] / "examples" / "goals"
+GOAL = """
+mechanism = "four_bar.toml"
+units = {length = "mm", angle = "deg"}
+transmission = 10
+[goal]
+kind = "path"
+point = "P"
+targets = [[20, 10], [5, 17], [0, 7]]
+[bounds]
+"pin.O" = [[-80, -80], [80, 80]]
+[[length]]
+pins = ["O", "A"]
+least = 2
+most = 60
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "four_bar.toml").write_text((GOALS / "four_bar.toml").read_text())
+    return tmp_path
+
+
+def test_designs_are_found_shown_and_written(folder, capsys):
+    goal = folder / "goal.toml"
+    goal.write_text(GOAL)
+    assert udkjax("design", goal, "--starts", 30, "--results", 1, "--out", folder / "out", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    (one,) = found["designs"]
+    assert one["loss"] < 1e-20 and one["turns"] and one["transmission"] >= np.sin(np.deg2rad(10)) - 1e-6
+    mech = udk.load(folder / "out" / "design1.toml")
+    np.testing.assert_allclose(mech.parameters()["pin.P"], [0.02, 0.01], atol=1e-9)
+    np.testing.assert_allclose(mech.parameters()["pin.A"], one["parameters"]["pin.A"], rtol=1e-9, atol=1e-12)
+    assert 0.002 * (1 - 1e-6) <= np.linalg.norm(np.subtract(one["parameters"]["pin.A"], one["parameters"]["pin.O"])) <= 0.06
+    assert (folder / "out" / "design1.html").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('kind = "path"', 'kind = "pat"', "goal.kind must be one of"),
+        ('point = "P"', 'pont = "P"', "unknown key"),
+        ("transmission = 10", "transmision = 10", "did you mean"),
+        ('pins = ["O", "A"]', 'pins = ["O"]', "must name two pins"),
+        ('"pin.O" =', '"pin.Q" =', "is not free"),
+        ("[5, 17]", "[5]", "targets"),
+        ('"four_bar.toml"', '"five_bar.toml"', "cannot read"),
+        ("[goal]", "[goal", "not valid TOML"),
+    ],
+)
+def test_mistakes_in_a_goal_are_named(folder, capsys, old, new, says):
+    goal = folder / "goal.toml"
+    goal.write_text(GOAL.replace(old, new))
+    assert udkjax("design", goal) == 2
+    assert says in capsys.readouterr().err
