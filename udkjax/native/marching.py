@@ -12,6 +12,7 @@ from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
+from udkjax.native.manifold import largest_violation
 from udkjax.native.members import write_begin, write_run
 from udkjax.native.module import Module
 from udkjax.native.tableau import EULER
@@ -47,72 +48,33 @@ class Marching(Module):
     def program_names(self) -> list[str]:
         return ["newton_q", "value_derivatives"]
 
+    def _get(self, f: Function, name: str, i: Value) -> Value:
+        return f.load(f.given["work"], i * f.width + self.places[name] * f.width, f.width)
+
+    def _put(self, f: Function, name: str, i: Value, x: Value):
+        f.store(x, f.given["work"], i * f.width + self.places[name] * f.width, f.width)
+
     def _march(self):
         """`march(work, call)`: the members in all lanes, over all values."""
         f, s = self.function("march", [(POINTER, "work"), (POINTER, "call")])
         work, call, width = f.given["work"], f.given["call"], self.plan.width
-        eps = float(np.finfo(float).eps)
-
-        def get(name: str, i: Value) -> Value:
-            return f.load(work, i * width + self.places[name] * width, width)
-
-        def put(name: str, i: Value, x: Value):
-            f.store(x, work, i * width + self.places[name] * width, width)
-
-        def wide(x: float) -> Value:
-            return f.const(x, DOUBLE, width)
-
+        zero = f.const(0.0, DOUBLE, width)
         times = f.load(call, self.call_fields.index("times"), base=INT)
         trusted, good, before = f.variable(0.0), f.variable(1.0), f.variable(s.start)
         with f.each(self.n) as i:
-            put("state q", i, get("point3 q", i))
+            self._put(f, "state q", i, self._get(f, "point3 q", i))
             for name in ("result dq", "result dv", "third derivative"):
-                put(name, i, wide(0.0))
+                self._put(f, name, i, zero)
         with f.each(times) as k:
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
                 f.store(self.input_number(f, call, "ts", f.lane(s.member, lane), k), work, lane + self.places["state t"] * width)
-            now = get("state t", f.const(0, INT))
-            h = now - before.value
-            with f.each(self.n) as i:
-                first, second = get("result dq", i), get("result dv", i)
-                bend = f.fma(h * (1 / 6), get("third derivative", i), second * 0.5)
-                ahead = f.fma(f.fma(bend, h, first), h, get("state q", i))
-                for name, x in (("previous dq", first), ("previous ddq", second), ("state q", ahead), ("prediction", ahead)):
-                    put(name, i, x)
-            for _ in range(CORRECTIONS):
-                self.invoke(f, "newton_q")
-                with f.each(self.n) as i:
-                    put("state q", i, get("corrected q", i))
-            self.invoke(f, "value_derivatives")
-            off, largest = f.variable(0.0), f.variable(1.0)
-            along, one, other = f.variable(0.0), f.variable(0.0), f.variable(0.0)
-            moves_on = h.is_not(0.0)
-            per_h = f.select(moves_on, wide(1.0) / f.select(moves_on, h, wide(1.0)), wide(0.0))
-            with f.each(self.n) as i:
-                unit, q = get("inverse unit", i), get("state q", i)
-                largest.value = f.max(f.abs(q) * unit, largest.value)
-                off.value = f.max(f.abs(q - get("prediction", i)) * unit, off.value)
-                old, new = get("previous dq", i) * unit, get("result dq", i) * unit
-                along.value = f.fma(old, new, along.value)
-                one.value = f.fma(old, old, one.value)
-                other.value = f.fma(new, new, other.value)
-                put("third derivative", i, (get("result dv", i) - get("previous ddq", i)) * per_h)
-            violated = f.variable(0.0)
-            with f.each(self.m) as i:
-                x = f.abs(get("psi", i)) / get("rows", i)
-                violated.value = f.select((x > violated.value) | x.is_not(x), x, violated.value)
-            per_unit = wide(1.0) / (s.omega * s.omega)
-            along_s, one_s, other_s = along.value + per_unit, one.value + per_unit, other.value + per_unit
-            straight = along_s > f.intrinsic("sqrt", one_s * other_s) * STRAIGHT
-            near = off.value < f.abs(h) * f.intrinsic("sqrt", one_s) * SLACK + largest.value * (64 * eps)
-            closed = ~(violated.value > largest.value * (ROUNDING_UNITS * eps)) & f.is_finite(violated.value)
-            begins = f.compare("lt", k, 1)
-            moves = (straight & near) | f.repeat(begins, width) if width > 1 else (straight & near) | begins
-            fine = closed & (s.distance > DISTANT) & moves
-            good.value = f.select(fine, good.value, wide(0.0))
+            now = self._get(f, "state t", f.const(0, INT))
+            h, begins = now - before.value, f.compare("lt", k, 1)
+            self._step_on(f, h)
+            good.value = f.select(self._is_sound(f, s, h, begins), good.value, zero)
             trusted.value = trusted.value + good.value
             with f.if_(begins), f.each(self.n) as i:  # there was no step: nothing is known of the third derivative
-                put("third derivative", i, wide(0.0))
+                self._put(f, "third derivative", i, zero)
             before.value = now
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
                 row = self.to_int(f, f.lane(s.member, lane)) * times + k
@@ -121,6 +83,45 @@ class Marching(Module):
         with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
             to = f.load(call, self.call_fields.index("trusted"), base=POINTER)
             f.store(f.lane(trusted.value, lane), to, self.to_int(f, f.lane(s.member, lane)))
+
+    def _step_on(self, f: Function, h: Value):
+        """Predict the positions a step ahead, correct them, and compute q' and q'' there."""
+        with f.each(self.n) as i:
+            first, second = self._get(f, "result dq", i), self._get(f, "result dv", i)
+            bend = f.fma(h * (1 / 6), self._get(f, "third derivative", i), second * 0.5)
+            ahead = f.fma(f.fma(bend, h, first), h, self._get(f, "state q", i))
+            for name, x in (("previous dq", first), ("previous ddq", second), ("state q", ahead), ("prediction", ahead)):
+                self._put(f, name, i, x)
+        for _ in range(CORRECTIONS):
+            self.invoke(f, "newton_q")
+            with f.each(self.n) as i:
+                self._put(f, "state q", i, self._get(f, "corrected q", i))
+        self.invoke(f, "value_derivatives")
+
+    def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> Value:
+        """Tell whether positions are closed, near their prediction, and on a straight course; estimate the third derivative."""
+        one, zero, eps = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), float(np.finfo(float).eps)
+        off, largest = f.variable(0.0), f.variable(1.0)
+        product, old_square, new_square = f.variable(0.0), f.variable(0.0), f.variable(0.0)
+        moves_on = h.is_not(0.0)
+        per_h = f.select(moves_on, one / f.select(moves_on, h, one), zero)
+        with f.each(self.n) as i:
+            unit, q = self._get(f, "inverse unit", i), self._get(f, "state q", i)
+            largest.value = f.max(f.abs(q) * unit, largest.value)
+            off.value = f.max(f.abs(q - self._get(f, "prediction", i)) * unit, off.value)
+            old, new = self._get(f, "previous dq", i) * unit, self._get(f, "result dq", i) * unit
+            product.value = f.fma(old, new, product.value)
+            old_square.value = f.fma(old, old, old_square.value)
+            new_square.value = f.fma(new, new, new_square.value)
+            change = self._get(f, "result dv", i) - self._get(f, "previous ddq", i)
+            self._put(f, "third derivative", i, change * per_h)
+        violated, per_unit = largest_violation(self, f), one / (s.omega * s.omega)
+        old_length2, new_length2 = old_square.value + per_unit, new_square.value + per_unit
+        straight = product.value + per_unit > f.intrinsic("sqrt", old_length2 * new_length2) * STRAIGHT
+        near = off.value < f.abs(h) * f.intrinsic("sqrt", old_length2) * SLACK + largest.value * (64 * eps)
+        closed = ~(violated > largest.value * (ROUNDING_UNITS * eps)) & f.is_finite(violated)
+        moves = (straight & near) | (f.repeat(begins, f.width) if f.width > 1 else begins)
+        return closed & (s.distance > DISTANT) & moves
 
     def step_all(self, f: Function, s: Lane, fill):
         f.call("march", f.given["work"], f.given["call"])
