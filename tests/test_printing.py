@@ -71,7 +71,10 @@ def objects() -> dict[str, object]:
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
         *(drawing, drawing.links["bar"], udk.Held(ts, 0.1)),
         *(udk.PathGoal("P", [[0, 0], [1, 1]]), udk.PoseGoal("a", [[0, 0, 0.1]]), udk.FunctionGoal("a", [0.1], [0.2])),
-        *((batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])), batch({"gravity": np.zeros((2, 2))}, [0.1])),
+        *(
+            (batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])),
+            batch({"gravity": np.zeros((2, 2))}, np.array([0.1])),
+        ),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
     return {type(one).__name__: one for one in found}

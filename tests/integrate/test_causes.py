@@ -63,7 +63,7 @@ def test_a_driver_beyond_the_reach_of_its_linkage(scale, choices, ts):
 
 def test_a_run_does_not_go_on_beyond_the_reach_of_its_linkage():
     """A full turn leads back into reach, but no motion leads there."""
-    solution = failed(four_bar(motor=[START, 3.0]), [0.0, 2 * np.pi / 3], rtol=1e-6, atol=1e-6)
+    solution = failed(four_bar(motor=[START, 3.0]), np.array([0.0, 2 * np.pi / 3]), rtol=1e-6, atol=1e-6)
     assert solution.result == udk.Result.drift
     assert float(solution.time) == pytest.approx((TOGGLE - START) / 3.0, rel=1e-2)
     assert "the linkage reaches" in solution.cause and solution.stats["steps"] < 2000

@@ -2,6 +2,7 @@
 
 import ctypes
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,11 +32,14 @@ METHODS = {
 class Solver(Memory):
     """One method on (m, n) matrices in so many lanes."""
 
-    def __init__(self, method, m, n, width):
-        self.plan = SimpleNamespace(width=width, vector=machine.lanes())
+    def __init__(self, method: pinv.Pseudoinverse, m: int, n: int, width: int):
+        plan: Any = SimpleNamespace(width=width, vector=machine.lanes())
+        code = dense_method(method)
+        assert code is not None
+        self.plan = plan
         self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
         self.places.add("fallback_tol")
-        layout = DenseLayout(self, dense_method(method))
+        layout = DenseLayout(self, code)
         functions = []
         for name in ("index", "factor", "solve"):
             f = Function(name, [(POINTER, "work")], width)
@@ -43,7 +47,7 @@ class Solver(Memory):
             if name == "index":
                 d.number_columns()
             else:
-                getattr(dense_method(method), name)(d)
+                getattr(code, name)(d)
             functions.append(f)
         declared = sorted(set().union(*(f.declared for f in functions)))
         text = "\n".join([*declared, *(f.text() for f in functions)])
@@ -73,7 +77,8 @@ class Solver(Memory):
 def solved(make, matrices, right, tols, width, relative=True):
     """By machine code, in groups of lanes; the last one is filled up."""
     method = make(1.0, relative=relative)
-    solver, found, ranks = Solver(method, *matrices.shape[1:], width), [], []
+    m, n = matrices.shape[1:]
+    solver, found, ranks = Solver(method, m, n, width), [], []
     for k in range(0, len(matrices), width):
         chosen = np.minimum(np.arange(k, k + width), len(matrices) - 1)
         x, rank = solver(matrices[chosen], right[chosen], np.broadcast_to(tols, len(matrices))[chosen])

@@ -31,7 +31,7 @@ def members(count, size, seed=0):
 def test_each_member_is_where_kinematics_has_it():
     given, values = members(11, 2e-3), START + np.linspace(0.1, 1.3, 7)
     found = BATCH(given, values)
-    assert np.all(found.reached)
+    assert np.all(found.reached) and found.dq is not None
     for k in (0, 10):
         one = udk.kinematics(MECH.with_parameters({name: x[k] for name, x in given.items()}), "motor", values)
         np.testing.assert_allclose(found.q[k], one.q, atol=1e-14)
@@ -41,6 +41,7 @@ def test_each_member_is_where_kinematics_has_it():
 def test_derivatives_along_all_pins_are_those_of_jax():
     given, values = members(1, 2e-3), START + np.array([0.4, 2.0])
     found = BATCH(given, values)
+    assert found.by_parameters is not None
     assert BATCH.free.entries()[:3] == ["pin.O[0]", "pin.O[1]", "pin.A[0]"]
 
     def q(parameters):
@@ -75,6 +76,7 @@ def test_any_scene_a_six_bar_and_redundant_rows():
     free = ["body.coupler.mass"]
     values = float(drive(mech, "body.link1.angle").value(mech.q0)) + np.linspace(0.1, 0.9, 5)
     found = udk.PositionBatch(mech, "body.link1.angle", free, derivatives=True)({free[0]: np.ones(2)}, values)
+    assert found.dq is not None
     one = udk.kinematics(mech, "body.link1.angle", values)
     np.testing.assert_allclose(found.q[1], one.q, atol=1e-13)
     np.testing.assert_allclose(found.dq[1], one.v, atol=1e-12)
@@ -90,10 +92,10 @@ def test_wrong_input_is_named():
     with pytest.raises(udk.SceneError, match="named twice"):
         udk.PositionBatch(MECH, "motor", ["pin.A", "pin.A"])
     with pytest.raises(udk.SceneError, match=r'"pin\.A" is missing'):
-        BATCH({name: x for name, x in members(2, 0.0).items() if name != "pin.A"}, [0.1])
+        BATCH({name: x for name, x in members(2, 0.0).items() if name != "pin.A"}, np.array([0.1]))
     with pytest.raises(udk.SceneError, match="must have the shape"):
-        BATCH(members(2, 0.0) | {"pin.A": np.zeros(2)}, [0.1])
+        BATCH(members(2, 0.0) | {"pin.A": np.zeros(2)}, np.array([0.1]))
     with pytest.raises(ValueError, match="values"):
         BATCH(members(2, 0.0), np.zeros((3, 4)))
     with pytest.raises(ValueError, match="finite"):
-        BATCH(members(2, 0.0), [0.1, np.nan])
+        BATCH(members(2, 0.0), np.array([0.1, np.nan]))

@@ -4,7 +4,7 @@ Arrays of coordinates in the memory of a run, with q, v, a for positions, veloci
 
     state q ...          the state at which programs evaluate
     result v, a ...      what they return; `corrected q` is q after a Newton step
-    point0 q ...         accepted states, from the oldest to the latest, point3, at the times `point0_t` ...
+    point0 q ...         accepted states, from the oldest to the latest, point3, at the times point0_t ...
     stage1 a ...         accelerations of the stages of a step
     difference0 ...      divided differences: the coefficients of the interpolating polynomial
     fallback a ...       results of fallback steps

@@ -8,7 +8,7 @@ import xarray
 from scipy import stats
 
 import udkjax as udk
-from udkjax.study.quantities import Angle, Length, Scaled
+from udkjax.study.quantities import InitialAngle, Length, Scaled
 from udkjax.study.sweep.axes import Axis, LatinHypercube, Sobol, Zipped
 from udkjax.study.sweep.grid import GridError, load_grid, loads_grid
 
@@ -27,7 +27,7 @@ def test_a_file_is_the_arguments_of_a_sweep():
     mass, tolerance, start, stabilization = given["axes"].values()
     np.testing.assert_array_equal(mass.values, np.linspace(0.5, 4.5, 9))
     np.testing.assert_allclose(tolerance.values, 10.0 ** np.arange(-10, -2))
-    assert mass.of is None and tolerance.of == ("rtol", "atol") and start.of == Angle(("link1", "link2", "link3"))
+    assert mass.of is None and tolerance.of == ("rtol", "atol") and start.of == InitialAngle(("link1", "link2", "link3"))
     assert isinstance(stabilization.values[0], udk.Projection) and isinstance(stabilization.values[1], udk.Baumgarte)
     assert isinstance(given["method"], udk.Auto) and type(given["solver"]).__name__ == "Dopri8"
     assert given["drift_tol"] == 1e-3 and "design" not in given
