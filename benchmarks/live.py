@@ -8,6 +8,7 @@ import json
 import statistics
 import tempfile
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def native_ms(run: Any) -> float:
 def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
     """Measure, print a line for each scene, and write the figures."""
     try:
-        from playwright.sync_api import sync_playwright
+        sync_playwright = import_module("playwright.sync_api").sync_playwright
     except ImportError:
         print("    playwright is not installed: sizes alone")
         sync_playwright = None

@@ -110,6 +110,7 @@ def test_a_row_that_numbers_make_independent_is_not_left_out():
     assert_allclose(traced.q, known.q, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_events_in_a_traced_mechanism():
     event = udk.Event(lambda t, frames: frames["link1"].angle + np.pi / 2, udk.Stop())
 
