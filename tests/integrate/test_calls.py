@@ -1,5 +1,6 @@
 """Calls of known numbers: what lies between `simulate` and machine code, and what is compiled before a first result, counted."""
 
+import gc
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -24,11 +25,14 @@ def called(function: Callable[[], object]) -> set[tuple[str, str]]:
         if event == "call" and Path(code.co_filename).is_relative_to(ROOT) and not code.co_name.startswith("<"):
             seen.add((code.co_filename, code.co_qualname))
 
+    gc.collect()
+    gc.disable()  # what is collected meanwhile calls the package, too: caches forget it
     sys.setprofile(listen)
     try:
         function()
     finally:
         sys.setprofile(None)
+        gc.enable()
     return seen
 
 
