@@ -15,6 +15,7 @@ from udkjax.integrate.compiled_mechanism import compile_known
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.prepare import AUTO
 from udkjax.integrate.projection import Projection
+from udkjax.native import primitive, row_marks
 
 TIMES = np.linspace(0.0, 2.0, 9)
 
@@ -52,6 +53,28 @@ def test_also_from_a_singular_configuration_that_is_passed(velocity):
 def test_at_rest_where_branches_meet_no_row_is_left_out():
     found, _ = marks(udk.library.parallelogram(angle=0.0))
     assert_array_equal(found, np.ones(12))
+
+
+@pytest.fixture(params=[0.003, 0.3])
+def other_step(request, monkeypatch):
+    """Ten times less and more than the step that is taken aside."""
+
+    def forget():
+        primitive.generate.cache_clear()
+        primitive.machine_code.cache_clear()
+
+    forget()
+    monkeypatch.setattr(row_marks, "STEP", request.param)
+    yield
+    forget()
+
+
+def test_marks_do_not_depend_on_how_far_the_step_aside_goes(other_step):
+    del other_step
+    for name in ("parallelogram", "planetary_gear"):
+        found, rank = marks(getattr(udk.library, name)())
+        assert found.sum() == rank
+    assert_array_equal(marks(udk.library.parallelogram(angle=0.0))[0], np.ones(12))
 
 
 def test_a_jitted_function_of_a_mechanism_is_machine_code():

@@ -3,9 +3,11 @@
 Rows that depend on others everywhere have to be told from those that do so at the initial position alone, in a singular
 configuration. So a mechanism takes one step aside, along its velocity or, at rest, along some direction that its constraints
 allow, with its drivers a little ahead; it is closed there by Newton's method, and rows are marked that elimination does not leave
-out. Where it does not close quadratically, as at rest where two branches of its motion meet, all rows are marked: elimination
+out. Where it does not close, or is led back, as at rest where two branches of its motion meet, all rows are marked: elimination
 then meets pivots that it must not trust, and every step is taken by the method that reveals the rank.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -21,6 +23,7 @@ from udkjax.native.tableau import EULER
 # Of the scene's units: how far the step goes. A row that depends on others only where the step begins has behind it a pivot of
 # about the square, relative to its diagonal entry: far above the threshold of dependence, and Newton's method closes from there.
 STEP = 0.03
+STAYS = 0.5  # of the step: where branches meet, Newton's method leads a position on neither of them back to where it began
 CORRECTIONS = 6  # of Newton's method, which doubles the digits in each: four are usual
 FREE = 1e-6  # of a direction or a velocity, in the scene's units: what is less is rounding, and constraints allow no motion
 
@@ -92,6 +95,8 @@ class RowMarks(Module):
         iterate_newton(self, f, s, everyone, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
         self.invoke(f, "psi")
         closed = largest_violation(self, f) < CLOSED_TOL
+        away = self.largest(f, self._distance(f))
+        closed = closed & ((away > STAYS * STEP) | ~f.like(is_free, BOOL, width))
         self.invoke(f, "independent_rows")
         with f.each(self.m) as i:
             put("independent", i, f.select(closed, get("independent", i), 1.0))
@@ -99,6 +104,15 @@ class RowMarks(Module):
         with f.each(width) as k, f.if_(f.lane(s.active, k) > 0.5):
             member = self.to_int(f, f.lane(s.member, k))
             self.copy_lane(f, f.at(marks, member * self.m), 0, "independent", k, count=self.m)
+
+    def _distance(self, f: Function) -> Callable[[Value], list[Value]]:
+        """The distance of each coordinate from the initial position, in its unit."""
+
+        def of_register(r: Value) -> list[Value]:
+            moved = self.vector(f, "state q", r) - self.vector(f, "point3 q", r)
+            return [f.abs(moved) * self.vector(f, "inverse unit", r)]
+
+        return of_register
 
     def step_all(self, f: Function, s: Lane, fill):
         """Find the marks of the members in all lanes, and take the next."""
