@@ -69,7 +69,7 @@ class CompiledMechanism(eqx.Module):
     @property
     def textbook(self) -> TextbookEquations:
         """The equations of a mechanism, whatever formulation is around them."""
-        inner = self.equations.equations if isinstance(self.equations, FormulatedSystem) else self.equations
+        inner = _without_formulation(self.equations)
         assert isinstance(inner, TextbookEquations)  # of others there is no machine code
         return inner
 
@@ -146,6 +146,10 @@ def _reason_for_textbook(equations: TextbookEquations) -> str:
     return ""
 
 
+def _without_formulation(equations: AbstractSystem) -> AbstractSystem:
+    return equations.equations if isinstance(equations, FormulatedSystem) else equations
+
+
 def eliminates(method: Pseudoinverse) -> bool:
     """Return whether a method eliminates rows, and leaves out those that are redundant."""
     return isinstance(method, Auto | Elimination)
@@ -168,7 +172,7 @@ def _run_operation(
 
 def _evaluation(equations: AbstractSystem) -> Accelerate | None:
     """Return the operation that evaluates equations at single states; None where machine code cannot."""
-    inner = equations.equations if isinstance(equations, FormulatedSystem) else equations
+    inner = _without_formulation(equations)
     if type(inner) is not TextbookEquations or not inner.constrained or _reason_for_textbook(inner):
         return None
     operation = Accelerate(_programs(inner), dense_method(inner.method))
