@@ -157,7 +157,7 @@ def fields_table(record: Any, units: Mapping[str, str], title: str = "") -> Prin
 
 def format_field(value: Any, unit: str = "") -> str:
     """Return the value of a field as text on one line: numbers with their unit, names, or what an object prints."""
-    if value is None or isinstance(value, Plain) or hasattr(value, "shape"):
+    if value is None or isinstance(value, Plain) or isinstance(getattr(value, "shape", None), tuple):
         return format_numbers(value, unit)
     if isinstance(value, str):
         return value

@@ -11,23 +11,26 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests import elements
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.formulations import Formulation
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import NativeEquations
 from udkjax.integrate.projection import Projection
 
 METHODS = [udk.Auto(), udk.Elimination(), udk.SVD(), udk.Varga(), udk.Householder(), udk.GramSchmidt(), udk.Greville()]
+FORMULATIONS = [udk.NullSpaceQR(), udk.NullSpaceSVD(), udk.Augmented(udk.SVD())]
 TIMES = np.linspace(0.0, 1.0, 6)
 
 
-def both(mechanism, method, stabilization=Projection()):
-    """The equations by machine code, and by the textbook."""
+def both(mechanism, chosen, stabilization=Projection()):
+    """The equations by machine code, of a pseudoinverse or a formulation, and by the textbook."""
     analysis = udk.analyse(mechanism)
-    compiled = compile_mechanism(mechanism.without_origin, analysis, method, stabilization, solver=udk.BDF())
+    method, formulation = (udk.Auto(), chosen) if isinstance(chosen, Formulation) else (chosen, None)
+    compiled = compile_mechanism(mechanism.without_origin, analysis, method, stabilization, formulation, udk.BDF())
     q, v, scales = mechanism.q0.ravel(), mechanism.v0.ravel(), analysis.scales
     marks = mark_rows(compiled, jnp.zeros(()), q, v, scales.length, jnp.maximum(scales.rate, 1.0))
     assert compiled.plan.evaluation is not None
-    return NativeEquations(compiled.textbook, marks, compiled.plan.evaluation), compiled.textbook
+    return NativeEquations(compiled.textbook, marks, compiled.equations, compiled.plan.evaluation), compiled.textbook
 
 
 @eqx.filter_jit
@@ -57,10 +60,11 @@ def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-1
     D, b, free, root = (np.asarray(x) for x in terms(systems[0][1], t, q, v))
     plus = np.linalg.pinv(D, rcond=1e-4)
     for method, (native, _) in zip(chosen, systems, strict=True):
-        a, tangent = evaluate(native, t, q, v, dq, dv)
+        formulated = isinstance(method, Formulation)  # which changes accelerations alone
+        a, tangent = (native.accelerations(t, q, v), ()) if formulated else evaluate(native, t, q, v, dq, dv)
         expected = free + root * (plus @ b)
         assert_allclose(a, expected, rtol=0, atol=atol * max(1.0, np.abs(expected).max()), err_msg=str(method))
-        for found, x in zip(tangent, (dq, dv), strict=True):
+        for found, x in zip(tangent, (dq, dv), strict=not formulated):
             assert_allclose(
                 found, x - root * (plus @ (D @ (x / root))), rtol=0, atol=atol * max(1.0, np.abs(x).max()), err_msg=str(method)
             )
@@ -81,7 +85,7 @@ def test_joints(name):
 @pytest.mark.parametrize("name", OTHER_JOINTS)
 def test_joints_by_each_method(name):
     joints = {k: elements.JOINTS[k] for k in ("revolute", name)}
-    agree(udk.Mechanism(elements.BODIES, joints), METHODS)
+    agree(udk.Mechanism(elements.BODIES, joints), [*METHODS, *FORMULATIONS, udk.Augmented()])
 
 
 @pytest.mark.parametrize("kind", ["drivers", "forces"])
@@ -91,17 +95,18 @@ def test_drivers_and_forces(kind, stabilization):
     drivers = {k: elements.DRIVERS[k] for k in ("turn", "lift")}
     moved = udk.Mechanism(elements.BODIES, joints, drivers=drivers)
     loaded = udk.Mechanism(elements.BODIES, joints, forces=elements.FORCES)
-    agree(moved if kind == "drivers" else loaded, [METHODS[0], METHODS[4]], stabilization)
+    chosen = [METHODS[0], METHODS[4]] if stabilization == Projection() else [udk.NullSpaceQR(), udk.Augmented()]
+    agree(moved if kind == "drivers" else loaded, chosen, stabilization)
 
 
 @pytest.mark.parametrize("angle", [-0.7, pytest.param(np.pi / 2, marks=pytest.mark.slow)])
 def test_redundant_rows(angle):
-    agree(udk.library.parallelogram(angle=angle, angular_velocity=0.7), METHODS, closed=True)
+    agree(udk.library.parallelogram(angle=angle, angular_velocity=0.7), METHODS + FORMULATIONS, closed=True)
 
 
 def test_a_singular_configuration():
     """All links in line: the rank falls by one, and a is the solution of least norm. Elimination has half the digits there."""
-    chosen = [m for m in METHODS if not isinstance(m, udk.Elimination)]
+    chosen = [m for m in METHODS if not isinstance(m, udk.Elimination)] + FORMULATIONS
     agree(udk.library.parallelogram(angle=0.0, angular_velocity=0.7), chosen, closed=True, atol=1e-11)
 
 
@@ -147,12 +152,35 @@ def test_runs_of_other_solvers_take_the_steps_of_the_plain_form(solver):
 
 
 @pytest.mark.slow
-def test_a_formulation_projects_by_machine_code():
+@pytest.mark.parametrize("solver", [None, udk.Adams()], ids=["native", "Adams"])
+def test_runs_by_formulations(solver):
     mechanism = udk.library.parallelogram()
-    one, two = (
-        udk.simulate(mechanism, TIMES, rtol=1e-7, atol=1e-7, formulation=udk.NullSpaceQR(), engine=e) for e in ("auto", "diffrax")
-    )
-    assert_allclose(one.q, two.q, rtol=0, atol=1e-7)
+    for formulation in FORMULATIONS[:2]:
+        one, two = (
+            udk.simulate(mechanism, TIMES, rtol=1e-7, atol=1e-7, formulation=formulation, engine=e, solver=solver)
+            for e in ("auto", "diffrax")
+        )
+        assert one.settings["engine"] == ("native" if solver is None else one.settings["engine"])
+        assert_allclose(one.q, two.q, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "formulation", [udk.Augmented(), pytest.param(udk.NullSpaceSVD(), marks=pytest.mark.slow)], ids=["LU", "SVD"]
+)
+def test_lanes_and_derivatives_of_runs_by_a_formulation(formulation):
+    """Members side by side are what each is alone; forward and reverse derivatives are those of the Udwadia-Kalaba equation."""
+    mechanism = udk.library.four_bar()
+
+    def end(mass, formulation):
+        moved = mechanism.with_parameters({"body.coupler.mass": mass})
+        return udk.simulate(moved, TIMES, rtol=1e-10, atol=1e-10, formulation=formulation).q[-1, 1, 2]
+
+    masses = jnp.array([0.7, 1.0, 1.9])
+    expected = jax.vmap(jax.value_and_grad(lambda m: end(m, None)))(masses)
+    found = jax.vmap(jax.value_and_grad(lambda m: end(m, formulation)))(masses)
+    assert_allclose(found, expected, rtol=1e-7)
+    assert_allclose(jax.jvp(lambda m: end(m, formulation), (masses[2],), (1.0,)), np.asarray(expected)[:, 2], rtol=1e-7)
+    assert_allclose(end(masses[0], formulation), found[0][0], rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -52,10 +52,8 @@ class Augmented(PointwiseFormulation):
     Without a `method` by LU with partial pivoting, as is usual. Then the rows must be independent. Where they are not, the matrix
     is singular, and LU does not notice: it divides by a pivot that is a rounding error. If that is exactly zero, as of a joint
     that is given twice, nothing is a number, and a run ends at once with `Result.not_finite`. In the paper's linkage (rank 11 of
-    12) it depends on the machine's rounding whether it is. Where it is not, the error goes into the multipliers, along the left
-    null space of A, while `Projection` keeps all rows satisfied to rounding: the run is right to 4e-9 after 20 s at 1e-9. Not
-    stabilized, the drift is divided by the pivot: at 5 s the steps have become so small that 5,000 do not reach the end. So they
-    do, with `Projection` too, at the first singular configuration. With a pseudoinverse as `method`, for instance
+    12) it depends on rounding whether it is. Where it is not, what the rows disagree by at a stage is divided by the pivot: steps
+    become ever smaller. With a pseudoinverse as `method`, for instance
     `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm: what is redundant is shared, and the accelerations are
     right, also in singular configurations where the right-hand side is consistent. Its default `rank_tol` is the square of the
     others': a singular value sigma of D = A M^(-1/2) is one of about sigma^2 here.

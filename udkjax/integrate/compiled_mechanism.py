@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.elements import has_pieces
-from udkjax.equations.formulations import FormulatedSystem, Formulation
+from udkjax.equations.formulations import FormulatedSystem, Formulation, WrappedSystem
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
@@ -21,6 +21,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.held_rows import SampleRows
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
+from udkjax.native.formulations import FormulationCode, formulation_code
 from udkjax.native.operations import Accelerate, RunStates, Tableau
 from udkjax.native.primitive import unsupported
 from udkjax.native.pseudoinverses import dense_method
@@ -63,15 +64,12 @@ class CompiledMechanism(eqx.Module):
     @property
     def samples(self) -> SampleRows:
         """The rows of all that has samples."""
-        equations: Any = self.equations
-        return SampleRows(equations.mechanism, self.breakpoints)
+        return SampleRows(self.textbook.mechanism, self.breakpoints)
 
     @property
     def textbook(self) -> TextbookEquations:
         """The equations of a mechanism, whatever formulation is around them."""
-        inner = _without_formulation(self.equations)
-        assert isinstance(inner, TextbookEquations)  # of others there is no machine code
-        return inner
+        return _textbook(self.equations)
 
 
 def compile_mechanism(
@@ -97,9 +95,9 @@ def compile_mechanism(
     operation, evaluation, rows = None, None, 0
     why = "it was asked for" if engine == "diffrax" else _reason_for_diffrax(equations, solver, adjoint, meter)
     if not why:
-        assert isinstance(equations, TextbookEquations)  # there is a reason for diffrax where they are not
         operation = _run_operation(equations, solver, projected, breakpoints)
-        rows = len(equations.scales.rows) - len((equations.redundant or ()) if eliminates(equations.method) else ())
+        textbook = _textbook(equations)
+        rows = len(textbook.scales.rows) - len((textbook.redundant or ()) if eliminates(textbook.method) else ())
         missing = unsupported(operation.code)
         why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
     elif engine == "auto":
@@ -128,15 +126,19 @@ def _reason_for_diffrax(
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
         return "a progress meter is diffrax's"
-    if type(equations) is not TextbookEquations:
-        return f"it knows the Udwadia-Kalaba equation of a mechanism, not {type(equations).__name__}"
     if not is_explicit(solver):
         return f"{type(solver).__name__} is no explicit Runge-Kutta method"
-    return _reason_for_textbook(equations)
+    return _reason_for_equations(equations)
 
 
-def _reason_for_textbook(equations: TextbookEquations) -> str:
+def _reason_for_equations(equations: AbstractSystem) -> str:
     """Return why machine code cannot evaluate equations, whatever the scene is; empty where it can."""
+    if isinstance(equations, FormulatedSystem):
+        if formulation_code(equations.formulation) is None:
+            return f"it does not know the formulation {equations.formulation}"
+        equations = equations.equations
+    if type(equations) is not TextbookEquations:
+        return f"it knows the equations of a mechanism, not {type(equations).__name__}"
     if not eliminates(equations.method) and dense_method(equations.method) is None:
         return f"it does not know the pseudoinverse {type(equations.method).__name__}"
     if jax.default_backend() != "cpu":
@@ -146,8 +148,11 @@ def _reason_for_textbook(equations: TextbookEquations) -> str:
     return ""
 
 
-def _without_formulation(equations: AbstractSystem) -> AbstractSystem:
-    return equations.equations if isinstance(equations, FormulatedSystem) else equations
+def _textbook(equations: AbstractSystem) -> TextbookEquations:
+    """Return the equations of a mechanism, whatever formulation is around them."""
+    inner = equations.equations if isinstance(equations, WrappedSystem) else equations
+    assert isinstance(inner, TextbookEquations)  # those of a system of the user's own are nothing else
+    return inner
 
 
 def eliminates(method: Pseudoinverse) -> bool:
@@ -155,27 +160,32 @@ def eliminates(method: Pseudoinverse) -> bool:
     return isinstance(method, Auto | Elimination)
 
 
-def _run_operation(
-    equations: TextbookEquations, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None
-) -> RunStates:
-    mechanism = equations.mechanism
+def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> RunStates:
+    textbook = _textbook(equations)
+    mechanism = textbook.mechanism
     elements = (*mechanism.constraints.values(), *mechanism.forces.values())
     return RunStates(
-        code=_programs(equations),
+        code=_programs(textbook),
         method=Tableau(method_of(solver)),
         projected=projected,
         breaks=breakpoints is not None or any(map(has_pieces, elements)),
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
-        pseudoinverse=dense_method(equations.method),
+        pseudoinverse=dense_method(textbook.method),
+        formulation=_formulation(equations),
     )
+
+
+def _formulation(equations: AbstractSystem) -> FormulationCode | None:
+    """Return the machine code of the formulation around equations."""
+    return formulation_code(equations.formulation) if isinstance(equations, FormulatedSystem) else None
 
 
 def _evaluation(equations: AbstractSystem) -> Accelerate | None:
     """Return the operation that evaluates equations at single states; None where machine code cannot."""
-    inner = _without_formulation(equations)
-    if type(inner) is not TextbookEquations or not inner.constrained or _reason_for_textbook(inner):
+    if not equations.constrained or _reason_for_equations(equations):
         return None
-    operation = Accelerate(_programs(inner), dense_method(inner.method))
+    inner = _textbook(equations)
+    operation = Accelerate(_programs(inner), dense_method(inner.method), _formulation(equations))
     return None if unsupported(operation.code) else operation
 
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.formulations import FormulatedSystem
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
@@ -17,7 +19,8 @@ from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.native.layout import INFO, OUTPUTS
+from udkjax.native.formulations import formulation_tol
+from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
 from udkjax.native.operations import MarkRows, RunStates
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
@@ -56,7 +59,7 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
 
 def serves_derivatives(active: Problem) -> bool:
     """Return whether there is machine code for derivatives along `active` numbers of the scene and initial states."""
-    served = lambda p: (p.equations.mechanism, p.equations.baumgarte, p.q, p.v)  # noqa: E731
+    served = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
     others = eqx.tree_at(served, active, (None,) * 4, is_leaf=lambda x: x is None)
     return not any(x is True for x in jax.tree.leaves(others))
 
@@ -64,12 +67,12 @@ def serves_derivatives(active: Problem) -> bool:
 def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
     """The numbers of a run, or a change of them; zeros stand for one row of what has samples."""
     of = problem if change is None else change
-    return problem.compiled.samples.stand_in(of.equations.mechanism), of.equations.baumgarte, of.marks
+    return problem.compiled.samples.stand_in(of.textbook.mechanism), of.textbook.baumgarte, of.marks
 
 
 def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
     """Tell which numbers are active."""
-    return problem.compiled.samples.stand_in(active.equations.mechanism, marks=True), active.equations.baumgarte, active.marks
+    return problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
 
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
@@ -80,7 +83,7 @@ def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, t
     dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
     directions = [along, dq, dv]
     if operation.sampled:
-        directions.insert(0, problem.compiled.samples.changes(change.equations.mechanism))
+        directions.insert(0, problem.compiled.samples.changes(change.textbook.mechanism))
     *found, dys, dend = native_p.bind(
         *_inputs(problem, operation), *(x[None, None] for x in directions), operation=operation, times=len(problem.ts)
     )
@@ -100,9 +103,9 @@ def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: A
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
     mechanism, baumgarte, _ = cotangent_tree(numbersbar[0], _numbers_of(problem), _active_of(problem, active))
     if operation.sampled:
-        mechanism = problem.compiled.samples.with_cotangents(mechanism, active.equations.mechanism, found[len(OUTPUTS) + 3][0])
+        mechanism = problem.compiled.samples.with_cotangents(mechanism, active.textbook.mechanism, found[len(OUTPUTS) + 3][0])
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
-    places = lambda p: (p.equations.mechanism, p.equations.baumgarte, p.q, p.v)  # noqa: E731
+    places = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
     return eqx.tree_at(places, none, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
 
 
@@ -132,6 +135,7 @@ def _inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> lis
         "omega": problem.rate,
         "fallback_tol": scene.fallback_tol,
         "max_steps": problem.max_steps,
+        **formulation_settings(compiled.equations),
     }
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
     return pack(operation, numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
@@ -162,6 +166,14 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
     given = pack(finding, numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp.zeros(0), xp)
     found = call_known(finding, given, 2) if xp is np else native_p.bind(*given, operation=finding, times=2)
     return found[0][0]
+
+
+def formulation_settings(equations: AbstractSystem) -> dict[str, Any]:
+    """Return what the machine code of a formulation is told; nothing without one."""
+    if not isinstance(equations, FormulatedSystem):
+        return {}
+    inner: Any = equations.equations
+    return dict(zip(FORMULATION_SETTINGS, (formulation_tol(equations.formulation), inner.scales.mass), strict=True))
 
 
 class Thresholds(NamedTuple):

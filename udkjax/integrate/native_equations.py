@@ -3,7 +3,6 @@
 They are primitives of JAX with a batching rule. Their derivatives are those of the textbook equations, to any order.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -11,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
-from udkjax.equations.formulations import FormulatedSystem, WrappedSystem
+from udkjax.equations.formulations import WrappedSystem
 from udkjax.equations.scales import Scales
 from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.native_engine import mark_rows, thresholds
+from udkjax.integrate.native_engine import formulation_settings, mark_rows, thresholds
 from udkjax.integrate.packing import pack
 from udkjax.integrate.problem import Problem
 from udkjax.native.operations import Accelerate, FindTangentPart, ProjectStates, StateOperation
@@ -26,6 +25,7 @@ class NativeEquations(WrappedSystem):
 
     equations: TextbookEquations
     marks: Float[Array, "m"] | None  # of independent rows; None: machine code knows them
+    formulated: AbstractSystem  # the same, or with the formulation around them
     operation: Accelerate = eqx.field(static=True)
 
     @property
@@ -45,13 +45,14 @@ class NativeEquations(WrappedSystem):
         return self.equations.is_finite(t, q, v)
 
     def _find(self, kind: type[StateOperation], t: Time, q: Vector, v: Vector, further: list[Any] | None = None) -> Array:
-        operation, equations = kind(self.operation.code, self.operation.pseudoinverse), self.equations
+        operation, equations = kind(self.operation.code, self.operation.pseudoinverse, self.operation.formulation), self.equations
         mechanism, scales = equations.mechanism.at(t), equations.scales
         drop_tol, safe_tol, fallback_tol = thresholds(equations, operation.code.policy)
         gains = [] if equations.baumgarte is None else [equations.baumgarte.alpha, equations.baumgarte.beta]
         marks = [] if self.marks is None else [self.marks]
         numbers = [*mechanism.numbers, *gains, *marks, drop_tol, safe_tol]
-        settings, ts = {"length": scales.length, "fallback_tol": fallback_tol}, jnp.stack([t, t])
+        settings = {"length": scales.length, "fallback_tol": fallback_tol, **formulation_settings(self.formulated)}
+        ts = jnp.stack([t, t])
         given = pack(operation, numbers, ts, q, v, settings, scales.rows, jnp.zeros(0), jnp, further or [])
         return native_p.bind(*given, operation=operation, times=2)[0][0]
 
@@ -63,8 +64,7 @@ def equations_for_diffrax(problem: Problem) -> AbstractSystem:
         return problem.equations
     textbook = problem.compiled.textbook
     marks = mark_rows(problem.compiled, problem.ts[0], problem.q, problem.v, problem.length, problem.rate)
-    native = NativeEquations(textbook, marks, evaluation)
-    return replace(problem.equations, equations=native) if isinstance(problem.equations, FormulatedSystem) else native
+    return NativeEquations(textbook, marks, problem.equations, evaluation)
 
 
 @eqx.filter_custom_jvp

@@ -44,7 +44,7 @@ def pack(
         Arrays with the member first.
     """
     as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
-    values = [settings[name] for name in operation.settings]
+    values = [settings[name] for name in operation.all_settings]
     given = (as_vector(numbers), ts, q, v, as_vector(values), rows, breaks, *further)
     arrays = [xp.asarray(x, float)[None] for x in given]
     return arrays if xp is np else stop_gradients(arrays)

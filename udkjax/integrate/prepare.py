@@ -23,7 +23,6 @@ from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.fields import number
-from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
     import diffrax
@@ -119,15 +118,15 @@ def prepare_run(
     if xp is jnp:
         numbers: Any = (q, v, rtol, atol, choices.drift_tol, choices.dt0)
         good = usable(*stop_gradients(numbers)) | ~closed
-        mechanism = getattr(compiled.equations, "mechanism", None)
-        if isinstance(mechanism, Mechanism):
-            good = good & stop_gradients(traced_numbers_hold(mechanism.elements))
+        if analysis is not None:
+            good = good & stop_gradients(traced_numbers_hold(compiled.textbook.mechanism.elements))
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))
         good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))
     runs = good & closed
-    equations: Any = compiled.equations  # which have the scales as arrays of NumPy, where all is known
-    scales = None if analysis is None else analysis.scales if xp is jnp else equations.scales
+    scales = None if analysis is None else analysis.scales
+    if scales is not None and xp is np:
+        scales = compiled.textbook.scales  # as arrays of NumPy
     length, rate = _units(scales, ts, v, xp)
     problem = Problem(
         compiled=compiled,

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.gradients import stop_gradients
 
@@ -34,6 +35,11 @@ class Problem(eqx.Module):
     def equations(self) -> AbstractSystem:
         """The equations of motion."""
         return self.compiled.equations
+
+    @property
+    def textbook(self) -> TextbookEquations:
+        """The equations of a mechanism, whatever formulation is around them."""
+        return self.compiled.textbook
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """Return the units of `atol` for coordinates and for velocities."""

@@ -10,7 +10,8 @@ How the code of a run is made, and where to look:
 4. `trajectory` adds the algorithm: `runge_kutta` (stages and errors of a step), `manifold` (projection), `controller` (accept or
    reject, and the next step), `singular` and `fallback` (steps near singular configurations), `breakpoints` and `pieces` (where
    the motion is not smooth), `dense_output` (states between steps), `members` (which member runs in which lane).
-5. `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination, where one is asked for.
+5. `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination, where one is asked for;
+   `formulations` finds accelerations in another way than by the Udwadia-Kalaba equation.
 6. `tangents` (forward mode) and `backpropagation` (reverse mode) add derivatives, with the programs of `program_derivative` and
    `prologue`; `closing`, `closing_derivatives` and `corrections` are a module that assembles a mechanism instead, `marching` one
    that follows its positions.
@@ -18,5 +19,5 @@ How the code of a run is made, and where to look:
 8. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules
    and shapes there are; `primitive` makes them a primitive of JAX with its batching rule. `udkjax.integrate` calls that and knows
    the rules of differentiation.
-8. `wasm` compiles the same text for pages, where `evaluation` finds accelerations and energies at single states.
+9. `wasm` compiles the same text for pages, where `evaluation` finds accelerations and energies at single states.
 """

@@ -23,7 +23,7 @@ class DenseEquations:
 
     def __init__(self, module: Module, method: DenseMethod):
         self._in, self._method = module, method
-        self._layout = DenseLayout(module, method)
+        self._layout = DenseLayout(module, method.matrices(module.m, module.n), (module.m, module.n))
         module.places.add("weights", module.m)
         module.places.add("saved", module.n)
 

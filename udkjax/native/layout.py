@@ -24,6 +24,10 @@ from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.steps import POINTS
 from udkjax.native.tableau import Method
 
+FORMULATION_SETTINGS = (
+    "formulation_tol",
+    "mass",
+)  # besides, for formulations: the threshold of the rank, the scale of masses (kg)
 SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
@@ -44,6 +48,7 @@ class Plan:
     steps: bool = True  # it integrates
     sampled: tuple[int, ...] = ()  # places of the numbers of the scene that have samples
     pseudoinverse: Any = None  # the `DenseMethod` that solves; None: elimination
+    formulation: Any = None  # the `FormulationCode` of accelerations; None: the Udwadia-Kalaba equation
 
 
 @dataclass

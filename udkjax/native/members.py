@@ -88,6 +88,11 @@ def write_finish(module: Module):
             with f.each(module.code.term_count) as i:
                 x = f.load(work, i * width + p["terms"] * width, width)
                 total.value = f.fma(x, 0.0, total.value)
+            if module.is_formulated:
+                module.accelerate(f, "result a")
+                with f.each(module.n) as i:
+                    a = f.load(work, (i + p["result a"]) * width, width)
+                    total.value = f.fma(a, 0.0, total.value)
             s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
     # The last state, once more to the manifold; and then the first, which is taken as it is.
     with f.each(module.rowcount) as r:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
 from udkjax.native.ir import POINTER, Function, Value
-from udkjax.native.layout import LANE_NUMBERS, Lane, Layout, Plan
+from udkjax.native.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.loops import LoopWriter
 from udkjax.native.memory import Memory
 from udkjax.native.program import Place, consecutive, write
@@ -42,8 +42,12 @@ class Module(Memory):
         self.n, self.m = n, m
         if plan.sampled:
             self.inputs = ("samples", *self.inputs)
+        if plan.formulation is not None:
+            self.settings = (*self.settings, *FORMULATION_SETTINGS)
         self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small to be trusted
         self.is_dense = plan.pseudoinverse is not None and m > 0
+        self.is_formulated = plan.formulation is not None and m > 0
+        self.takes_dense_rows = self.is_dense or self.is_formulated
         self.pieces = code.piece_count if plan.breaks else 0
         self.programs = {name: getattr(code, name) for name in self.program_names()}
         self.written_out = WrittenOut(code, list(self.programs), differentiated, active, reverse) if plan.written_out else None
@@ -61,7 +65,7 @@ class Module(Memory):
         """Reserve room in memory for all arrays; layout.py says what they hold."""
         plan, code, n, m = self.plan, self.code, self.n, self.m
         p = self.places = Layout(plan.width, plan.vector)
-        for name in LANE_NUMBERS:
+        for name in (*LANE_NUMBERS, *(FORMULATION_SETTINGS if plan.formulation else ())):
             p.add(name)
         p.add("constants", self.constants)
         p.add("state t")
@@ -96,8 +100,10 @@ class Module(Memory):
             p.add("numbers", -(-code.number_count // plan.width))
         if not self.written_out:
             self._add_arrays("", code.scratch)
-        if self.is_dense and "root" not in p.places:
+        if self.takes_dense_rows and "root" not in p.places:
             self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.written_out else {}))
+        if self.is_formulated:
+            p.add("saved v", n)
         if self.falls_back:
             self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
             if self.written_out:
@@ -139,6 +145,8 @@ class Module(Memory):
             names += ["dense_accelerations", *(["dense_newton_q", "dense_newton_v", "psi_dot"] if self.plan.projected else [])]
         else:
             names += self.solving
+        if self.is_formulated and not self.is_dense:
+            names.append("dense_accelerations")
         if self.falls_back and self.plan.written_out:
             names.append("rows_and_loads")
         return names
@@ -163,7 +171,7 @@ class Module(Memory):
             named |= {x: x for x in self.code.scratch}
         elif self.falls_back:
             named |= {x: x for x in ("psi_q", "psi_dot", "root")}
-        if self.is_dense:
+        if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
         return {x: ("work", self.places[place]) for x, place in named.items()}
 
@@ -267,4 +275,11 @@ class Module(Memory):
 
     def accelerate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i, of its state."""
-        self.invoke(f, "accelerations", f"stage{i} a")
+        self.accelerate(f, f"stage{i} a")
+
+    def accelerate(self, f: Function, to: str):
+        """Compute the accelerations of the state."""
+        self.invoke(f, "accelerations", to)
+
+    def accelerate_end(self, f: Function):
+        """Hook: called with `state q` and `result v` at the end of a step, and `result a` of them."""

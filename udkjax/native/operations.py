@@ -15,7 +15,8 @@ from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
-from udkjax.native.layout import INFO, INPUTS, OUTPUTS, SETTINGS, Plan
+from udkjax.native.formulations import FormulationCode
+from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, Plan
 from udkjax.native.marching import Marching
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -49,10 +50,15 @@ class Operation(ABC):
 
     code: ScenePrograms
 
-    settings: ClassVar[tuple[str, ...]] = SETTINGS  # that it takes
+    settings: ClassVar[tuple[str, ...]] = SETTINGS  # that its kind takes
     in_lanes: ClassVar[bool] = True  # whether members run side by side
     results: ClassVar[int] = len(OUTPUTS)  # the first outputs, which have no directions
     is_reverse: ClassVar[bool] = False  # whether it runs and walks back in two passes, each without what the other finds
+
+    @property
+    def all_settings(self) -> tuple[str, ...]:
+        """The names of the settings that it takes."""
+        return self.settings
 
     @property
     def tangents(self) -> int:
@@ -92,6 +98,11 @@ class RunStates(Operation):
     breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
     sampled: tuple[int, ...] = ()  # places of the numbers that have samples
     pseudoinverse: DenseMethod | None = None  # None: elimination
+    formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
+
+    @property
+    def all_settings(self) -> tuple[str, ...]:
+        return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
 
     def plan(self, width: int, vector: int) -> Plan:
         """Return what the module's code depends on."""
@@ -105,6 +116,7 @@ class RunStates(Operation):
             written_out=self.code.is_small,
             sampled=self.sampled,
             pseudoinverse=self.pseudoinverse,
+            formulation=self.formulation,
         )
 
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
@@ -218,12 +230,17 @@ class StateOperation(Operation):
     """A function of single states."""
 
     pseudoinverse: DenseMethod | None = None  # None: elimination
+    formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
 
     settings: ClassVar[tuple[str, ...]] = StateFunction.settings
     function: ClassVar[type[StateFunction]]
 
+    @property
+    def all_settings(self) -> tuple[str, ...]:
+        return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
+
     def module(self, width: int, several: bool, vector: int) -> Module:
-        return self.function(self.code, self.pseudoinverse, width, vector)
+        return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         return [(members, len(self.function.found) * self.coordinates)]

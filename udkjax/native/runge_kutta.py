@@ -38,7 +38,7 @@ def write_attempt(module: Module):
     stage_state(module, f, s, stages)
     setattr(s, "state t", s.t1)
     if not module.plan.projected:
-        module.invoke(f, "accelerations", "result a")
+        module.accelerate(f, "result a")
         check_pivots(module, f, s, "result a")
         with f.each(module.rowcount) as r:
             module.put(f, "result v", r, module.vector(f, "state v", r))
@@ -51,6 +51,7 @@ def write_attempt(module: Module):
             estimate_errors(module, f, s, None, "state dq", "state dv")
         newton(module, f, s)
         module.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
+        module.accelerate_end(f)
         unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
         if module.falls_back:
             s.where(unsafe, ok=0.0)
@@ -62,6 +63,7 @@ def write_attempt(module: Module):
             again = (s.stepping > 0.5) & (s.fallback > 0.5)
             with f.if_(f.any_of(again)):
                 module.invoke(f, "finish_by_fallback")
+                module.accelerate_end(f)
                 s.where(again, ok=1.0)
     _measure_error(module, f, s)
 
@@ -108,7 +110,7 @@ def stage_state(module: Module, f: Function, s: Lane, i: int, start: str = "poin
 
 def check_pivots(module: Module, f: Function, s: Lane, name: str):
     """Compute accelerations whose pivots are too small to be trusted by the fallback, or give the attempt up."""
-    if not module.falls_back:
+    if not module.falls_back or module.is_formulated:
         return
     unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
     with f.if_(f.any_of(unsafe)):

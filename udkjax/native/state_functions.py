@@ -10,6 +10,7 @@ from typing import ClassVar
 
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.fallback import write_fallback
+from udkjax.native.formulations import FormulationCode
 from udkjax.native.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.manifold import project_output, with_threshold
@@ -27,7 +28,9 @@ class StateFunction(Trajectory):
     results = ("found",)
     found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, one behind another
 
-    def __init__(self, code: ScenePrograms, pseudoinverse: DenseMethod | None, width: int, vector: int):
+    def __init__(
+        self, code: ScenePrograms, pseudoinverse: DenseMethod | None, formulation: FormulationCode | None, width: int, vector: int
+    ):
         super().__init__(
             Plan(
                 code,
@@ -38,6 +41,7 @@ class StateFunction(Trajectory):
                 vector=vector,
                 written_out=code.is_small,
                 pseudoinverse=pseudoinverse,
+                formulation=formulation,
             )
         )
 
@@ -83,8 +87,8 @@ class StateAccelerations(StateFunction):
         return ["accelerations"]
 
     def _evaluate(self, f: Function, s: Lane):
-        self.invoke(f, "accelerations", "result a")
-        if not self.falls_back:
+        self.accelerate(f, "result a")
+        if not self.falls_back or self.formulated:
             return
         s.stepping = s.active
         s.fallback = s.active

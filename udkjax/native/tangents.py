@@ -46,8 +46,8 @@ class Differentiated(Trajectory):
     def evaluate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i at its state, with what their derivatives need to know of it."""
         f.call("evaluation", f.given["work"], self.address(f, f"stage{i} a"), self.address(f, f"stage{i} linearization"))
-        if self.dense:
-            self.invoke(f, "accelerations", f"stage{i} a")  # derivatives are those of all methods, values the method's own
+        if self.dense or self.formulated:
+            self.accelerate(f, f"stage{i} a")  # derivatives are those of all methods, values the method's own
 
     def write_programs(self):
         super().write_programs()

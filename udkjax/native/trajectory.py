@@ -23,6 +23,7 @@ from udkjax.native.controller import write_decide
 from udkjax.native.dense_equations import DenseEquations
 from udkjax.native.dense_output import write_between, write_differences, write_outputs
 from udkjax.native.fallback import write_fallback
+from udkjax.native.formulations import FORMULATE
 from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.members import write_begin, write_finish, write_run
@@ -39,15 +40,30 @@ class Trajectory(Module):
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = (), reverse: bool = False):
         super().__init__(plan, differentiated, active, reverse)
         self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
+        self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
 
     def write_programs(self):
         super().write_programs()
         if self.dense:
             self.dense.write()
+        if self.formulated:
+            self.formulated.write()
 
     def begin_memory(self, f: Function):
         if self.dense:
             self.dense.number_columns(f)
+        if self.formulated:
+            self.formulated.number_columns(f)
+
+    def accelerate(self, f: Function, to: str):
+        self.invoke(f, FORMULATE if self.formulated else "accelerations", to)
+
+    def accelerate_end(self, f: Function):
+        if self.formulated:
+            self.copy(f, "state v", "saved v")
+            self.copy(f, "result v", "state v")
+            self.invoke(f, FORMULATE, "result a")
+            self.copy(f, "saved v", "state v")
 
     def begin_rows(self, f: Function, lane: Value, length: Value):
         if self.dense:

@@ -38,16 +38,31 @@ class DenseMethod(ABC):
 
 
 class DenseLayout:
-    """The matrices of a method in the memory of a module."""
+    """The matrices of a method in the memory of a module.
 
-    def __init__(self, module: Memory, method: DenseMethod):
-        self.module = module
-        m, n = module.m, module.n
-        shapes = {"D": (m, n), "b": (1, m), "x": (1, n), "index": (1, max(m, n)), **method.matrices(m, n)}
+    Args:
+        module: The module.
+        matrices: The rows and columns of the matrices besides D, by name.
+        shape: Those of D.
+        prefix: Of the names of their places.
+        tol: The name of the threshold of the rank.
+    """
+
+    def __init__(
+        self,
+        module: Memory,
+        matrices: dict[str, tuple[int, int]],
+        shape: tuple[int, int],
+        prefix: str = "dense",
+        tol: str = "fallback_tol",
+    ):
+        self.module, self.shape, self.prefix, self.tol = module, shape, prefix, tol
+        m, n = shape
+        shapes = {"D": (m, n), "b": (1, m), "x": (1, n), "index": (1, max(m, n)), **matrices}
         self.shapes, self.registers, vector, width = shapes, {}, module.plan.vector, module.plan.width
         for name, (rows, columns) in shapes.items():
             self.registers[name] = -(-columns * width // vector)
-            module.places.add(f"dense {name}", rows * self.registers[name] * max(vector // width, 1))
+            module.places.add(f"{prefix} {name}", rows * self.registers[name] * max(vector // width, 1))
 
 
 class MatrixRow:
@@ -110,7 +125,7 @@ class DenseMatrices:
 
     def __init__(self, layout: DenseLayout, f: Function):
         self.layout, self.f, self.module = layout, f, layout.module
-        self.m, self.n, self.vector = self.module.m, self.module.n, self.module.plan.vector
+        (self.m, self.n), self.vector = layout.shape, self.module.plan.vector
         self.steps = min(self.m, self.n)
 
     # --- numbers of each lane
@@ -141,7 +156,7 @@ class DenseMatrices:
     @property
     def tol(self) -> Value:
         """The threshold of the rank."""
-        return self.f.load(self.f.given["work"], self.module.places["fallback_tol"] * self.f.width, self.f.width)
+        return self.f.load(self.f.given["work"], self.module.places[self.layout.tol] * self.f.width, self.f.width)
 
     def threshold(self, method: DenseMethod, square_of_scale: Value) -> Value:
         """Return the square of the threshold, from that of the method's scale of D."""
@@ -159,9 +174,25 @@ class DenseMatrices:
     def row(self, name: str, i: Operand = 0) -> MatrixRow:
         """Return row i of a matrix."""
         f, registers = self.f, self.layout.registers[name]
-        start, stride = self.module.places[f"dense {name}"] * f.width, registers * self.vector
+        start, stride = self.module.places[f"{self.layout.prefix} {name}"] * f.width, registers * self.vector
         place = f.like(i, INT, 1) * stride + start if isinstance(i, Value) else int(i) * stride + start
         return MatrixRow(self, f.at(f.given["work"], place), registers)
+
+    def gather(self, name: str, places: Value, to: MatrixRow):
+        """Copy a row of a matrix that differs from lane to lane."""
+        f, registers = self.f, self.layout.registers[name]
+        if f.width == 1:
+            source = self.row(name, places)
+
+            def copy(r: Operand):
+                to[r] = source[r]
+
+            self.over_registers(registers, copy)
+            return
+        sources = [self.row(name, f.lane(places, f.const(k, INT))).address for k in range(f.width)]
+        with f.each(registers * self.vector // f.width) as j:
+            for k, source in enumerate(sources):
+                f.store(f.load(source, j * f.width + k), to.address, j * f.width + k)
 
     def over_registers(self, registers: int, do: Callable[[Operand], None]):
         """Do something with each register of a row: written out, or in rounds of several."""

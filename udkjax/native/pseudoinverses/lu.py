@@ -1,0 +1,59 @@
+"""D^(-1) of a square matrix by LU with partial pivoting: of a singular one it is no number, or a rounding error's reciprocal."""
+
+from dataclasses import dataclass
+
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
+from udkjax.native.pseudoinverses.qr import reversed_each
+
+
+@dataclass(frozen=True)
+class LUCode(DenseMethod):
+    """P D = L U: rows of `upper` are the pivot rows as they were taken; row k of `lower`, what step k took of each other row."""
+
+    def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
+        return {
+            "upper": (m, n),
+            "lower": (m, m),
+            "inverse": (1, m),
+            "order": (1, m),
+            "unused": (1, m),
+            "y": (1, m),
+        }
+
+    def factor(self, d: DenseMatrices):
+        f, unused = d.f, d.row("unused")
+        in_register = max(d.vector // f.width, 1)  # columns
+        with f.each(d.m) as i:
+            unused.put(i, d.wide(1.0))
+        with f.each(d.m) as k:
+            best, pivot = f.variable(-1.0), f.variable(0.0)
+            with f.each(d.m) as i:
+                size = f.select(unused.entry(i) > 0.5, f.abs(d.row("D", i).entry(k)), -1.0)
+                larger = size > best.value
+                pivot.where(larger, d.number(i))
+                best.where(larger, size)
+            upper, lower = d.row("upper", k), d.row("lower", k)
+            d.gather("D", d.whole(pivot.value), upper)
+            inverse = 1.0 / upper.entry(k)
+            d.row("inverse").put(k, inverse)
+            d.row("order").put(k, pivot.value)
+            with f.each(d.m) as i:
+                row = d.row("D", i)
+                left = f.select(d.number(i).is_(pivot.value), 0.0, unused.entry(i))
+                unused.put(i, left)
+                factor = f.select(left > 0.5, row.entry(k) * inverse, 0.0)
+                lower.put(i, factor)
+                with f.if_(f.any_of(factor.is_not(0.0))):
+                    wide = d.spread(-factor)
+                    with f.each(row.registers, f.arithmetic("div", k, in_register)) as r:
+                        row[r] = f.fma(wide, upper[r], row[r])
+
+    def solve(self, d: DenseMatrices):
+        f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
+        with f.each(d.m) as k:
+            found = b.at(d.whole(d.row("order").entry(k)))
+            y.put(k, found)
+            d.axpy(-found, d.row("lower", k), b)
+        x.clear()
+        with reversed_each(d, d.m) as k:  # what lies left of the diagonal meets coordinates that are still zero
+            x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))
