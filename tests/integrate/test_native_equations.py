@@ -16,6 +16,7 @@ from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import NativeEquations
 from udkjax.integrate.projection import Projection
+from udkjax.native.primitive import FEW
 
 METHODS = [udk.Auto(), udk.Elimination(), udk.SVD(), udk.Varga(), udk.Householder(), udk.GramSchmidt(), udk.Greville()]
 FORMULATIONS = [udk.NullSpaceQR(), udk.NullSpaceSVD(), udk.Augmented(udk.SVD())]
@@ -102,6 +103,22 @@ def test_drivers_and_forces(kind, stabilization):
 @pytest.mark.parametrize("angle", [-0.7, pytest.param(np.pi / 2, marks=pytest.mark.slow)])
 def test_redundant_rows(angle):
     agree(udk.library.parallelogram(angle=angle, angular_velocity=0.7), METHODS + FORMULATIONS, closed=True)
+
+
+def test_what_is_no_number_does_not_last():
+    """A state whose velocity is none, and the same mechanism after it, in the same lane: of several, or the only one."""
+    mechanism, t = udk.library.four_bar(), jnp.zeros(())
+    state = udk.assemble(mechanism)
+    q, v = state.q.ravel(), state.v.ravel()
+    for chosen in (*METHODS[2:], *FORMULATIONS, udk.Augmented()):
+        native, _ = both(mechanism, chosen)
+        expected = native.accelerations(t, q, v)
+        for members in (FEW, 5 * FEW):
+            missing = np.arange(members) < members // 2
+            vs = jnp.where(missing[:, None], jnp.nan, v)
+            a = np.asarray(jax.vmap(lambda v, e=native: e.accelerations(t, q, v))(vs))
+            assert np.isnan(a[missing]).all(), chosen
+            assert_allclose(a[~missing], jnp.broadcast_to(expected, a[~missing].shape), rtol=1e-12, atol=1e-12, err_msg=str(chosen))
 
 
 def test_a_singular_configuration():

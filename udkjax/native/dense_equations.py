@@ -87,6 +87,7 @@ class DenseEquations:
         """Return D^+ W b, with b in an array."""
         d = DenseMatrices(self._layout, f)
         b = d.row("b")
+        b.clear()  # what fills the last register has been multiplied by what was no number, perhaps
         with f.each(d.m) as i:
             b.put(i, self._array(f, right, i + start) * self._array(f, "weights", i))
         f.call(SOLVE, f.given["work"])

@@ -227,6 +227,7 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
 
     def solve_rows(self, d: DenseMatrices):
         f, of = d.f, DenseMatrices(self._rows, d.f)
+        of.row("b").clear()
         with f.each(of.m) as i:
             of.row("D", i).clear()
             of.row("b").put(i, self.right(f, i))
@@ -240,6 +241,7 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
             with f.each(of.steps) as j:
                 row.put(j, of.row("D", j).entry(i) * d.sqrt(of.row("lengths").entry(j)))
         pivoted_qr(d, lambda _: d.wide(0.25))  # lengths are one, or zero of those that do not count
+        d.row("b").clear()
         with f.each(d.m) as i:
             d.row("b").put(i, of.row("x").entry(i))
 
