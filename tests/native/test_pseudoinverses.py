@@ -39,7 +39,7 @@ class Solver(Memory):
         self.plan = plan
         self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
         self.places.add("fallback_tol")
-        layout = DenseLayout(self, code)
+        layout = DenseLayout(self, code.matrices(m, n), (m, n))
         functions = []
         for name in ("index", "factor", "solve"):
             f = Function(name, [(POINTER, "work")], width)
