@@ -103,26 +103,6 @@ def line(axes, label) -> np.ndarray:
 TS = np.linspace(0, 1, 5)
 
 
-def test_singular_values_and_their_threshold(axes):
-    values = np.array([3.0, 2.0, 1.0, 1e-17]) * np.ones((5, 1))
-    assert plots.draw_singular_values(axes, TS, values, rank_tol=1e-4, least=2, unit="kg$^{-1/2}$") is axes
-    np.testing.assert_allclose(line(axes, "σ4")[:, 1], 1e-17)
-    np.testing.assert_allclose(line(axes, "threshold")[:, 1], 3e-4)
-    assert axes.get_yscale() == "log" and axes.get_ylabel() == "singular value (kg$^{-1/2}$)" and axes.get_xlabel() == "time (s)"
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["σ3", "σ4", "threshold"]
-
-
-def test_ranks_of_several_runs_are_apart(axes):
-    assert plots.draw_rank(axes, TS, {"one": 11 * np.ones(5), "two": np.array([11, 11, 12, 12, 12])}) is axes
-    assert np.all(line(axes, "two")[:, 1] - line(axes, "one")[:, 1] > 0) and line(axes, "one")[0, 1] == pytest.approx(11, abs=0.1)
-
-
-def test_work_and_precision(axes):
-    assert plots.draw_work_precision(axes, {"A": ([10, 100], [1e-3, 1e-6]), "B": ([20, 50], [1e-2, 1e-4])}) is axes
-    np.testing.assert_allclose(line(axes, "A"), [[10, 1e-3], [100, 1e-6]])
-    assert len({one.get_marker() for one in axes.lines}) == 2 and axes.get_xscale() == axes.get_yscale() == "log"
-
-
 @pytest.fixture
 def sweep_data():
     data = xarray.Dataset(coords={"mass": ("mass", [1.0, 2.0, 3.0], {"units": "kg"}), "rtol": [1e-8, 1e-6]})
@@ -131,18 +111,12 @@ def sweep_data():
     return data
 
 
-def test_heat_maps_and_failure_maps(axes, sweep_data):
+def test_heat_maps(axes, sweep_data):
     assert plots.draw_sweep(axes, sweep_data, "violation") is axes
     mesh: Any = axes.collections[0]
     np.testing.assert_array_equal(np.asarray(mesh.get_array()).ravel(), np.arange(6.0))
     assert (axes.get_ylabel(), axes.get_xlabel()) == ("mass (kg)", "rtol")
     assert mesh.colorbar.ax.get_ylabel() == "violation (m)"
-    other = Figure().subplots()
-    assert plots.draw_failures(other, sweep_data) is other
-    mesh = other.collections[0]
-    colours = mesh.cmap(mesh.norm(mesh.get_array()))
-    assert len({tuple(c) for c in colours.reshape(-1, 4)}) == 2
-    assert "drift" in [text.get_text() for text in mesh.colorbar.ax.get_yticklabels()]
     one = Figure().subplots()
     plots.draw_sweep(one, sweep_data.isel(rtol=0), "violation")
     np.testing.assert_array_equal(one.lines[0].get_ydata(), [0, 2, 4])
@@ -157,17 +131,6 @@ def test_reactions_and_their_uniqueness(axes):
     np.testing.assert_allclose(line(axes, "A")[:, 1], 5)
     np.testing.assert_allclose(line(axes, "B (not unique)")[:, 1], 10)
     assert axes.lines[1].get_linestyle() == ":" and axes.get_ylabel() == "force of a joint (N)"
-
-
-def test_a_mode_swings_by_its_part_of_the_size(axes, linkage):
-    shape = np.zeros((4, 3))
-    shape[3, 0] = -5.0  # the coupler moves to the left
-    assert plots.draw_mode(axes, linkage, linkage.q0, shape, swing=0.1) is axes
-    lines = [np.asarray(one.get_xydata()) for one in axes.lines[:-1]]
-    assert len(lines) == 12
-    size = np.ptp(np.concatenate(lines[:4]), axis=0).max()
-    np.testing.assert_allclose(lines[7] - lines[3], [[-0.1 * size, 0]] * len(lines[3]), rtol=0.02, atol=1e-12)
-    np.testing.assert_allclose(lines[11] - lines[3], lines[3] - lines[7])
 
 
 def test_coupler_curves_begin_at_a_mark(axes):
@@ -219,9 +182,6 @@ def test_curves_are_told_apart_in_print():
     """Two curves on the same axes differ by their dashes or marks, or by how light they are."""
     three = {"A": {"b": np.ones((5, 3))}, "B": {"b": np.ones((5, 3))}, "C": {"b": np.ones((5, 3))}}
     cases: list[Any] = [
-        (plots.draw_singular_values, TS, np.ones((5, 4)), 1e-4),
-        (plots.draw_rank, TS, {"a": TS, "b": TS, "c": TS}),
-        (plots.draw_work_precision, {name: ([1, 2], [1, 2]) for name in "abcdefg"}),
         (plots.draw_reactions, TS, three),
         (plots.draw_coupler_curves, {name: np.ones((5, 2)) for name in "abcd"}),
         (plots.draw_energy, TS, Energy(jnp.asarray(TS), jnp.asarray(TS))),

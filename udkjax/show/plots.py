@@ -28,7 +28,6 @@ from udkjax.study.accuracy import largest_violation
 with OptionalImport():
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
 
 if TYPE_CHECKING:
     import xarray
@@ -44,9 +43,6 @@ __all__ = [
 ]  # and every function that draws
 WIDE_SCENE_RATIO = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
 SMALLEST_VIOLATION = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
-SMALLEST_SINGULAR_VALUE = 1e-18  # singular values below it are drawn as it
-RANK_SHIFT = 0.06  # between the ranks of several runs
-SMALL_DISPLACEMENT = 1e-6  # m, rad: a displacement of a mode at which its points move as its derivative says
 SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
 
 
@@ -135,54 +131,6 @@ def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
     return axes
 
 
-def draw_singular_values(
-    axes: Axes, ts: ArrayLike, values: Float[ArrayLike, "T k"], rank_tol: float | None = None, least: int = 3, unit: str = ""
-) -> Axes:
-    """Draw the `least` smallest singular values in colours and the others in grey; dashed: rank_tol times the largest.
-
-    `unit`: that of D is kg$^{-1/2}$; those of `udk.singular_values` have none.
-    """
-    values = np.maximum(np.asarray(values, float), SMALLEST_SINGULAR_VALUE)
-    count = values.shape[1]
-    first = max(count - least, 0)
-    for k in range(first):
-        axes.semilogy(ts, values[:, k], color="0.7", lw=0.8)
-    for k in range(first, count):
-        style = DASHES[(k - first) % len(DASHES)]
-        axes.semilogy(ts, values[:, k], style, color=COLOURS[(k - first) % len(COLOURS)], lw=1.3, label=f"σ{k + 1}")
-    if rank_tol is not None:
-        axes.semilogy(ts, rank_tol * values[:, 0], color="black", lw=0.8, ls=(0, (6, 3)), label="threshold")
-    axes.set(xlabel="time (s)", ylabel=f"singular value ({unit})" if unit else "singular value")
-    legend(axes)
-    return plain(axes)
-
-
-def draw_rank(axes: Axes, ts: ArrayLike, ranks: Mapping[str, ArrayLike] | ArrayLike) -> Axes:
-    """Draw the rank over time; of several runs under their labels, a little apart."""
-    several = ranks if isinstance(ranks, Mapping) else {"": ranks}
-    for k, (label, values) in enumerate(several.items()):
-        shift = RANK_SHIFT * (k - (len(several) - 1) / 2)
-        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "ls": DASHES[k % len(DASHES)], "lw": 1.4}
-        axes.step(np.asarray(ts), np.asarray(values, float) + shift, where="post", label=label, **style)
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="time (s)", ylabel="rank")
-    if isinstance(ranks, Mapping):
-        legend(axes)
-    return plain(axes)
-
-
-def draw_work_precision(
-    axes: Axes, curves: Mapping[str, tuple[Any, Any]], work: str = "right-hand sides", error: str = "error (m, rad)"
-) -> Axes:
-    """Draw the error against the work of runs at several tolerances: (work, error) of each method under its name."""
-    for k, (name, (effort, errors)) in enumerate(curves.items()):
-        colour, mark = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
-        axes.loglog(effort, errors, marker=mark, ms=4.5, mfc="white", lw=1, color=colour, label=name)
-    axes.set(xlabel=work, ylabel=error)
-    legend(axes)
-    return plain(axes)
-
-
 def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
     """Draw a number of each member of a sweep over its axes: a heat map of two of them, a line over one; grey: no value.
 
@@ -192,14 +140,6 @@ def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
     drawn = sweep_figures.draw_panel(axes, data, name)
     if drawn is not None:
         axes.figure.colorbar(drawn, ax=axes, label=sweep_figures.words(data, name))
-    return axes
-
-
-def draw_failures(axes: Axes, data: "xarray.Dataset") -> Axes:
-    """Draw how each member of a sweep ended, over its axes: a colour for each `Result`, successes in grey."""
-    drawn = sweep_figures.draw_panel(axes, data, sweep_figures.RESULT_VARIABLE)
-    if drawn is not None:
-        sweep_figures.name_results(axes.figure.colorbar(drawn, ax=axes))
     return axes
 
 
@@ -228,31 +168,6 @@ def draw_reactions(
     axes.set_ylim(bottom=0)
     legend(axes)
     return plain(axes)
-
-
-def draw_mode(
-    axes: Axes, mech: Mechanism, q: Float[ArrayLike, "bodies 3"], shape: Float[ArrayLike, "bodies 3"], swing: float = 0.1
-) -> Axes:
-    """Draw a mode of vibration: the mechanism at rest, in grey, and at both ends of its swing.
-
-    Args:
-        axes: where.
-        mech: what vibrates.
-        q: coordinates at rest (m, m, rad).
-        shape: the displacement of each body, of any size.
-        swing: how far the points that hold bodies move at most, as a part of the mechanism's size.
-    """
-    q, shape, held = np.asarray(q, float), np.asarray(shape, float), attachments(mech)
-    rest = np.concatenate([to_ground(held[body], q[k]) for k, body in enumerate(mech.bodies)] + [held[GROUND], q[:, :2]])
-    tiny = SMALL_DISPLACEMENT * shape / np.abs(shape).max()
-    moved = [to_ground(held[body], q[k] + tiny[k]) - to_ground(held[body], q[k]) for k, body in enumerate(mech.bodies)]
-    scale = swing * np.ptp(rest, axis=0).max() / np.abs(np.concatenate([*moved, tiny[:, :2]])).max()
-    for sign, colour, style in ((0, "0.6", "-"), (1, COLOURS[0], "-"), (-1, COLOURS[1], "--")):
-        for k, body in enumerate(mech.bodies):
-            x, y = to_ground(outline(held[body]), q[k] + sign * scale * tiny[k]).T
-            axes.plot(x, y, style, color=colour, lw=2.2 if sign else 3.4, solid_capstyle="round", zorder=2 + abs(sign))
-    axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
-    return _plane(axes)
 
 
 def draw_coupler_curves(axes: Axes, curves: Mapping[str, Float[ArrayLike, "T 2"]]) -> Axes:

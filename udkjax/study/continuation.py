@@ -24,10 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.printing import PrintsWords
-from udkjax.study.control_flow import ControlFlow
+from udkjax.study.control_flow import ControlFlow, sequential
 from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, across
 from udkjax.study.curve import AbstractCurve
-from udkjax.study.sequential import sequential
 
 FIRST, LONGEST, SHORTEST = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
 LARGEST_BEND = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more

@@ -4,16 +4,20 @@ What JAX compiles takes seconds before it takes its first step; NumPy begins at 
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from udkjax.equations.structure import ArrayLibrary
+from udkjax.scene.fields import is_traced, is_within_jit
 
 State = TypeVar("State")
+Result = TypeVar("Result")
 
 
 class ControlFlow(NamedTuple):
@@ -26,6 +30,7 @@ class ControlFlow(NamedTuple):
     map: Callable[..., Any]
     vmap: Callable[[Callable[..., Any]], Callable[..., Any]]  # of one argument
     put: Callable[[Any, Any, Any], Any]  # an array with another value at an index; the array before is not used again
+    call: Callable[..., Any]  # a function written for JAX, of some arguments
 
 
 def _while_loop(condition: Callable[[State], Any], body: Callable[[State], State], state: State) -> State:
@@ -72,5 +77,52 @@ def _at(array: jax.Array, index: Any, value: Any) -> jax.Array:
     return array.at[index].set(value)
 
 
-BY_JAX = ControlFlow(jnp, jax.lax.while_loop, jax.lax.cond, jax.lax.scan, jax.lax.map, jax.vmap, _at)
-BY_NUMPY = ControlFlow(np, _while_loop, _cond, _scan, _map, _vmap, _put)
+@eqx.filter_jit
+def _compiled(function: Callable[..., Result], *given: Any) -> Result:
+    return function(*given)
+
+
+def _call(function: Callable[..., Result], *given: Any) -> Result:
+    return function(*given)
+
+
+def _call_compiled(function: Callable[..., Result], *given: Any) -> Result:
+    return jax.tree.map(np.asarray, _compiled(function, *given))
+
+
+BY_JAX = ControlFlow(jnp, jax.lax.while_loop, jax.lax.cond, jax.lax.scan, jax.lax.map, jax.vmap, _at, _call)
+BY_NUMPY = ControlFlow(np, _while_loop, _cond, _scan, _map, _vmap, _put, _call_compiled)
+
+
+def solve(function: Callable[..., Result], *given: Any) -> Result:
+    """Return function(*given, by), where `by` is NumPy's control flow if all is known, else JAX's in one compiled program."""
+    if is_traced(given):
+        return _compiled(_by_jax, function, *given)
+    with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
+        known = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, given)
+        return jax.device_put(function(*known, BY_NUMPY))
+
+
+def _by_jax(function: Callable[..., Result], *given: Any) -> Result:
+    return function(*given, BY_JAX)  # which is told by its identity: given to a compiled function it would be another one
+
+
+def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:
+    """Return function(*arguments), pytrees of arrays and choices; under `vmap`, of one member after another.
+
+    Side by side, all members of a loop would take as many steps as the slowest. Without derivatives.
+    """
+    arrays, choices = eqx.partition(arguments, eqx.is_array)
+
+    @jax.custom_batching.custom_vmap
+    def each(arrays: PyTree) -> Result:
+        return function(*eqx.combine(arrays, choices))
+
+    @each.def_vmap
+    def _(axis_size: int, batched: PyTree, arrays: PyTree) -> tuple[Result, PyTree]:
+        del axis_size
+        moving, shared = eqx.partition(arrays, batched[0])
+        found = jax.lax.map(lambda moving: each(eqx.combine(moving, shared)), moving)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return each(arrays)

@@ -19,14 +19,13 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import is_traced, is_within_jit, library_for, number, stored
+from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Driven
-from udkjax.study.linearization import Linearization, linearize, linearize_by, load_scale_by, with_unit_mass
+from udkjax.study.linearization import Linearization, linearize, with_unit_mass
 from udkjax.study.positions import distinct, random_positions
-from udkjax.study.sequential import sequential
 
 MAX_STEPS = 100
 FORCE_TOL = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
@@ -131,12 +130,7 @@ def equilibrium(
     free = degrees_of_freedom(analysis)
     t = number(t)
     q = close(mechanism, t, state, analysis=analysis).state.q
-    given = mechanism.without_origin, analysis, t, number(library_for(q).ravel(q))
-    if is_traced(given) or is_within_jit():
-        return _compiled(*given, free, stable)
-    at, start = np.asarray(t), np.asarray(given[-1])
-    with np.errstate(all="ignore"):
-        return jax.device_put(_equilibrium(given[0], analysis, at, start, free, stable, BY_NUMPY))
+    return solve(_equilibrium, mechanism.without_origin, analysis, t, number(library_for(q).ravel(q)), free, stable)
 
 
 @checked
@@ -179,25 +173,19 @@ def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:
     return xp.linalg.eigvalsh(0.5 * (K + K.T)) if len(K) else xp.zeros(0)
 
 
-@eqx.filter_jit
-def _compiled(
-    mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], start: Float[Array, "n"], free: int, stable: bool
-) -> Equilibrium:
-    return _equilibrium(mechanism, analysis, t, start, free, stable, BY_JAX)
-
-
 def _equilibrium(
     mechanism: Mechanism, analysis: Analysis, t: Any, start: Any, free: int, stable: bool, by: ControlFlow
 ) -> Equilibrium:
     curve = _rest_curve(mechanism, analysis, by)
-    scale = load_scale_by(by, mechanism, analysis.scales, t, start)
+    scale = by.call(load_scale, mechanism, analysis.scales, t, start)
     if by is BY_NUMPY:
         q = _settle(curve, mechanism, analysis, scale, t, start, free, stable)
     else:
         q = sequential(_settle, *stop_gradients((curve, mechanism, analysis, scale, t, start)), free, stable)
         assert isinstance(curve, Curve)
         q = _rest_position(curve, analysis, t, q, free)
-    xp, at, scale = by.xp, linearize_by(by, mechanism, analysis, free, t, q), load_scale_by(by, mechanism, analysis.scales, t, q)
+    xp, scale = by.xp, by.call(load_scale, mechanism, analysis.scales, t, q)
+    at = by.call(linearize, mechanism, analysis, free, t, q)
     left = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
     balanced = curve.is_closed(xp.append(q, t) / curve.units) & (left <= FORCE_TOL)
     neutral, bodies = SMALLEST_STIFFNESS * scale.stiffness, mechanism.body_names
@@ -220,7 +208,7 @@ def _settle(
     by, xp = curve.by, curve.by.xp
 
     def at(q: Float[Array, "n"]) -> Linearization:
-        return linearize_by(by, mechanism, analysis, free, t, q)
+        return by.call(linearize, mechanism, analysis, free, t, q)
 
     def body(state: Settling) -> Settling:
         q, here, k, _ = state

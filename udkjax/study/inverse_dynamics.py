@@ -12,7 +12,7 @@ joints take what drivers do not: with one degree of freedom the branch's own dir
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, Protocol, TypeAlias
 
 import equinox as eqx
@@ -37,7 +37,6 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import StateHistory
 from udkjax.study.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
-from udkjax.study.free_directions import free_part
 from udkjax.study.kinematics import Kinematics, kinematics
 
 
@@ -203,7 +202,7 @@ def _efforts(
         q, v, a = q.ravel(), v.ravel(), a.ravel()
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
-        free, known = free_part(J), jnp.asarray(True)
+        free, known = _free_part(J), jnp.asarray(True)
         missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
         if analysis.rank is not None:  # else it is not known how many directions there are
             deficient = SVD(RANK_TOL).plus(J).rank < analysis.rank if len(J) else jnp.asarray(False)
@@ -221,3 +220,11 @@ def _efforts(
         return jnp.where(known, f, jnp.nan), C @ v, left
 
     return jax.vmap(at)(ts, q, v, a)
+
+
+def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
+    """Return x -> (I - J^+ J) x for vectors (n,) or columns (n, k): what no row of J sees; differentiable."""
+    if not len(J):
+        return lambda x: x
+    plus = SVD(RANK_TOL).plus(J)
+    return lambda x: x - plus @ (J @ x)

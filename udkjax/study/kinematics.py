@@ -1,15 +1,14 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
-from typing import Any, TypeAlias, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
@@ -21,10 +20,10 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import Numbers, is_within_jit, library_for, number, stored
+from udkjax.scene.fields import Numbers, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.continuation import Points, Reached, follow, no_points
-from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.study.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.study.curve import Curve, KnownCurve
 from udkjax.study.drive import Drive, Driven, drive
 from udkjax.study.position_derivatives import with_derivative, with_derivatives
@@ -33,7 +32,6 @@ UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther w
 FULL_TURN = 2.0 * np.pi  # rad
 
 Rows: TypeAlias = Float[Array, "T n"]
-Result = TypeVar("Result")
 
 
 class Kinematics(PrintsTable):
@@ -189,7 +187,7 @@ def kinematics(
             )
     first = values[0] if isinstance(values, Tracer) else np.asarray(values)[0]
     driven, q = _start(mechanism, driver, first, state, held)
-    return _call(_kinematics, driven, q, values, rate, acceleration, mechanism.body_names)
+    return solve(_kinematics, driven, q, values, rate, acceleration, mechanism.body_names)
 
 
 @checked
@@ -202,26 +200,7 @@ def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held
     if driver is None:
         raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
     driven, q = _start(mechanism, driver, 0.0, state, held)
-    return _call(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
-
-
-def is_known(tree: PyTree) -> bool:
-    """Return whether no number is traced."""
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
-
-
-def _call(function: Callable[..., Result], driven: Driven, *given: Any) -> Result:
-    """Call a function of what is given, and of the control flow: by NumPy, where all is known, else as one compiled program."""
-    if not is_known((driven, given)):
-        return _compiled(function, driven, *given)
-    with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext():
-        driven, given = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, (driven, given))
-        return jax.device_put(function(driven, *given, BY_NUMPY))
-
-
-@eqx.filter_jit
-def _compiled(function: Callable[..., Result], driven: Driven, *given: Any) -> Result:
-    return function(driven, *given, BY_JAX)
+    return solve(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
 
 
 def _kinematics(

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,12 +20,10 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.load_scale import LoadScale, load_scale
-from udkjax.equations.scales import RANK_TOL, Scales
+from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.control_flow import BY_JAX, ControlFlow
-from udkjax.study.free_directions import null_space
 
 
 class Linearization(NamedTuple):
@@ -49,7 +46,7 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
     """
     w, root, still = analysis.scales.weights, uk.inverse_sqrt_mass(mechanism), jnp.zeros_like(q)
     F = lambda q, v: loads.force(mechanism, t, q, v)  # noqa: E731
-    V = null_space(uk.D(mechanism, t, q, w), free) if mechanism.constraints else jnp.eye(len(q))
+    V = _null_space(uk.D(mechanism, t, q, w), free) if mechanism.constraints else jnp.eye(len(q))
     if mechanism.constraints:
         D = uk.D(mechanism, t, q, w)
         plus = SVD(RANK_TOL).plus(D)
@@ -69,24 +66,14 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
     return Linearization(N, N.T @ (M[:, None] * N), N.T @ C @ N, N.T @ K @ N, N.T @ force, force, multipliers)
 
 
-def linearize_by(
-    by: ControlFlow, mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike, q: Float[Array, "n"]
-) -> Linearization:
-    """Return what `linearize` does, within a program of JAX; or, of known numbers, by a program of its own for NumPy to go on."""
-    if by is BY_JAX:
-        return linearize(mechanism, analysis, free, t, q)
-    return jax.tree.map(np.asarray, _linearize(mechanism, analysis, free, t, q))
+def _null_space(J: Float[Array, "m n"], free: int) -> Float[Array, "n free"]:
+    """Return an orthonormal basis N of `free` directions with J N = 0: right singular vectors of the smallest singular values.
 
-
-_linearize = eqx.filter_jit(linearize)
-_load_scale = eqx.filter_jit(load_scale)
-
-
-def load_scale_by(by: ControlFlow, mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Float[Array, "n"]) -> LoadScale:
-    """Return what `load_scale` does, likewise."""
-    if by is BY_JAX:
-        return load_scale(mechanism, scales, t, q)
-    return jax.tree.map(np.asarray, _load_scale(mechanism, scales, t, q))
+    Without derivatives: those of what is made with it follow where it is projected by I - J^+ J.
+    """
+    J = jax.lax.stop_gradient(J)
+    n = J.shape[1]
+    return jnp.linalg.svd(J, full_matrices=True)[2][n - free :].T if len(J) else jnp.eye(n)
 
 
 def with_unit_mass(at: Linearization, by: ControlFlow) -> tuple[Array, Array]:

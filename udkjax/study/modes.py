@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
@@ -15,11 +14,11 @@ from udkjax.integrate.assembly import State
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import is_traced, is_within_jit, library_for, number, stored
+from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.study.control_flow import ControlFlow, solve
 from udkjax.study.equilibrium import degrees_of_freedom, equilibrium
-from udkjax.study.linearization import linearize_by, solver_of_mass, with_unit_mass
+from udkjax.study.linearization import linearize, solver_of_mass, with_unit_mass
 
 
 class Modes(PrintsTable):
@@ -88,20 +87,11 @@ def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, ana
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
-    given = mechanism.without_origin, analysis, t, number(library_for(state.q).ravel(state.q))
-    if is_traced(given) or is_within_jit():
-        return _compiled(*given, free)
-    with np.errstate(all="ignore"):
-        return jax.device_put(_modes(given[0], analysis, np.asarray(t), np.asarray(given[-1]), free, BY_NUMPY))
-
-
-@eqx.filter_jit
-def _compiled(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Modes:
-    return _modes(mechanism, analysis, t, q, free, BY_JAX)
+    return solve(_modes, mechanism.without_origin, analysis, t, number(library_for(state.q).ravel(state.q)), free)
 
 
 def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, by: ControlFlow) -> Modes:
-    xp, at, rest = by.xp, linearize_by(by, mechanism, analysis, free, t, q), q.reshape(-1, 3)
+    xp, at, rest = by.xp, by.call(linearize, mechanism, analysis, free, t, q), q.reshape(-1, 3)
     if not free:
         none = xp.zeros((0, *rest.shape))
         return Modes(xp.zeros(0), none, xp.zeros(0, complex), none + 0j, rest, xp.zeros(()), mechanism.body_names)

@@ -24,9 +24,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.study.continuation import Points
+from udkjax.study.control_flow import sequential
 from udkjax.study.crossing import LAST, nodes, weights
 from udkjax.study.curve import Curve
-from udkjax.study.sequential import sequential
 
 # Of the largest (s - s*) dq/dp beside it: a residue below that is of rounding, which E^+ multiplies by a hundred at most there.
 RESIDUE = 1e-6

@@ -4,6 +4,7 @@ import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_direction
+from udkjax.equations.redundancy import choose_dispensable
 from udkjax.integrate.assembly import State, close, require_closed
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
@@ -107,22 +108,12 @@ def _dependencies(
     if here.rank == best.rank:
         return permanent, []
     # Here: the combinations that vanish, less those that vanish everywhere, each of which gives up one row.
-    spared = _choose_redundant(best.left)
+    spared = choose_dispensable([best.left])
     N = here.left
     for row in spared:
         if np.linalg.norm(N[row]) > UNIQUE_TOL:
             N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
     return permanent, dependencies(N, owners, attached)
-
-
-def _choose_redundant(N: np.ndarray) -> list[int]:
-    """Choose as many rows as N has columns, without which the others are independent, where N^T J = 0."""
-    chosen: list[int] = []
-    while N.shape[1]:
-        row = int(np.argmax(np.linalg.norm(N, axis=1)))
-        chosen.append(row)
-        N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
-    return chosen
 
 
 def _fixes(

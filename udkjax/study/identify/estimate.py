@@ -1,7 +1,6 @@
 """The result of an identification: values, their uncertainty, what the records do not show, and how it was found."""
 
 import html
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -278,7 +277,3 @@ class Estimate:
             "versions": versions(),
         }
         return plain({name: getattr(self, name) for name in same} | found)
-
-    def to_json(self) -> str:
-        """Return the same as text."""
-        return json.dumps(self.to_dict(), indent=1)
