@@ -323,15 +323,13 @@ def test_derivatives_of_positions_by_numbers_of_the_scene(name, order):
         found = udk.kinematics(mech.with_parameters({number: g}), driver, values)
         return jnp.stack([found.q[1, body, 2], found.v[1, body, 2], found.a[1, body, 2]])
 
-    def slopes(f):
-        """f, and its derivative forward and in reverse mode."""
-        return jax.jit(lambda g: (*jax.jvp(f, (g,), (1.0,)), jax.jacrev(f)(g)))
+    def reverse_and_value(f):
+        return jax.jit(jax.jacrev(lambda g: (f(g),) * 2, has_aux=True))
 
-    evaluate, h = slopes(f if order == 1 else lambda g: jax.jvp(f, (g,), (1.0,))[1]), 1e-5
+    evaluate, h = reverse_and_value(f if order == 1 else lambda g: jax.jvp(f, (g,), (1.0,))[1]), 1e-5
     with jax.debug_nans(True):
-        (_, forward, reverse), (ahead, *_), (behind, *_) = (evaluate(g) for g in (1.0, 1.0 + h, 1.0 - h))
-    np.testing.assert_allclose(forward, (ahead - behind) / (2 * h), atol=1e-8 if order == 1 else 1e-7)
-    np.testing.assert_allclose(reverse, forward, atol=1e-12 if order == 1 else 1e-10)
+        (slope, _), (_, ahead), (_, behind) = (evaluate(g) for g in (1.0, 1.0 + h, 1.0 - h))
+    np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), atol=1e-8 if order == 1 else 1e-7)
 
 
 def test_a_batch_has_a_code_for_each_member():

@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.choices import fast
 
 TURN = np.linspace(0.0, 2 * np.pi, 25)
 CASES = {
@@ -15,13 +16,9 @@ CASES = {
 }
 
 
-@pytest.fixture(params=CASES, scope="module")
-def case(request):
-    return CASES[request.param]
-
-
-def test_positions_of_known_and_of_traced_numbers(case):
-    make, driver, values = case
+@pytest.mark.parametrize("name", fast(["through meetings of branches"], CASES))
+def test_positions_of_known_and_of_traced_numbers(name):
+    make, driver, values = CASES[name]
     mechanism = make()
     known = udk.kinematics(mechanism, driver, values)
     traced = jax.jit(lambda values: udk.kinematics(mechanism, driver, values))(values)
@@ -31,8 +28,9 @@ def test_positions_of_known_and_of_traced_numbers(case):
     assert_allclose(known.a, traced.a, rtol=1e-6, atol=1e-6)
 
 
-def test_limits_of_known_and_of_traced_numbers(case):
-    make, driver, _ = case
+@pytest.mark.parametrize("name", fast(["to a toggle"], CASES))
+def test_limits_of_known_and_of_traced_numbers(name):
+    make, driver, _ = CASES[name]
     mechanism = make()
     known = udk.travel(mechanism, driver)
     traced = jax.jit(lambda shift: udk.travel(mechanism.with_parameters({"gravity": [0.0, shift]}), driver))(-9.81)

@@ -220,6 +220,7 @@ def test_frequencies_have_exact_derivatives(name):
     np.testing.assert_allclose(exact, differences, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_batch_of_equilibria_has_a_code_for_each_member():
     mech = spring_four_bar()
     stiffness = np.linspace(1.0, 100.0, 1000)

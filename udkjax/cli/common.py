@@ -57,7 +57,7 @@ def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[s
 
 
 def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> tuple["Mechanism", str]:
-    """Read a scene and its text, or say everything that is wrong with it and exit; the options are those of `read_mjcf`."""
+    """Read a scene and its text; the options are those of `read_mjcf`."""
     import udkjax as udk
     from udkjax.scene import MjcfWarning
 
@@ -70,8 +70,6 @@ def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> 
         return mechanism, scene.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {scene}: {problem}")
-    except udk.SceneError as problem:
-        refuse(problem)
 
 
 def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":

@@ -1,6 +1,6 @@
 """`udkjax diagnose`."""
 
-from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
+from udkjax.cli.common import Json, Scene, fail, load, output_times, show
 
 
 def diagnose(
@@ -20,13 +20,8 @@ def diagnose(
 
     import udkjax as udk
 
-    run = None
-    try:
-        if ts is not None:
-            run = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10, throw=False)
-        found = udk.diagnose(mech, solution=run, t=t, fixes=fixes)
-    except udk.AssemblyError as problem:
-        refuse(problem)
+    run = None if ts is None else udk.simulate(mech, ts, rtol=1e-10, atol=1e-10, throw=False)
+    found = udk.diagnose(mech, solution=run, t=t, fixes=fixes)
     show(found.to_dict(), str(found), json)
     if run is not None and run.result:
         fail(run.cause)

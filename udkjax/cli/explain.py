@@ -18,14 +18,12 @@ def explain(scene: Scene, /, t: float = 0.0, json: Json = False) -> None:
     mech, _ = load(scene)
     import udkjax as udk
 
-    try:
-        state = udk.assemble(mech)
-        if t > 0:
+    state = udk.assemble(mech)
+    if t > 0:
+        try:
             run = udk.simulate(mech, [0.0, t], state, rtol=1e-10, atol=1e-10)
-            state = udk.State(run.q[-1], run.v[-1])
-        found = udk.explain(mech, t, state)
-    except udk.AssemblyError as problem:
-        refuse(problem)
-    except udk.SimulationError as problem:
-        refuse(f"--t {t:g}: {problem}")
+        except udk.SimulationError as problem:
+            refuse(f"--t {t:g}: {problem}")
+        state = udk.State(run.q[-1], run.v[-1])
+    found = udk.explain(mech, t, state)
     show(found.to_dict(), str(found), json)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from udkjax.cli.common import Json, Quiet, Scene, fail, load, refuse, show
+from udkjax.cli.common import Json, Quiet, Scene, fail, load, show
 from udkjax.cli.datasets import check_folder
 
 if TYPE_CHECKING:
@@ -90,12 +90,9 @@ def identify(
     records = options.records(data, noise, ignore, estimate_initial_state)
     profiled = options.profiled(profile)
     if options.problems:
-        refuse(udk.IdentificationError(options.problems))
-    try:
-        estimate = udk.identify(mech, records, options.parameters, progress=False if quiet else None, **settings)
-        profiles = [estimate.profile(name) for name in profiled]
-    except (udk.IdentificationError, udk.AssemblyError) as problem:
-        refuse(problem)
+        raise udk.IdentificationError(options.problems)
+    estimate = udk.identify(mech, records, options.parameters, progress=False if quiet else None, **settings)
+    profiles = [estimate.profile(name) for name in profiled]
     several = {"parameters": parameters, "noise": noise, "guess": guess, "bounds": bounds, "prior": prior, "ignore": ignore}
     given = {name: [item for group in groups for item in group] for name, groups in several.items()}
     results = estimate.to_dict() | {

@@ -40,10 +40,7 @@ def inverse(
     from udkjax.show.summary import format_error, format_peak, table
     from udkjax.study.drive import element_of
 
-    try:
-        found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
-    except udk.SceneError as problem:
-        refuse(problem)
+    found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
     efforts = {name: np.asarray(x) for name, x in found.efforts.items()}
     power = np.asarray(found.power)
     lines: dict[str, str] = {}

@@ -12,8 +12,6 @@ from udkjax.extras import OptionalImport
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from udkjax import Mechanism
-
 with OptionalImport():
     import tyro
 
@@ -54,15 +52,13 @@ def kinematics(
 
     import udkjax as udk
     from udkjax.show.summary import table
+    from udkjax.study.drive import value_of
 
-    try:
-        travel = udk.travel(mech, driver)
-        first = _default(first, float(travel.lower), _value(mech, driver))
-        last = _default(last, float(travel.upper), first + 2 * math.pi)
-        found = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
-        others = udk.branches(mech, driver, first) if branches else None
-    except udk.SceneError as problem:
-        refuse(problem)
+    travel = udk.travel(mech, driver)
+    first = _default(first, float(travel.lower), float(value_of(mech, driver)(udk.assemble(mech).q)))
+    last = _default(last, float(travel.upper), first + 2 * math.pi)
+    found = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
+    others = udk.branches(mech, driver, first) if branches else None
     names = [udk.Reached(int(code)).name for code in np.asarray(found.status)]
     reached = int(np.sum(np.asarray(found.reached)))
     free = math.isinf(float(travel.lower)) and math.isinf(float(travel.upper))
@@ -116,11 +112,3 @@ def _default(given: float | None, limit: float, otherwise: float) -> float:
     if given is not None:
         return given
     return limit if math.isfinite(limit) else otherwise
-
-
-def _value(mech: "Mechanism", driver: str) -> float:
-    """The value of a coordinate where the mechanism starts."""
-    import udkjax as udk
-    from udkjax.study.drive import value_of
-
-    return float(value_of(mech, driver)(udk.assemble(mech).q))

@@ -2,15 +2,14 @@
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, fail, load, refuse, say, show
+from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, load, refuse, say, show
 from udkjax.cli.datasets import check_folder
 
 if TYPE_CHECKING:
@@ -55,49 +54,29 @@ def sweep(
     if scheduler is not None and engine == "devices":
         refuse("--scheduler is for --engine dask")
     mech, text = load(scene)
-    arguments = _arguments(grid)
 
     from udkjax.study.sweep.dimensions import SweepError
-    from udkjax.study.sweep.executors import ClusterError
-    from udkjax.study.sweep.store import StoreError
+    from udkjax.study.sweep.executors import start_client
+    from udkjax.study.sweep.grid import load_grid
 
+    try:
+        arguments = load_grid(grid)
+    except OSError as problem:
+        refuse(f"cannot read {grid}: {problem}")
     limit = int(memory * 2**20)
     try:
         if dry_run:
             _estimate(mech, arguments, limit, json)
             return
         assert out is not None
-        with _client(engine, scheduler) as client:
-            _sweep(
-                mech,
-                text,
-                arguments,
-                out,
-                engine=engine,
-                client=client,
-                memory=limit,
-                progress=False if quiet else None,
-                json=json,
-            )
+        with nullcontext() if engine != "dask" and scheduler is None else start_client(scheduler) as client:
+            choices = {"engine": engine, "client": client, "memory": limit, "progress": False if quiet else None}
+            _sweep(mech, text, arguments, out, json, choices)
     except SweepError as problem:
         refuse(f"{grid}: {problem}")
-    except (StoreError, ClusterError) as problem:
-        fail(problem)
     except KeyboardInterrupt:
         say(f"stopped; what is finished is in {out}, and the same command goes on from there")
         sys.exit(INTERRUPTED)
-
-
-def _arguments(grid: Path) -> dict[str, Any]:
-    """Read a grid, or say everything that is wrong with it and exit."""
-    from udkjax.study.sweep.grid import GridError, load_grid
-
-    try:
-        return load_grid(grid)
-    except OSError as problem:
-        refuse(f"cannot read {grid}: {problem}")
-    except GridError as problem:
-        refuse(str(problem))
 
 
 def _estimate(mech: "Mechanism", arguments: dict[str, Any], memory: int, json: bool) -> None:
@@ -110,7 +89,7 @@ def _estimate(mech: "Mechanism", arguments: dict[str, Any], memory: int, json: b
     show(asdict(found), estimate_summary(plan, found), json)
 
 
-def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, json: bool, **choices: Any) -> None:
+def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, json: bool, choices: dict[str, Any]) -> None:
     import udkjax as udk
     from udkjax.show.sweep_figures import save_pictures
     from udkjax.show.sweep_summary import sweep_results, sweep_summary
@@ -125,15 +104,3 @@ def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, j
     files = ["sweep.nc", *save_pictures(data, out)]
     results = {**sweep_results(data), "seconds": seconds, "folder": out, "files": files}
     show(results, f"{sweep_summary(data, seconds)}\nwrote {', '.join(files)} to {out}", json)
-
-
-@contextmanager
-def _client(engine: str, scheduler: str | None) -> Iterator[object]:
-    """Yield the client that tasks are given to; None where they are not."""
-    if engine != "dask" and scheduler is None:
-        yield None
-        return
-    from udkjax.study.sweep.executors import start_client
-
-    with start_client(scheduler) as client:
-        yield client

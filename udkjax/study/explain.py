@@ -53,27 +53,19 @@ def explain(
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)
     symbols = _symbols(mechanism.without_origin, analysis, float(t), q, v, stabilization, rank_tolerance(mechanism))
     s = {name: np.asarray(value) for name, value in symbols.items()}
-    n = len(s["a"])
-    rank = int(s["rank"])
-    null_rows = s["null"][:, np.linalg.norm(s["null"], axis=0) > 0]
+    rank, null_rows = int(s.pop("rank")), s.pop("null_rows")
     return Explanation(
         mechanism=mechanism,
         t=float(t),
         q=np.asarray(q),
         v=np.asarray(v),
         row_names=analysis.row_names,
-        **{
-            key: s[key]
-            for key in ("psi", "psi_dot", "psi_q", "gamma", "mass", "force", "weights", "D", "D_plus", "a_F", "b", "a")
-        },
-        singular_values=s["sigma"],
         rank=rank,
-        multipliers=s["multipliers"],
-        unique=s["unique"],
-        null_rows=null_rows,
-        constraint_force=-s["psi_q"].T @ s["multipliers"] if len(s["psi"]) else np.zeros(n),
+        null_rows=null_rows[:, np.linalg.norm(null_rows, axis=0) > 0],
+        constraint_force=-s["psi_q"].T @ s["multipliers"],
         gauss=_gauss(s, rank),
         checks=_checks(s),
+        **s,
     )
 
 
@@ -84,9 +76,7 @@ def _symbols(
     w, method = analysis.scales.weights, SVD(rank_tol=tol)
     psi_q = constraints.psi_q(mechanism, t, q)
     rows, columns = psi_q.shape
-    D, unique = uk.D(mechanism, t, q, w), uniqueness(mechanism, t, q, analysis)
-    null = left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None]
-    sigma = jnp.linalg.svd(D, compute_uv=False) if rows else jnp.zeros(0)
+    D = uk.D(mechanism, t, q, w)
     return {
         "psi": constraints.psi(mechanism, t, q),
         "psi_dot": constraints.psi_dot(mechanism, t, q, v),
@@ -96,15 +86,15 @@ def _symbols(
         "force": loads.force(mechanism, t, q, v),
         "weights": w,
         "D": D,
-        "sigma": sigma,
+        "singular_values": jnp.linalg.svd(D, compute_uv=False) if rows else jnp.zeros(0),
         "rank": method.rank(D) if rows else jnp.zeros((), int),
         "D_plus": method(D) if rows else jnp.zeros((columns, 0)),
         "a_F": uk.a_F(mechanism, t, q, v),
         "b": uk.b(mechanism, t, q, v, baumgarte, w),
         "a": uk.accelerations(mechanism, t, q, v, method, baumgarte, w),
         "multipliers": uk.multipliers(mechanism, t, q, v, method, baumgarte, w),
-        "unique": unique.unique,
-        "null": null,
+        "unique": uniqueness(mechanism, t, q, analysis).unique,
+        "null_rows": left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None],
     }
 
 

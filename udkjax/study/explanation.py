@@ -109,9 +109,6 @@ class Explanation(NamedTuple):
 # --- as text: the lines of each section
 
 
-# --- as text
-
-
 def _columns(mechanism: Mechanism) -> list[str]:
     return [f"{letter}{k + 1}" for k in range(len(mechanism.body_names)) for letter in ("x", "y", "th")]
 

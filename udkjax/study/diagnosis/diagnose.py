@@ -71,10 +71,7 @@ def diagnose(
     permanent, momentary = _dependencies(mechanism, here, usual, owners)
     if not around and here.right.size:  # it moves to first order only, which is what these rows leave undecided
         permanent, momentary = [], [*permanent, *momentary]
-    found = [
-        Redundancy(d.constraints, d.redundancy, True, tuple(_fixes(mechanism, positions, usual, owners, d) if fixes else ()))
-        for d in permanent
-    ]
+    found = _with_fixes(mechanism, positions, usual if fixes else [], permanent)
     found += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
     of_joints = [k for k, name in enumerate(owners) if name in mechanism.joints]
     return Diagnosis(
@@ -116,13 +113,14 @@ def _dependencies(
     return permanent, dependencies(N, owners, attached)
 
 
-def _fixes(
-    mechanism: Mechanism, positions: RankedPositions, usual: list[Configuration], owners: list[str], dependency: Dependency
-) -> list[Fix]:
-    """Return the fixes of a set; its stress is that of the first of the positions."""
-    first = max(usual, key=lambda c: c.smallest)
-    others = [c for c in usual if c is not first]
-    return fixes_of(mechanism, positions, [first, *others], owners, dependency)
+def _with_fixes(
+    mechanism: Mechanism, positions: RankedPositions, usual: list[Configuration], sets: list[Dependency]
+) -> list[Redundancy]:
+    """Return sets that depend on each other everywhere, with their fixes in some positions: none, where there are none."""
+    owners = [name for name, _ in positions.rows.names]
+    at = sorted(usual, key=lambda c: -c.smallest)  # the stress of a set is that of the first
+    fixes = [fixes_of(mechanism, positions, at, owners, one) if at else [] for one in sets]
+    return [Redundancy(one.constraints, one.redundancy, True, tuple(own)) for one, own in zip(sets, fixes, strict=True)]
 
 
 def _cure(
@@ -140,12 +138,7 @@ def _cure(
         rows = KinematicRows(current)
         here = RankedPositions(rows, positions.rank_tol)
         at, owners = [here.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
-        attached = {name: current.frames_of(element) for name, element in current.constraints.items()}
-        first = max(at, key=lambda c: c.smallest)
-        sets = [
-            Redundancy(d.constraints, d.redundancy, True, tuple(_fixes(current, here, at, owners, d)))
-            for d in dependencies(first.left, owners, attached)
-        ]
+        sets = _with_fixes(current, here, at, _dependencies(current, at[0], at, owners)[0])
     return tuple(done)
 
 

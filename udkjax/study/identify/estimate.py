@@ -26,8 +26,8 @@ from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikeliho
 from udkjax.study.identify.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import apply_values
+from udkjax.study.noise import Whiteness
 from udkjax.study.report import format_value, join_names, plain, plural
-from udkjax.study.whiteness import Whiteness
 
 if TYPE_CHECKING:
     import xarray

@@ -22,8 +22,8 @@ from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
+from udkjax.study.noise import Whiteness, whiteness_of
 from udkjax.study.progress import ProgressOption, report_progress
-from udkjax.study.whiteness import Whiteness, whiteness_of
 
 MOST_REWEIGHTINGS = 2  # fits, each with the noise that the one before left
 SAME_WEIGHT_RATIO = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error

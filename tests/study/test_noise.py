@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from udkjax.study.whiteness import whiteness_of
+from udkjax.study.noise import whiteness_of
 
 SEEDS = 300
 
