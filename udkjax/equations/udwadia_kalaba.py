@@ -8,12 +8,15 @@ A mechanism's constraints Psi(t, q) = 0, masses M and loads F give, with
 
 whatever the rank of D. These are the accelerations that satisfy the constraints, or violate them least, and that are nearest to
 a_F in the metric of M (Gauss's principle); the multipliers are those of least norm. Each symbol is a function on arrays,
-differentiable to any order, and the tests hold every faster form against it. `method` is any pseudoinverse.
+differentiable to any order, and the tests hold every faster form against it; `method` is any pseudoinverse.
 
 Rows of Psi in metres and rows in radians have singular values of different units. Weights w (m,) of the rows make them comparable
 to one another, so that one threshold of the rank serves all (`Scales.weights`: 1 for metres, a length for radians): D and b stand
-for diag(w) D and diag(w) b, which changes no solution of consistent rows, and lambda = -w (D^+)^T D^+ b. A weight of zero leaves
-its row out.
+for diag(w) D and diag(w) b, which changes no solution of consistent rows, and lambda = -w (D^+)^T D^+ b, in N and N m. A weight of
+zero leaves its row out.
+
+Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` are the gains alpha and
+beta, or None: no stabilization; `w` are the weights (m,), or None: all one.
 """
 
 import equinox as eqx
@@ -50,51 +53,19 @@ class Baumgarte(PrintsLine):
 
 
 def D(mechanism: Mechanism, t: Scalar, q: State, w: Weights = None) -> Float[Array, "m n"]:
-    """D = Psi_q M^(-1/2).
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        w: Weights of the rows (m,); None: all one.
-
-    Returns:
-        D (m, n), its rows weighted.
-    """
+    """D = Psi_q M^(-1/2)."""
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
 def a_F(mechanism: Mechanism, t: Scalar, q: State, v: State) -> Float[Array, "n"]:
-    """a_F = M^(-1) F: the accelerations without constraints.
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        v: Velocities (m/s, rad/s), in the shape of q.
-
-    Returns:
-        a_F (n,), in m/s^2 and rad/s^2.
-    """
+    """a_F = M^(-1) F: the accelerations without constraints."""
     return loads.force(mechanism, t, q, v) / loads.mass(mechanism)
 
 
 def b(
     mechanism: Mechanism, t: Scalar, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
 ) -> Float[Array, "m"]:
-    """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy.
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        v: Velocities (m/s, rad/s), in the shape of q.
-        baumgarte: Gains alpha and beta; None: no stabilization.
-        w: Weights of the rows (m,); None: all one.
-
-    Returns:
-        b (m,), its rows weighted.
-    """
+    """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
     b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v)
     if baumgarte is not None:
         b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
@@ -111,20 +82,7 @@ def accelerations(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "n"]:
-    """a = a_F + M^(-1/2) D^+ b.
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        v: Velocities (m/s, rad/s), in the shape of q.
-        method: The pseudoinverse.
-        baumgarte: Gains alpha and beta; None: no stabilization.
-        w: Weights of the rows (m,); None: all one.
-
-    Returns:
-        a (n,), in m/s^2 and rad/s^2.
-    """
+    """a = a_F + M^(-1/2) D^+ b."""
     x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
     return a_F(mechanism, t, q, v) + inverse_sqrt_mass(mechanism) * x
 
@@ -138,20 +96,7 @@ def multipliers(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "m"]:
-    """lambda = -(D^+)^T D^+ b: of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None.
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        v: Velocities (m/s, rad/s), in the shape of q.
-        method: The pseudoinverse.
-        baumgarte: Gains alpha and beta; None: no stabilization.
-        w: Weights of the rows (m,); None: all one.
-
-    Returns:
-        lambda (m,), in N for rows in metres and N m for rows in radians.
-    """
+    """lambda = -(D^+)^T D^+ b: of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
     D_plus = pseudoinverse(method, D(mechanism, t, q, w))
     return weigh(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
 
@@ -162,18 +107,6 @@ def project(
     """Return a state to the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
 
     Newton steps q - M^(-1/2) D^+ Psi are followed by one step v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        v: Velocities (m/s, rad/s), in the shape of q.
-        method: The pseudoinverse.
-        w: Weights of the rows (m,); None: all one.
-        steps: The number of Newton steps of q.
-
-    Returns:
-        q and v (n,).
     """
 
     def newton(_: Array, q: Array) -> Array:
@@ -189,19 +122,7 @@ def project(
 def tangent_part(
     mechanism: Mechanism, t: Scalar, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
 ) -> Float[Array, "n"]:
-    """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which a projection leaves.
-
-    Args:
-        mechanism: The scene.
-        t: Time (s).
-        q: Coordinates (m, rad), (n,) or (bodies, 3).
-        change: The change (n,).
-        method: The pseudoinverse.
-        w: Weights of the rows (m,); None: all one.
-
-    Returns:
-        The part of the change within the manifold (n,).
-    """
+    """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which a projection leaves."""
     matrix = D(mechanism, t, q, w)
     return change - inverse_sqrt_mass(mechanism) * (
         pseudoinverse(method, matrix) @ (matrix @ (change / inverse_sqrt_mass(mechanism)))
