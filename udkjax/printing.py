@@ -13,11 +13,11 @@ import numpy as np
 from jax.core import Tracer
 
 MOST_ROWS = 14  # of a table as text, whose title and remarks fit on a screen beside it: what is more is counted
-MOST_HTML_ROWS = 30
+MOST_HTML_ROWS = 30  # of a table in a notebook, which scrolls
 MOST_NUMBERS = 6  # numbers of an array that are written out; of more, their shape and range
 MOST_CHARACTERS = 96  # of a cell
 MOST_LINE = 400  # characters of what prints as one line
-DIGITS = 6
+DIGITS = 6  # of a number in a table: enough to compare runs by eye
 PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # of the largest number beside it: what thousands of operations leave prints as 0
 
 Plain = bool | int | float | complex | np.ndarray | np.generic

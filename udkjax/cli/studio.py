@@ -7,7 +7,7 @@ import tyro
 
 from udkjax.cli.common import Json, refuse, show
 
-MOST_PORT = 65535
+MOST_PORT = 65535  # of TCP
 
 
 def studio(

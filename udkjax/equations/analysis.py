@@ -27,6 +27,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
 from udkjax.scene.arguments import checked
+from udkjax.scene.fields import is_traced
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -166,7 +167,7 @@ def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
 def _rows_of_known_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
     """The redundant rows of a mechanism whose masses or loads are traced; None where its geometry is, too."""
     with jax.ensure_compile_time_eval():
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(_geometry(mechanism))):
+        if is_traced(_geometry(mechanism)):
             return None
         known = jax.tree.map(lambda x: np.ones(np.shape(x)) if isinstance(x, Tracer) else x, mechanism)
         return _analyse(known, structure(mechanism)).redundant_rows

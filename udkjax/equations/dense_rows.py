@@ -16,11 +16,10 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
-# Singular values of D with rows of length one at a closed position, relative to the largest. Up to half of the digits a singular
-# value counts as zero: redundant rows leave rounding errors. From `CLEAR_TOL` on it does not; the rank of a position with one in
+# Singular values of D with rows of length one at a closed position, relative to the largest. Up to the first one counts as zero:
+# redundant rows leave rounding errors in half of its digits. From the second on it does not; the rank of a position with one in
 # between, which is merely close to a singular configuration, is in doubt.
-DEPENDENT_TOL = float(np.sqrt(np.finfo(float).eps))
-CLEAR_TOL = 1e-4
+DEPENDENT_TOL, CLEAR_TOL = float(np.sqrt(np.finfo(float).eps)), 1e-4
 NEGLIGIBLE_SHARE = 1e-6  # of a combination of rows of length one: a share of a row below it is rounding
 
 

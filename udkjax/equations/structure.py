@@ -17,8 +17,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import ForceElement
+from udkjax.scene.given_elements import attached_bodies
 from udkjax.scene.joints import Constraint
-from udkjax.scene.mechanism import Mechanism, attached_bodies
+from udkjax.scene.mechanism import Mechanism
 
 Time: TypeAlias = Float[ArrayLike, ""]  # s
 TreeDef: TypeAlias = Hashable  # JAX's description of a tree without its leaves

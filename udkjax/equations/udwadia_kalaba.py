@@ -12,8 +12,8 @@ differentiable to any order, and the tests hold every faster form against it; `m
 
 Rows of Psi in metres and rows in radians have singular values of different units. Weights w (m,) of the rows make them comparable
 to one another, so that one threshold of the rank serves all (`Scales.weights`: 1 for metres, a length for radians): D and b stand
-for diag(w) D and diag(w) b, which changes no solution of consistent rows, and lambda = -w (D^+)^T D^+ b, in N and N m. A weight of
-zero leaves its row out.
+for diag(w) D and diag(w) b, which changes no solution of consistent rows, and lambda = -w (D^+)^T D^+ b, in N and N m. A weight
+of zero leaves its row out.
 
 Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` are the gains alpha and
 beta, or None: no stabilization; `w` are the weights (m,), or None: all one.

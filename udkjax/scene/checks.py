@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import FieldMetadata, Requirement, Table
+from udkjax.scene.fields import FieldMetadata, Table, is_traced
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
@@ -93,22 +93,6 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
         else:
             found.extend(check_table(entry.where, entry.cls, entry.table, known))
     return found
-
-
-def completion_mistakes(where: str, before: eqx.Module, after: eqx.Module) -> Iterator[str]:
-    """Iterate over the mistakes of the numbers that an element left to the initial guess, from what they are there."""
-    for field in dataclasses.fields(after):
-        value = getattr(after, field.name)
-        if getattr(before, field.name, None) is not None or not isinstance(value, np.ndarray | jax.Array):
-            continue
-        known = np.asarray(value, float)
-        conditions = [Requirement("must be finite", np.isfinite), *field.metadata.get("require", ())]
-        unmet = next((c.text for c in conditions if not np.all(c.holds(known))), None)
-        if unmet:
-            given = (f.name for f in dataclasses.fields(before) if isinstance(getattr(before, f.name), np.ndarray | jax.Array))
-            cure = " or ".join(["other positions of the bodies", *(f"other {name}" for name in given)])
-            found = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess, from which it is taken"
-            yield f"{found}: give it, or {cure}"
 
 
 def traced_numbers_hold(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
@@ -218,7 +202,7 @@ def find_class(path: str, choices: Mapping[str, type], table: Table) -> tuple[ty
 
 def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
     """Iterate over the mistakes of a number: its type, its shape and, where it is not traced, its value."""
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(value))
+    traced = is_traced(value)
     array = jnp.asarray(value) if traced else _as_array(value)
     fixed = all(dim.isdigit() for dim in dims)
     if array is not None and dims[-1:] == ["..."]:
@@ -320,11 +304,3 @@ def abbreviate(value: object) -> str:
     else:
         text = f"shape {value.shape}" if isinstance(value, Tracer) else str(getattr(value, "tolist", lambda: value)())
     return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."
-
-
-def check_hashable(element: eqx.Module) -> Iterator[str]:
-    """Iterate over the mistakes of the static fields of a user-written element."""
-    try:
-        hash(jax.tree.structure(element))
-    except TypeError as error:
-        yield f": static fields must be hashable ({error}): write a tuple in place of a list"

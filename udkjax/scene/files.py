@@ -13,7 +13,7 @@ from udkjax.scene.mjcf.mjcf_reader import is_xml, mechanism_of_text
 from udkjax.scene.mjcf.mjcf_writer import mjcf_text
 from udkjax.scene.toml_text import parse_toml
 
-DRAWN_VERSION = 2
+DRAWN_VERSION = 2  # of the format: drawings, of pins and links
 
 
 def load(path: str | os.PathLike[str]) -> Mechanism:

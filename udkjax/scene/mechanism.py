@@ -10,19 +10,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Scalar
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
-from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, check_hashable, completion_mistakes, problems_of
+from udkjax.scene.bodies import Body
+from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, StaticValue, given_number, is_traced, number
+from udkjax.scene.fields import Numbers, is_traced, number
 from udkjax.scene.forces import ForceElement, Friction
+from udkjax.scene.given_elements import attached_bodies, check_elements, complete, completion_mistakes, name_elements
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
-from udkjax.scene.joints import AnyConstraint, Constraint, Joint
+from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.number_fields import (
     groups_of,
     parameters_in,
@@ -32,7 +32,6 @@ from udkjax.scene.number_fields import (
     split_index,
     value_of,
 )
-from udkjax.scene.schema import table_of, type_name
 
 Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)
@@ -135,12 +134,12 @@ class Mechanism(PrintsTable):
             "driver": list((drivers or {}).items()),
             "force": list(forces.items() if isinstance(forces, Mapping) else zip(name_elements(forces), forces, strict=True)),
         }
-        found = _check_elements(given, gravity, name)
+        found = check_elements(given, gravity, name)
         self.name, self.gravity = name, number(gravity)
         self.body_names, self._bodies = _unzip(found["body"])
         known = dict(found["body"])
-        completed = {section: [(key, _complete(c, known)) for key, c in found[section]] for section in ("joint", "driver")}
-        if mistakes := _completion_mistakes(found, completed):
+        completed = {section: [(key, complete(c, known)) for key, c in found[section]] for section in ("joint", "driver")}
+        if mistakes := completion_mistakes(found, completed):
             raise SceneError(mistakes, name)
         self.joint_names, self._joints = _unzip(completed["joint"])
         self.driver_names, self._drivers = _unzip(completed["driver"])
@@ -196,7 +195,7 @@ class Mechanism(PrintsTable):
             named.append(number(np.unique(np.concatenate(held))))
         if not named:
             return None
-        known = not any(isinstance(x, Tracer) for x in named)  # and stays so while something else is traced
+        known = not is_traced(named)  # and stays so while something else is traced
         return number(np.concatenate(named)) if known else jnp.concatenate(named)
 
     @property
@@ -223,7 +222,7 @@ class Mechanism(PrintsTable):
     def at(self, t: Scalar) -> "Mechanism":
         """Return the mechanism with one interval, that at time t (s), in place of all that has samples."""
         samples = self.samples
-        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((t, samples)))
+        traced = is_traced((t, samples))
         xp, known_stays_known = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
         with known_stays_known, np.errstate(all="ignore"):
             return self.with_samples({place: with_row(x, row_at(x, t, xp)) for place, x in samples.items()})
@@ -272,7 +271,7 @@ class Mechanism(PrintsTable):
         drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
         """
         require_values(values, self.name)
-        traced = any(isinstance(value, Tracer) for value in jax.tree.leaves(dict(values)))
+        traced = is_traced(dict(values))
         origin = Origin(self) if traced and self.is_concrete else self.origin
         base, own, changed = self, values, ()
         if self.drawing is not None:
@@ -298,87 +297,8 @@ class Mechanism(PrintsTable):
         return drawing.with_groups(groups, gravity).mechanism(), own, changed
 
 
-def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
-    """Return the names of the bodies whose frames an element gets, in that order, where `joints` are those of its mechanism."""
-    if isinstance(element, Friction):
-        return joints[element.joint].frame_names
-    return element.frame_names if isinstance(element, Constraint) else element.bodies
-
-
-def _check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> dict[str, list[tuple[str, Any]]]:
-    """Return all elements with plain numbers made arrays; raise `SceneError` where anything is wrong with any of them."""
-    kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
-    problems, entries, found = [], [], {section: [] for section in given}
-    for section, items in given.items():
-        for index, (key, element) in enumerate(items):
-            if not isinstance(element, kinds[section]):
-                entry = SceneEntry(section, index, key, None, {})
-                problem = f"{entry.where}: must be of class {kinds[section].__name__}, is a {type(element).__name__}"
-                entries.append(entry._replace(problem=problem))
-                continue
-            element = jax.tree.map(_as_number, element)
-            entries.append(entry := SceneEntry(section, index, key, type(element), table_of(element)))
-            element = jax.tree.map(_as_static, element)
-            problems.extend(f"{entry.where}{problem}" for problem in check_hashable(element))
-            if section == "force" and not _has_load(type(element)):
-                problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
-            found[section].append((key, element))
-    problems.extend(problems_of(entries, gravity))
-    if problems:
-        raise SceneError(problems, name)
-    return found
-
-
-def _complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
-    if type(constraint).complete is Constraint.complete:  # most joints: spares the sines and cosines of every body
-        return constraint
-    places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
-    known = not any(isinstance(x, Tracer) for x in jax.tree.leaves((constraint, places)))
-    if known:  # NumPy has nothing to compile
-        constraint, places = jax.tree.map(np.asarray, (constraint, places))
-    frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
-    known_stays_known = jax.ensure_compile_time_eval() if known else nullcontext()  # while something else is traced
-    with known_stays_known, np.errstate(all="ignore"):
-        completed = constraint.complete(*frames)
-        return jax.tree.map(number, completed) if known else completed
-
-
-def _completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
-    """Return what is wrong with the numbers that constraints took from the initial guess; those that are traced pass."""
-    found = []
-    for section, elements in after.items():
-        for k, ((name, completed), (_, given)) in enumerate(zip(elements, before[section], strict=True)):
-            if completed is not given and not any(isinstance(x, Tracer) for x in jax.tree.leaves(completed)):
-                found.extend(completion_mistakes(f"{section} {abbreviate(name)} ({section}[{k}])", given, completed))
-    return found
-
-
-def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
-    """Name each element that has no name TYPE1, TYPE2, ... by its place among those of its type (classes or their names)."""
-    found, counts = [], {}
-    for i, element in enumerate(elements):
-        kind = element if isinstance(element, str) else type_name(type(element))
-        counts[kind] = counts.get(kind, 0) + 1
-        found.append((names[i] if names else None) or f"{kind}{counts[kind]}")
-    return found
-
-
-def _has_load(cls: type) -> bool:
-    return cls.potential is not ForceElement.potential or cls.loads is not ForceElement.loads
-
-
-def _as_number(leaf: object) -> object:
-    """Convert the plain numbers of user-written elements, which would be static."""
-    return given_number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
-
-
-def _as_static(leaf: object) -> object:
-    """Wrap a leaf that is not a number, so that it is static."""
-    return leaf if eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) else StaticValue(leaf)
-
-
 def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
-    known = not any(isinstance(x, Tracer) for x in (*vectors, *numbers))  # by NumPy: jnp takes its time for each array
+    known = not is_traced((vectors, numbers))  # by NumPy: jnp takes its time for each array
     if known:
         return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
     return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])

@@ -5,17 +5,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
-from jax.core import Tracer
 
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
-from udkjax.scene.fields import Table, vector_as_angle
-from udkjax.scene.mechanism import Mechanism, name_elements
+from udkjax.scene.fields import Table, is_traced, vector_as_angle
+from udkjax.scene.given_elements import name_elements
+from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import groups_of
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # of scenes of bodies and joints
 
 
 def mechanism_text(mechanism: Mechanism) -> str:
@@ -39,7 +38,7 @@ def mechanism_text(mechanism: Mechanism) -> str:
 
 def check_known(tree: eqx.Module, name: str) -> None:
     """Raise `SceneError` where numbers are traced: a file cannot hold them."""
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree)):
+    if is_traced(tree):
         raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], name)
 
 

@@ -103,6 +103,7 @@ class _Unit(NamedTuple):
         return _Unit(self.size * other.size**power, dimension)
 
 
+# Powers of length, mass, time and angle.
 _NONE, _LENGTH, _MASS, _TIME, _ANGLE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 _RATE, _FORCE, _TORQUE, _ACCELERATION = (0, 0, -1, 1), (1, 1, -2, 0), (2, 1, -2, 0), (1, 0, -2, 0)
 _SIZES = {

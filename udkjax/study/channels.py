@@ -27,7 +27,7 @@ from udkjax.scene.mechanism import Mechanism
 
 Needs = Literal["states", "accelerations", "reactions"]
 Point = tuple[float, float]  # in a body's own frame (m)
-_CENTRE: Point = (0.0, 0.0)
+_CENTRE: Point = (0.0, 0.0)  # of mass: the origin of a body's frame
 POINT_UNITS = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s2", "ay": "m/s2"}
 _ANGLE_UNITS = {"angle": "rad", "omega": "rad/s", "alpha": "rad/s2"}
 LOADS = {"fx": "N", "fy": "N", "torque": "N m"}

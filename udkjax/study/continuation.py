@@ -75,7 +75,7 @@ class _State(NamedTuple):
     points: Points
 
 
-_FOLD, _LANDS = -1, -2
+_FOLD, _LANDS = -1, -2  # events beside the outcomes of `Reached`
 
 
 def follow(

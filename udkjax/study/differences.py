@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 
 STEP_RATIO = 4.0  # from one step of differences to the next
 DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # of dimensionless unknowns: 0.1 to 4e-7
-RICHARDSON = STEP_RATIO**2
+RICHARDSON = STEP_RATIO**2  # ratio of the errors, of second order, of one step and the next
 NEXT_STEPS = 2  # smaller steps whose truncation does not count beside that of one; two, since one may be near by chance
-LEAST_CHANGE = 1e-2  # of what is seen: the least change that is more than that of a small step
+LEAST_CHANGE = 1e-2  # of what is seen: a step that changes less is small, however large its prediction is
 TOO_LARGE = 0.5  # of a difference: where smaller steps say otherwise by more, a step is too large
 
 

@@ -23,7 +23,7 @@ from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import Numbers, array_namespace, names, number, number_called
+from udkjax.scene.fields import Numbers, array_namespace, is_traced, names, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of, point_of_pin
@@ -83,7 +83,7 @@ class Driven(NamedTuple):
 
     def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
         """Return the value of the coordinate (rad, m) in a position: of NumPy, where all is known."""
-        if any(isinstance(x, Tracer) for x in jax.tree.leaves((self.mechanism, q))):
+        if is_traced((self.mechanism, q)):
             return psi(self.mechanism, 0.0, q)[self.row]
         return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
 
@@ -159,7 +159,7 @@ def _frame(q: Float[Array, "3"]) -> Frame:
 def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
     """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
     driver = Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete()
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((driver, frames))):
+    if is_traced((driver, frames)):
         return jnp.asarray(driver.residual(0.0, *frames)[0])
     return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
 
@@ -262,7 +262,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
 
 def _at_once(given: PyTree) -> AbstractContextManager:
     """Compute what is known at once, also while something else is traced."""
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
+    traced = is_traced(given)
     return nullcontext() if traced else jax.ensure_compile_time_eval()
 
 

@@ -34,7 +34,7 @@ from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import Mistakes, quote, suggestion
-from udkjax.scene.fields import Number, number
+from udkjax.scene.fields import Number, is_traced, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import describe
 
@@ -257,7 +257,7 @@ def _check(event: Event, mechanism: Mechanism) -> None:
     except KeyError as error:
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error
-    if not any(isinstance(x, Tracer) for x in jax.tree.leaves(event)):
+    if not is_traced(event):
         known = np.linspace(0.1, 0.9, mechanism.q0.size)
         with jax.ensure_compile_time_eval():
             found = event.condition(0.0, frames_of(mechanism.body_names, known, known))

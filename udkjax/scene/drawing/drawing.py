@@ -19,8 +19,9 @@ from udkjax.scene.drawing.mistakes import joint_names, where
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.forces import ForceElement
+from udkjax.scene.given_elements import name_elements
 from udkjax.scene.joints import Joint, Revolute
-from udkjax.scene.mechanism import AbstractDrawing, Mechanism, name_elements
+from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.scene.schema import table_of
 
 Table = Mapping[str, Any]

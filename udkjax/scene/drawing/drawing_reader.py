@@ -3,9 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from jax.core import Tracer
 
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import SceneEntry, abbreviate, check_table, gravity_mistakes, quote, suggestion
@@ -17,6 +15,7 @@ from udkjax.scene.drawing.link import Link, Pin, with_known_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
 from udkjax.scene.drawing.placement import PinLayout, Placement
 from udkjax.scene.drivers import Driver
+from udkjax.scene.fields import is_traced
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.schema import build
@@ -76,7 +75,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
         return DrawingElements(groups, gravity, problems)
     layout = PinLayout(groups["link"], fixed, groups["slide"])
     problems += layout_mistakes(layout, groups, fixed)
-    if not any(isinstance(x, Tracer) for x in jax.tree.leaves((groups["pin"], groups["link"]))):
+    if not is_traced((groups["pin"], groups["link"])):
         drawn = known_elements(groups)
         problems += shape_mistakes({name: pin.position for name, pin in drawn["pin"].items()}, drawn["link"])
         if not problems:

@@ -13,9 +13,10 @@ from udkjax.scene.joints import Revolute
 from udkjax.scene.library.posed_bodies import bodies_on_pose, unit_vector, with_known_numbers
 from udkjax.scene.mechanism import Mechanism
 
-# Masses (kg) and inertias (kg m^2) of K1 to K7, then lengths (m), as the sources name them.
+# Masses (kg) and inertias (kg m^2) of K1 to K7.
 MASSES = (0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498)
 INERTIAS = (2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5)
+# Points and lengths (m), as the sources name them.
 A, B, C = (-0.06934, -0.00227), (-0.03635, 0.03273), (0.014, 0.072)
 D, DA, E, EA, FA = 0.028, 0.0115, 0.02, 0.01421, 0.01421
 RR, RA, SS, SA, SB, SC, SD = 0.007, 0.00092, 0.035, 0.01874, 0.01043, 0.018, 0.02

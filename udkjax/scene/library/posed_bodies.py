@@ -22,7 +22,7 @@ from udkjax.scene.drawing.link import Link
 from udkjax.scene.fields import array_namespace, number
 from udkjax.scene.mechanism import Mechanism
 
-ORIGINS = ((0.0, 0.0), (0.0, 0.0))
+ORIGINS = ((0.0, 0.0), (0.0, 0.0))  # the centres of mass of two bodies, as points of a joint
 P = ParamSpec("P")
 Several: TypeAlias = ArrayLike | Sequence[ArrayLike]  # a number or several
 COMPLEX_STEP = 1e-100  # of the coordinate: its square is lost beside 1, and a rate times it is no denormal number

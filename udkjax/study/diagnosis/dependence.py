@@ -41,7 +41,7 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
             if rank > spanned.shape[1]:
                 found.append(Dependency(tuple(members), rank - spanned.shape[1]))
                 spanned = both[0][:, :rank]
-        # What no candidate was made of: without a row of what is known for each of its combinations.
+        # Combinations that no set accounts for yet: those of N that vanish in one row for each that the sets span.
         remaining = N
         rest = N @ spanned
         while rest.shape[1]:

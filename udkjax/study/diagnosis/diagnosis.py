@@ -13,7 +13,7 @@ from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
 from udkjax.study.report import plain, plural, row_label
 
-LABEL_WIDTH = 14
+LABEL_WIDTH = 14  # characters of a section's title
 MOST_FIXES = 8  # fixes of one set that are printed
 SMALLEST_POSE_NUMBER = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
 

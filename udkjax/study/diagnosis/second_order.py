@@ -17,7 +17,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
 N_STARTS = 400  # directions to look from
-ITERATIONS = 60
+ITERATIONS = 60  # of Gauss-Newton: at double zeros each halves the error, to 1e-18
 ZERO_FORM = 1e-10  # of the forms, whose coefficients are at most one
 DOUBLE_ZERO = 1e-7  # of a tangent: a double zero is known to the root of rounding
 SAME_DIRECTION = 1e-4  # rad: directions nearer than that are one

@@ -1,0 +1,122 @@
+"""Elements as they are given to a mechanism: named, checked, and with the numbers that they leave to its initial guess."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
+from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, problems_of
+from udkjax.scene.drivers import Driver
+from udkjax.scene.fields import Numbers, Requirement, StaticValue, given_number, is_traced, number
+from udkjax.scene.forces import ForceElement, Friction
+from udkjax.scene.joints import AnyConstraint, Constraint, Joint
+from udkjax.scene.schema import table_of, type_name
+
+
+def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
+    """Name each element that has no name TYPE1, TYPE2, ... by its place among those of its type (classes or their names)."""
+    found, counts = [], {}
+    for i, element in enumerate(elements):
+        kind = element if isinstance(element, str) else type_name(type(element))
+        counts[kind] = counts.get(kind, 0) + 1
+        found.append((names[i] if names else None) or f"{kind}{counts[kind]}")
+    return found
+
+
+def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
+    """Return the names of the bodies whose frames an element gets, in that order, where `joints` are those of its mechanism."""
+    if isinstance(element, Friction):
+        return joints[element.joint].frame_names
+    return element.frame_names if isinstance(element, Constraint) else element.bodies
+
+
+def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> dict[str, list[tuple[str, Any]]]:
+    """Return all elements with plain numbers made arrays; raise `SceneError` where anything is wrong with any of them."""
+    kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
+    problems, entries, found = [], [], {section: [] for section in given}
+    for section, items in given.items():
+        for index, (key, element) in enumerate(items):
+            if not isinstance(element, kinds[section]):
+                entry = SceneEntry(section, index, key, None, {})
+                problem = f"{entry.where}: must be of class {kinds[section].__name__}, is a {type(element).__name__}"
+                entries.append(entry._replace(problem=problem))
+                continue
+            element = jax.tree.map(_as_number, element)
+            entries.append(entry := SceneEntry(section, index, key, type(element), table_of(element)))
+            element = jax.tree.map(_as_static, element)
+            problems.extend(f"{entry.where}{problem}" for problem in _check_hashable(element))
+            if section == "force" and not _has_load(type(element)):
+                problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
+            found[section].append((key, element))
+    problems.extend(problems_of(entries, gravity))
+    if problems:
+        raise SceneError(problems, name)
+    return found
+
+
+def _check_hashable(element: eqx.Module) -> Iterator[str]:
+    """Iterate over the mistakes of the static fields of a user-written element."""
+    try:
+        hash(jax.tree.structure(element))
+    except TypeError as error:
+        yield f": static fields must be hashable ({error}): write a tuple in place of a list"
+
+
+def _has_load(cls: type) -> bool:
+    return cls.potential is not ForceElement.potential or cls.loads is not ForceElement.loads
+
+
+def _as_number(leaf: object) -> object:
+    """Convert the plain numbers of user-written elements, which would be static."""
+    return given_number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
+
+
+def _as_static(leaf: object) -> object:
+    """Wrap a leaf that is not a number, so that it is static."""
+    return leaf if eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) else StaticValue(leaf)
+
+
+def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
+    """Return a constraint with the numbers that it leaves to the initial guess, which the bodies hold."""
+    if type(constraint).complete is Constraint.complete:  # most joints: spares the sines and cosines of every body
+        return constraint
+    places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
+    known = not is_traced((constraint, places))
+    if known:  # NumPy has nothing to compile
+        constraint, places = jax.tree.map(np.asarray, (constraint, places))
+    frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
+    known_stays_known = jax.ensure_compile_time_eval() if known else nullcontext()  # while something else is traced
+    with known_stays_known, np.errstate(all="ignore"):
+        completed = constraint.complete(*frames)
+        return jax.tree.map(number, completed) if known else completed
+
+
+def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
+    """Return what is wrong with the numbers that constraints took from the initial guess; those that are traced pass."""
+    found = []
+    for section, elements in after.items():
+        for k, ((name, completed), (_, given)) in enumerate(zip(elements, before[section], strict=True)):
+            if completed is not given and not is_traced(completed):
+                found.extend(_mistakes_of_guess(f"{section} {abbreviate(name)} ({section}[{k}])", given, completed))
+    return found
+
+
+def _mistakes_of_guess(where: str, before: eqx.Module, after: eqx.Module) -> Iterator[str]:
+    """Iterate over the mistakes of the numbers that an element left to the initial guess, from what they are there."""
+    for field in dataclasses.fields(after):
+        value = getattr(after, field.name)
+        if getattr(before, field.name, None) is not None or not isinstance(value, np.ndarray | jax.Array):
+            continue
+        known = np.asarray(value, float)
+        conditions = [Requirement("must be finite", np.isfinite), *field.metadata.get("require", ())]
+        unmet = next((c.text for c in conditions if not np.all(c.holds(known))), None)
+        if unmet:
+            given = (f.name for f in dataclasses.fields(before) if isinstance(getattr(before, f.name), np.ndarray | jax.Array))
+            cure = " or ".join(["other positions of the bodies", *(f"other {name}" for name in given)])
+            found = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess, from which it is taken"
+            yield f"{found}: give it, or {cure}"
