@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.stepping import by_equal_steps
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 from udkjax.study.exact import exact_coordinates
 
 RUNGE_KUTTA: dict[str, tuple[Callable[[], Any], int]] = {

@@ -24,7 +24,7 @@ from experiments.common import described, panels, tracked
 from experiments.parts.drift_law import linkage, scalar_law
 from experiments.parts.linkage import OUTPUTS, errors, parallelogram, start
 from experiments.parts.tuning import ABSOLUTE_RANK_TOL
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 
 STARTS = (-45.0, -20.0)  # degrees, at rest
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)

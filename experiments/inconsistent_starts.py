@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from udkjax.equations import prepare
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 from udkjax.study.exact import exact_coordinates
 
 TREATMENTS: dict[str, tuple[Any, Any]] = {

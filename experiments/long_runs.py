@@ -38,7 +38,7 @@ from experiments.common import described, panels, tracked
 from experiments.parts.stepping import by_tolerance
 from udkjax.equations import prepare
 from udkjax.integrate.diffrax_engine import derivative
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 from udkjax.study.exact import pendulum
 
 SOLVERS: dict[str, Any] = {

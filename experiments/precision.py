@@ -28,7 +28,7 @@ import udkjax as udk
 from experiments.common import HERE, described, panels, tracked
 from experiments.parts.in_precision import END, OUTPUTS, STARTS, THRESHOLDS
 from experiments.pinv_accuracy import LINEAR, collection
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 
 PRECISIONS = {"float64": "1", "float32": "0"}
 

@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.linkage import errors, parallelogram, start
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 
 GROUPS = {"+60 at rest": (60.0, 0.0), "+45 at rest": (45.0, 0.0), "in line at rest": (0.0, 0.0), "up, -1 rad/s": (90.0, -1.0)}
 SPREAD, MEMBERS, SEED = 5.0, 64, 0  # degrees; the first of each group is its centre

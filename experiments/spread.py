@@ -34,7 +34,7 @@ from matplotlib.figure import Figure
 
 import udkjax as udk
 from experiments.common import described, panels, tracked
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 from udkjax.study.exact import exact_coordinates
 
 METHODS: dict[str, Any] = {

@@ -24,7 +24,7 @@ from matplotlib.patches import Rectangle
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.linkage import OUTPUTS, errors, parallelogram, start
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 
 METHODS = {
     "SVD": udk.SVD,

@@ -48,7 +48,7 @@ from experiments.parts.tuning import (
     length,
     scene,
 )
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 GRID = (1.0, 1.5, 2.0, 2.5, 3.0, 5.0, 7.0, 10.0, 20.0)  # alpha = beta, 1/s: those of gains.py around what is tuned

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.drift_law import LIFT, Motion, Range, law, lift, linkage, opened, scalar_law, turning
-from udkjax.show.plots import COLOURS
+from udkjax.show.style import COLOURS
 
 STARTS = (-20.0, -30.0, -45.0, -50.0, -70.0)  # degrees, at rest
 GAINS = ((0.0, 0.0), (2.0, 2.0), (1.0, 0.5), (3.0, 1.0), (1.0, 3.0))  # alpha, beta in 1/s; the last lets the drift oscillate

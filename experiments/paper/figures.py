@@ -4,7 +4,8 @@ import numpy as np
 
 from udkjax.extras import OptionalImport
 from udkjax.scene import loads
-from udkjax.show.plots import COLOURS, draw_motion
+from udkjax.show.plots import draw_motion
+from udkjax.show.style import COLOURS
 from udkjax.study import exact_coordinates
 
 with OptionalImport():

@@ -14,6 +14,7 @@ from udkjax.equations.quantities import Energy
 from udkjax.integrate import Result, Solution
 from udkjax.show import plots
 from udkjax.show.plots import attachments, farthest_instants, outline, to_ground, trajectory
+from udkjax.show.style import COLOURS
 from udkjax.study import exact_coordinates
 
 
@@ -193,4 +194,4 @@ def test_curves_are_told_apart_in_print():
         for one, other in combinations(curves, 2):
             differ = one.get_linestyle() != other.get_linestyle() or one.get_marker() != other.get_marker()
             assert differ or abs(luminance(one.get_color()) - luminance(other.get_color())) > 10, draw.__name__
-    assert max(luminance(colour) for colour in plots.COLOURS) < 75  # none vanishes on white
+    assert max(luminance(colour) for colour in COLOURS) < 75  # none vanishes on white
