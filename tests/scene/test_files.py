@@ -36,7 +36,7 @@ positive = st.floats(min_value=5e-324, allow_infinity=False)
 numbers = st.tuples(finite, finite)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.text(min_size=1), st.text(), positive, numbers, finite, st.lists(finite, min_size=1, max_size=4))
 def test_any_text_and_any_number_comes_back(name, title, mass, point, angle, coefficients):
     if name == "ground":
