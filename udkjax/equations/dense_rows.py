@@ -44,27 +44,32 @@ class TruncatedPseudoinverse(NamedTuple):
         return self.vt.T @ (self.inverse * (self.u.T @ b))
 
 
-class DenseTerms:
-    """Psi of a mechanism with known numbers and its derivatives, by NumPy on the scene's programs."""
+class RowTerms:
+    """Psi of a mechanism with known numbers, Psi_dot and the entries of Psi_q, by NumPy on the scene's programs."""
 
     def __init__(self, mechanism: Mechanism):
         programs = scene_programs(mechanism)
         self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
+        self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self._arrays_at = arrays_in_time(mechanism)
-        self._entries = tuple(programs.psi_q_entries[:2])
 
-    def _geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Psi (m,), Psi_dot (m,), and the entries of Psi_q."""
         return self._arrays_at(t).geometry(t, q, v)
 
     def psi(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Psi (m,)."""
         return self._arrays_at(t).psi(t, q)
 
+
+class DenseTerms(RowTerms):
+    """Psi of a mechanism with known numbers and its derivatives, as whole matrices."""
+
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi_q (m, n) and Psi_t (m,)."""
-        _, rate, entries = self._geometry(t, q, np.zeros_like(q))
+        _, rate, entries = self.geometry(t, q, np.zeros_like(q))
         found = np.zeros((self.count, self.size))
-        found[self._entries] = entries
+        found[self.entries] = entries
         return found, rate
 
     def gamma(self, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -83,7 +88,7 @@ class DenseRows(DenseTerms):
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Psi and Psi_dot."""
-        return self._geometry(t, q, v)[:2]
+        return self.geometry(t, q, v)[:2]
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return self.psi(t, q) / self.scales.rows
@@ -106,7 +111,7 @@ class DenseRows(DenseTerms):
         q = close_position(self, t, q, np)
         plus = self.plus(t, q)
         for _ in range(VELOCITIES):
-            v = v - self.metric * (plus @ (self.scales.weights * self._geometry(t, q, v)[1]))
+            v = v - self.metric * (plus @ (self.scales.weights * self.geometry(t, q, v)[1]))
         return q, v, *self.violation(t, q, v), plus.rank
 
 

@@ -18,11 +18,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from udkjax.equations.abstract_system import Time
-from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE
+from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE, RowTerms
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
-from udkjax.equations.scene_arrays import arrays_in_time
-from udkjax.equations.scene_programs import scene_programs
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.fields import ROUNDING
@@ -100,51 +98,40 @@ def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
     return coo_array((np.concatenate([p.data for p in blocks]), place), shape=(rows, shift[-1]))
 
 
-class SparseRows:
+class SparseRows(RowTerms):
     """Psi and D of a mechanism with known numbers; D sparse. The metric is M^(-1/2), or, to look for redundant rows, (A, A, 1).
 
     The interface is that of `DenseRows` and of `KinematicRows`.
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
-        self._programs = programs = scene_programs(mechanism)
-        self.count, self.size = programs.row_count, programs.coordinate_count
-        self.names = programs.row_names
+        super().__init__(mechanism)
         self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
-        root = 1 / np.sqrt(mass_of(mechanism, np))
         arm = float(self.scales.arm)
-        self.metric = np.tile([arm, arm, 1.0], len(root) // 3) if kinematic else root
+        self.metric = np.tile([arm, arm, 1.0], self.size // 3) if kinematic else 1 / np.sqrt(mass_of(mechanism, np))
         self.driver_time_step = driver_time_step(self.scales)
-        self._arrays_at = arrays_in_time(mechanism)
-
-    def _evaluate(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self._arrays_at(t).geometry(t, q, v)
-
-    def _psi(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return self._arrays_at(t).psi(t, q)
 
     @cached_property
     def _order(self) -> list[int]:
         rows: list[set[int]] = [set() for _ in range(self.count)]
-        for i, k in zip(*self._programs.psi_q_entries[:2], strict=True):
+        for i, k in zip(*self.entries, strict=True):
             rows[i].add(k // 3)
         return minimum_degree(rows)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
         """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
-        psi, _, values = self._evaluate(t, q, q)
+        psi, _, values = self.geometry(t, q, q)
         D, length = self._normalize_rows(values)
         return psi, length, D
 
     def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
-        row, column, *_ = self._programs.psi_q_entries
-        D = csr_array((values * self.metric[column], (row, column)), shape=(self.count, self.size))
+        D = csr_array((values * self.metric[self.entries[1]], self.entries), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
         return csr_array(D.multiply(1 / length[:, None])), length
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return self._psi(t, q) / self.scales.rows
+        return self.psi(t, q) / self.scales.rows
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         psi, length, D = self.at(t, q)
@@ -175,8 +162,8 @@ class SparseRows:
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
         for _ in range(VELOCITIES + 1):  # what the first leaves because of its damping
-            v = v + self._solve(D, self._evaluate(t, q, v)[1] / length)
-        return q, v, psi, self._evaluate(t, q, v)[1], rank
+            v = v + self._solve(D, self.geometry(t, q, v)[1] / length)
+        return q, v, psi, self.geometry(t, q, v)[1], rank
 
     def split_rows(self, positions: list[SparsePosition]) -> Sequence[tuple[np.ndarray, Sequence["RowSubset"]]]:
         """Sets of rows that depend on each other, and how each stands in the positions."""
