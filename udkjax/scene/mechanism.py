@@ -275,12 +275,12 @@ class Mechanism(PrintsTable):
         origin = Origin(self) if traced and self.is_concrete else self.origin
         base, own, changed = self, values, ()
         if self.drawing is not None:
-            base, own, changed = self._drawn_again(self.drawing, values)
+            base, own, changed = self._redraw(self.drawing, values)
         new, gravity = replace_numbers(groups_of(base), base.gravity, own, parameters_of(base), self.name)
         elements = new["body"], new["joint"], new["driver"], new["force"]
         return Mechanism(*elements, gravity, self.name, origin, base.drawing, changed)
 
-    def _drawn_again(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], Any]:
+    def _redraw(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], Any]:
         """Return the mechanism of the drawing with its share of the values, the other values, and the names of these."""
         drawn, known = parameters_in(drawing.groups), parameters_of(self)
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}

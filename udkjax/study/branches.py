@@ -15,7 +15,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Drive, drive
-from udkjax.study.positions import distinct, random_positions
+from udkjax.study.positions import distinct_positions, random_positions
 
 
 @checked
@@ -47,7 +47,7 @@ def branches(
     driven = drive(mechanism, driver, 0.0, held)
     guesses = random_positions(mechanism, starts, seed)
     q, closed = _close(driven.mechanism, driven.analysis, number(value), guesses)
-    found = np.asarray(q)[distinct(q, closed, driven.analysis.scales)]
+    found = np.asarray(q)[distinct_positions(q, closed, driven.analysis.scales)]
     found[..., 2] = np.angle(np.exp(1j * found[..., 2]))
     order = np.lexsort(np.round(found[..., 2], 6).T[::-1])
     return jnp.asarray(found[order])

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.printing import PrintsWords
 from udkjax.study.control_flow import ControlFlow, sequential
-from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, across
+from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing
 from udkjax.study.curve import AbstractCurve
 
 FIRST, LONGEST, SHORTEST = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
@@ -183,7 +183,7 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
     here = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
 
     def beside() -> tuple[Crossing, Array]:
-        other, is_known = across(curve, X, tau)
+        other, is_known = find_crossing(curve, X, tau)
         return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, here), is_known
 
     found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (here, xp.asarray(False)))

@@ -57,7 +57,7 @@ class Crossing(NamedTuple):
     spacing: Float[Array, ""]  # h
 
 
-def across(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
+def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
     """Find a point, q', q'' and q''' from both sides of it.
 
     Args:
@@ -70,7 +70,7 @@ def across(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"
     """
 
     def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
-        return _interpolated(curve, X, tau, h)
+        return _interpolate(curve, X, tau, h)
 
     by, xp = curve.by, curve.by.xp
     spacings = xp.asarray(SPACINGS, X.dtype)
@@ -81,7 +81,7 @@ def across(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"
     return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
 
 
-def _interpolated(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
     by, xp = curve.by, curve.by.xp
     slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)

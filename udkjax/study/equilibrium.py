@@ -25,7 +25,7 @@ from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential,
 from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize, with_unit_mass
-from udkjax.study.positions import distinct, random_positions
+from udkjax.study.positions import distinct_positions, random_positions
 
 MAX_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
 FORCE_TOL = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
@@ -145,7 +145,7 @@ def equilibria(
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
     found = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
-    different = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct(found.q, found.balanced, analysis.scales)]
+    different = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct_positions(found.q, found.balanced, analysis.scales)]
     return sorted(different, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
 
 

@@ -23,7 +23,7 @@ def random_positions(mechanism: Mechanism, count: int, seed: int, state: State |
     return jnp.asarray(found)
 
 
-def distinct(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
+def distinct_positions(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
     """Return which of the positions that count differ from all before them; whole turns make no difference."""
     points = np.asarray(q, float)
     length, different = float(scales.length), []

@@ -57,18 +57,18 @@ class PinInSlot(DrawnElement):
 
     def mistakes(self, layout):
         yield from line_mistakes(self.along, self.direction)
-        if not self._guided(layout):
+        if not self._guided_link(layout):
             yield f"pin: {quote(self.pin)} is on no link but {quote(self.on)}, whose slot it should slide in"
         if self.link is not None and self.link not in layout.members(self.pin):
             yield f"link: {quote(self.link)} has no pin {quote(self.pin)}"
 
     def parts(self, placement):
-        pair = (self.on, self._guided(placement))
+        pair = (self.on, self._guided_link(placement))
         pin = placement.places[self.pin]
         points = placement.points(pair, (placement.places[self.along[0]] if self.along else pin, pin))
         return Parts(joint=Slot(pair, points, placement.direction(self.on, self.along, self.direction)))
 
-    def _guided(self, layout: PinLayout) -> str:
+    def _guided_link(self, layout: PinLayout) -> str:
         return self.link or next((m for m in layout.members(self.pin) if m != self.on), "")
 
     @property

@@ -142,7 +142,9 @@ class Units:
         for name, value in table.items():
             place = f"{path}.{name}"
             if name not in expected or not _is_number(expected[name].annotation):
-                found[name] = self._nested(place, expected[name].annotation, value, problems, law) if name in expected else value
+                found[name] = (
+                    self._convert_nested(place, expected[name].annotation, value, problems, law) if name in expected else value
+                )
                 continue
             unit = _unit(cls, name, variant, law)
             if name in VECTORS and isinstance(value, list | tuple):
@@ -155,7 +157,7 @@ class Units:
                 found[name] = self.convert(place, value, unit, problems)
         return found
 
-    def _nested(self, path: str, annotation: Any, value: object, problems: list[str], law: str) -> object:
+    def _convert_nested(self, path: str, annotation: Any, value: object, problems: list[str], law: str) -> object:
         """Return the table of a motion law or of a profile in SI units; anything else as it is."""
         if not isinstance(value, Mapping) or not (isinstance(annotation, type) and issubclass(annotation, eqx.Module)):
             return value

@@ -3,7 +3,7 @@
 from itertools import combinations
 
 from udkjax.scene.mjcf.body_tree import BodyTree, TreeGeom
-from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.motion_plane import MotionPlane
 from udkjax.scene.mjcf.xml_tree import XmlElement
 
@@ -14,7 +14,7 @@ def contact_pairs(root: XmlElement, tree: BodyTree, plane: MotionPlane) -> list[
     Left out are those of one body, of a body and what it hangs on, of bodies that are excluded, those that nothing moves, and
     spheres around them that stay beside each other, above and below the plane of the motion.
     """
-    parts = merged(root, ("contact",)).children
+    parts = merge_parts(root, ("contact",)).children
     excluded = [{part.attributes.get("body1", ""), part.attributes.get("body2", "")} for part in parts if part.tag == "exclude"]
     found = [f"{p.attributes.get('geom1')} and {p.attributes.get('geom2')}" for p in parts if p.tag == "pair"]
     for one, two in combinations(tree.geoms, 2):

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from udkjax.scene.mjcf.body_tree import TreeJoint, unique_name
-from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.motion_plane import AXES_TOL
 from udkjax.scene.mjcf.plane_model import Ends, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
@@ -34,7 +34,7 @@ class CoupledLengths:
         self.joints = {joint.name: self._joint_length(joint) for joint in model.joints}
         self.tendons: dict[str, CoupledLength | None] = {}
         self.tendon_attributes: dict[str, AttributeReader] = {}
-        for element in merged(root, ("tendon",)).children:
+        for element in merge_parts(root, ("tendon",)).children:
             if element.tag in ("fixed", "spatial"):
                 read = self.settings.read(element, section="tendon")
                 name = unique_name(read.text("name") or element.tag, self.tendons)

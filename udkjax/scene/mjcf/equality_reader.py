@@ -8,7 +8,7 @@ from udkjax.scene.checks import quote
 from udkjax.scene.joints import Angle, Distance, Gear, Joint, Revolute, Weld
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
-from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion
 from udkjax.scene.mjcf.plane_model import Ends
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
@@ -26,7 +26,7 @@ class EqualityReader:
         self.lengths, self.model, self._motions, self._taken = lengths, lengths.model, motions, taken
         self.joints: dict[str, Joint] = {}
         kinds = {"connect": self._add_connect, "weld": self._add_weld, "joint": self._add_joint, "tendon": self._add_tendon}
-        for element in merged(root, ("equality",)).children:
+        for element in merge_parts(root, ("equality",)).children:
             read = self.model.tree.settings.read(element, section="equality")
             if (
                 "equality" not in self.model.tree.settings.disabled

@@ -9,7 +9,7 @@ from udkjax.scene.checks import quote
 from udkjax.scene.forces import Force, ForceElement, Spring, Torque, TorsionSpring
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
-from udkjax.scene.mjcf.model_settings import merged
+from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
@@ -37,7 +37,7 @@ class ForceReader:
         for name, length in lengths.tendons.items():
             if length:
                 self._add_passive(name, length, lengths.tendon_attributes[name])
-        for element in merged(root, ("actuator",)).children:
+        for element in merge_parts(root, ("actuator",)).children:
             if element.tag in ACTUATORS and "actuation" not in self.settings.disabled:
                 self._add_actuator(self.settings.read(element), controls.get(element.attributes.get("name", ""), 0.0))
 

@@ -16,7 +16,7 @@ from udkjax.scene.mjcf.contact_pairs import contact_pairs
 from udkjax.scene.mjcf.coupled_lengths import CoupledLengths
 from udkjax.scene.mjcf.equality_reader import EqualityReader
 from udkjax.scene.mjcf.force_reader import LEFT_OUT, ForceReader
-from udkjax.scene.mjcf.model_settings import ModelSettings, merged
+from udkjax.scene.mjcf.model_settings import ModelSettings, merge_parts
 from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion, plane_of
 from udkjax.scene.mjcf.plane_model import PlaneModel
 from udkjax.scene.mjcf.vocabulary import unknown_parts
@@ -111,7 +111,7 @@ def mechanism_of_text(
 
 def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tuple[dict[str, float], ...]:
     """Return the values and the rates of joints, and the controls of actuators, by name, of a keyframe."""
-    keys = {element.attributes.get("name", ""): element for element in merged(root, ("keyframe",)).children}
+    keys = {element.attributes.get("name", ""): element for element in merge_parts(root, ("keyframe",)).children}
     problems, joints = model.tree.settings.problems, [joint.name for joint in model.joints]
     if key is not None and key not in keys:
         problems.append(f"<keyframe>: no key has the name {abbreviate(key)}{suggestion(key, keys)}")
@@ -119,7 +119,7 @@ def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tupl
     if element is None:
         return {}, {}, {}
     read = AttributeReader(element, element.attributes, problems)
-    actuators = [child.attributes.get("name", "") for child in merged(root, ("actuator",)).children]
+    actuators = [child.attributes.get("name", "") for child in merge_parts(root, ("actuator",)).children]
     found = []
     for attribute, names in (("qpos", joints), ("qvel", joints), ("ctrl", actuators)):
         given = attribute in read and names

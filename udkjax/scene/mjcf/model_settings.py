@@ -18,7 +18,7 @@ class ModelSettings:
     def __init__(self, root: XmlElement, problems: list[str]):
         self.problems = problems
         self._defaults: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
-        compilers, options, flags = (merged(root, path) for path in (("compiler",), ("option",), ("option", "flag")))
+        compilers, options, flags = (merge_parts(root, path) for path in (("compiler",), ("option",), ("option", "flag")))
         read = AttributeReader(compilers, compilers.attributes, problems)
         self.radians = math.pi / 180 if read.choice("angle", ("degree", "radian"), "degree") == "degree" else 1.0
         self.sequence = read.text("eulerseq", "xyz")
@@ -77,7 +77,7 @@ class ModelSettings:
         return word == "true" or (word == "auto" and self.autolimits and range_name in read)
 
 
-def merged(root: XmlElement, path: tuple[str, ...]) -> XmlElement:
+def merge_parts(root: XmlElement, path: tuple[str, ...]) -> XmlElement:
     """Return all elements at a path below the outermost one as a single one: later attributes override earlier ones."""
     found = [root]
     for tag in path:

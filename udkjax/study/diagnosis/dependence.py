@@ -33,7 +33,7 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
     remaining = N
     while spanned.shape[1] < N.shape[1]:
         involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
-        candidates = [_around(seed, involved, remaining, owner, attached) for seed in involved]
+        candidates = [_minimal_set_around(seed, involved, remaining, owner, attached) for seed in involved]
         for members in sorted(candidates, key=len):
             own = null_space(N[~np.isin(owner, members)], DEPENDS).T
             both = np.linalg.svd(np.concatenate([spanned, own], axis=1), full_matrices=False)
@@ -61,7 +61,9 @@ def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> n
     return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS).T
 
 
-def _around(seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]) -> list[str]:
+def _minimal_set_around(
+    seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]
+) -> list[str]:
     """Return a minimal dependent set around one constraint: of all, the farthest are taken out first."""
     far = _distances(seed, involved, attached)
     members = list(involved)

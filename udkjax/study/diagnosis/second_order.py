@@ -80,7 +80,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
     for direction in x:
         if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME_DIRECTION for z in found):
             continue
-        zeros = _around(A, direction)
+        zeros = _zeros_around(A, direction)
         if zeros.is_cone and any(z.is_cone and z.dimension == zeros.dimension for z in found):  # one line is enough
             continue
         found = [z for z in found if not _inside(z.space, zeros.space)] + [zeros]
@@ -98,7 +98,7 @@ def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     return x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO_FORM]
 
 
-def _around(A: np.ndarray, x: np.ndarray) -> Zeros:
+def _zeros_around(A: np.ndarray, x: np.ndarray) -> Zeros:
     """Return the zeros around x: the kernel of all A_i x if all forms vanish on it; a cone if others are near; or x alone."""
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
     kernel = vt[int(np.sum(sigma > SAME_DIRECTION)) :].T

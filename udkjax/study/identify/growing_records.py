@@ -84,7 +84,7 @@ def fit_growing_records(
     at, begun, fitted, size, ahead = z, z, 0.0, np.inf, 0.0
     for _ in range(MOST_PARTS):
         if fitted == 0.0 or ahead == 0.0:
-            reach = _predictable(held, at, tol, fitted, size)
+            reach = _predictable_time(held, at, tol, fitted, size)
             ahead = min(max(reach, first, LEAST_GROWTH * fitted), max(first, MOST_GROWTH * fitted))
         if ahead >= whole:
             break
@@ -122,7 +122,7 @@ def noise_of_records(problem: FitProblem) -> Float[np.ndarray, "R"]:
     return found
 
 
-def _predictable(held: HeldProblem, z: np.ndarray, tol: Tolerances, fitted: float, size: float) -> float:
+def _predictable_time(held: HeldProblem, z: np.ndarray, tol: Tolerances, fitted: float, size: float) -> float:
     """Return the time since the beginnings of the records up to which they are predicted by a fit of their parts up to another.
 
     `size` is the root mean square of its residuals.

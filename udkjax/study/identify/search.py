@@ -87,10 +87,10 @@ def search(
             if (
                 explains(problem, fit, loose)
                 or len(known) >= len(z) + more
-                or (_agreeing(fit) >= ENOUGH_AGREEING and _shows_most(problem, fit))
+                or (_count_agreeing(fit) >= ENOUGH_AGREEING and _shows_most(problem, fit))
             ):
                 break
-    best, agreeing = int(np.argmin(fit.cost)), _agreeing(fit)
+    best, agreeing = int(np.argmin(fit.cost)), _count_agreeing(fit)
     only = fit.take(np.array([best]))
     if more and not explains(problem, only, loose):
         # Where half of the guesses agree, the mechanism does not move like that.
@@ -102,7 +102,7 @@ def search(
     return SearchResult(only, agreeing, count, tuple(ways), history, problem)
 
 
-def _agreeing(fit: Fit) -> int:
+def _count_agreeing(fit: Fit) -> int:
     """Return how many fits are at the best minimum."""
     best = int(np.argmin(fit.cost))
     there = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM_DISTANCE * (1.0 + np.abs(fit.z[best]).max())
