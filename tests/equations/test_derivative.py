@@ -13,7 +13,7 @@ from tests.programs import run
 from udkjax import GROUND
 from udkjax.equations.scene_arrays import constants_of
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_scalars
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.equations.written_out import WrittenOut
 from udkjax.pinv.rank_policy import RankPolicy
@@ -53,7 +53,7 @@ def test_they_are_those_of_the_textbook(scene, name):
         gains_and_thresholds = jnp.array([2.0, 3.0])
 
         def constants(leaves):
-            return constants_of(programs, jnp.concatenate([jnp.stack(numbers_as_scalars(leaves)), gains_and_thresholds]), jnp)
+            return constants_of(programs, jnp.concatenate([numbers_as_vector(leaves), gains_and_thresholds]), jnp)
 
         def expected(leaves, q, v):
             mech = tree.unflatten(leaves)
@@ -69,7 +69,7 @@ def test_they_are_those_of_the_textbook(scene, name):
         return jax.jvp(constants, (leaves,), (dleaves,))[1], jax.jvp(expected, (leaves, q, v), (dleaves, dq, dv))[1]
 
     dconstants, expected = by_jax([jnp.asarray(x, float) for x in leaves], dleaves)
-    numbers = [*map(float, numbers_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14]
+    numbers = [*map(float, numbers_as_vector(leaves)), 2.0, 3.0, 1e-14, 1e-14]
     active = [True] * (programs.number_count - 2) + [False] * 2
     results = ["a"] if name == "accelerations" else ["q1", "v1"]
 

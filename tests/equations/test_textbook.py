@@ -18,7 +18,7 @@ from tests.programs import dense, evaluate_programs
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_scalars
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.rank_policy import RankPolicy
 
 SVD = udk.SVD(1e-9)
@@ -189,7 +189,7 @@ def test_programs_are_the_textbook(moved, policy):
     redundant = analysis.redundant_rows or ()
     programs = scene_programs(mech, redundant, True, policy)
     leaves, n = mech.at(T0).numbers, q.size
-    numbers = [*map(float, numbers_as_scalars(leaves)), 2.0, 3.0, 1e-14, 1e-14]
+    numbers = [*map(float, numbers_as_vector(leaves)), 2.0, 3.0, 1e-14, 1e-14]
     found = evaluate_programs(programs, ["accelerations", "rows_and_loads"], numbers, float(T0), q, v)
     (free, b), psi, psi_dot = np.split(found["terms"], [n]), found["psi"], found["psi_dot"]
     psi_q = dense(programs, found["psi_q"])

@@ -59,20 +59,6 @@ def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
     return jnp.concatenate(parts)
 
 
-def numbers_as_scalars(leaves: Sequence[NumericArray]) -> list[NumericArray]:
-    """All numbers of some arrays one by one, in the order in which the graph of a scene counts them."""
-    return [x for leaf in leaves for x in _scalars(leaf)]
-
-
-def _scalars(leaf: NumericArray) -> list[NumericArray]:
-    if not np.shape(leaf):
-        return [leaf[()] if isinstance(leaf, np.ndarray) else leaf]
-    if not isinstance(leaf, Tracer):
-        return [leaf[place] for place in np.ndindex(*np.shape(leaf))]
-    flat = leaf.reshape(-1)
-    return [jax.lax.index_in_dim(flat, k, keepdims=False) for k in range(flat.size)]  # a third of what flat[k] takes to trace
-
-
 class ElementStructure(NamedTuple):
     """The part of an element that is traced once for many: all but the names of its bodies and the values of its numbers."""
 
