@@ -37,7 +37,7 @@ class IdentifyOptions:
     def check(self, settings: Mapping[str, Any]) -> None:
         """Check that there are such parameters, and that settings make sense."""
         if self.parameters:
-            self.names = self._tried(lambda: unknowns_of(self.mechanism, self.parameters).names, ())
+            self.names = self._try(lambda: unknowns_of(self.mechanism, self.parameters).names, ())
         if settings["n_starts"] < 0:
             self.problems.append(f"--n-starts {settings['n_starts']}: must not be negative")
         if not 0 < settings["tol"] < 1:
@@ -52,8 +52,8 @@ class IdentifyOptions:
             return []
         everywhere, by_channel = self._noise(noise)
         left_out = [name for group in ignore for name in group]
-        found = self._tried(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
-        found = self._tried(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
+        found = self._try(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
+        found = self._try(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
         return [record.with_start(Start(estimate=start)) for record in found]
 
     def profiled(self, groups: Groups) -> list[str]:
@@ -103,7 +103,7 @@ class IdentifyOptions:
         else:
             given[of][option] = values[0] if option == "guess" else tuple(values)
 
-    def _tried(self, read: Callable[[], Found], otherwise: Found) -> Found:
+    def _try(self, read: Callable[[], Found], otherwise: Found) -> Found:
         try:
             return read()
         except IdentificationError as error:

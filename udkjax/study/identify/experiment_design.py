@@ -21,7 +21,7 @@ from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, build_problem
-from udkjax.study.identify.parameters import Asked
+from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import MEDIUM_TOL, Tolerances
 from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, Start
 from udkjax.study.identify.uncertainty import SMALLEST_PART
@@ -86,7 +86,7 @@ class Design:
 def design_experiment(
     mechanism: Mechanism,
     candidates: Sequence[Candidate | Mapping[str, ArrayLike] | Start | State],
-    parameters: Asked,
+    parameters: ParametersLike,
     channels: Sequence[Key],
     ts: ArrayLike,
     noise: Noise,

@@ -24,7 +24,7 @@ from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
-from udkjax.study.identify.parameters import Asked, unknowns_of
+from udkjax.study.identify.parameters import ParametersLike, unknowns_of
 from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, Tolerances
 from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
@@ -210,7 +210,7 @@ def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
 def build_problem(
     mechanism: Mechanism,
     data: Data,
-    parameters: Asked,
+    parameters: ParametersLike,
     settings: Mapping[str, Any],
     noise: Noise = None,
     ignore: Sequence[str] = (),

@@ -25,7 +25,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
 from udkjax.study.identify import prediction
 from udkjax.study.identify.fit_problem import FitProblem, Residuals, build_problem
-from udkjax.study.identify.parameters import Asked
+from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import TIGHT_TOL, Tolerances
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
@@ -143,7 +143,7 @@ class GradientCheck:
 def check_gradients(
     mechanism: Mechanism,
     data: Data,
-    parameters: Asked,
+    parameters: ParametersLike,
     *,
     tol: float = TIGHT_TOL,
     ignore: Sequence[str] = (),

@@ -16,7 +16,7 @@ from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, Resid
 from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
-from udkjax.study.identify.parameters import Asked
+from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Tolerances
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
@@ -34,7 +34,7 @@ INTEGRATION_ERROR = 1e-8  # of what a channel shows: smaller residuals are error
 def identify(
     mechanism: Mechanism,
     data: Data,
-    parameters: Asked,
+    parameters: ParametersLike,
     *,
     noise: Noise = None,
     initial_state: Start | Estimated | None = None,

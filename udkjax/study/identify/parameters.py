@@ -55,8 +55,8 @@ class Parameter:
     share: Literal["value", "scale"] = "value"
 
 
-OneAsked = TypeAliasType("OneAsked", str | Length | Parameter | Setter)
-Asked = TypeAliasType("Asked", OneAsked | Sequence[OneAsked])
+ParameterLike = TypeAliasType("ParameterLike", str | Length | Parameter | Setter)
+ParametersLike = TypeAliasType("ParametersLike", ParameterLike | Sequence[ParameterLike])
 
 
 class _Part(NamedTuple):
@@ -67,7 +67,7 @@ class _Part(NamedTuple):
     same: bool
 
 
-def unknowns_of(mechanism: Mechanism, given: Asked) -> Unknowns:
+def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
     """Read parameters: texts, lengths, functions and `Parameter`s.
 
     Raises:
@@ -91,7 +91,7 @@ def unknowns_of(mechanism: Mechanism, given: Asked) -> Unknowns:
     return Unknowns.of(found)
 
 
-def _entries(mechanism: Mechanism, item: OneAsked, problems: list[str]) -> list[Unknown]:
+def _entries(mechanism: Mechanism, item: ParameterLike, problems: list[str]) -> list[Unknown]:
     """Return a parameter as unknowns: of an array, each of its entries."""
     p = item if isinstance(item, Parameter) else Parameter(item)
     try:
