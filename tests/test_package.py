@@ -128,7 +128,7 @@ def test_the_public_names_are_there():
     assert {*udkjax.__all__, "__version__"} == set(dir(udkjax))
     assert callable(udkjax.simulate) and callable(udkjax.assemble) and udkjax.library.__name__ == "udkjax.scene.library"
     with pytest.raises(AttributeError, match="no attribute 'simulat'"):
-        udkjax.simulat  # noqa: B018
+        udkjax.simulat  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def python(code: str, **environment: str) -> str:
