@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from inspect import isclass, signature
 from types import UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.named_arguments import CHECKS, required
+from udkjax.scene.named_arguments import CHECKS
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, Check, Given, article, describe, require_history
 
 Arguments = ParamSpec("Arguments")
@@ -51,9 +51,9 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
         bound = parameters.bind(*args, **kwargs)
         given = frozenset(bound.arguments)  # defaults are right
         bound.apply_defaults()
-        for name, check in checks:
-            if name in given:
-                check(name, bound.arguments[name], bound.arguments)
+        for check in checks:
+            if check.name in given:
+                check.apply(bound.arguments)
         return function(*args, **kwargs)
 
     return call
@@ -62,28 +62,44 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 def argument_problems(function: Callable[..., object], given: Given) -> list[str]:
     """Return what is wrong with some of the arguments that a function is to be called with, the mechanism among them."""
     problems: list[str] = []
-    for name, check in _checks_of(function):
+    for check in _checks_of(function):
         try:
-            if name in given:
-                check(name, given[name], given)
+            if check.name in given:
+                check.apply(given)
         except (TypeError, ValueError) as error:
             problems.append(str(error))
     return problems
 
 
-def _checks_of(function: Callable[..., object]) -> list[tuple[str, Check]]:
-    found: list[tuple[str, Check]] = []
+class ParameterCheck(NamedTuple):
+    """One check of a parameter; `if_none` says whether it takes None too, lets it pass, or refuses it."""
+
+    name: str
+    check: Check
+    if_none: Literal["takes", "passes", "refuses"] = "takes"
+
+    def apply(self, given: Given) -> None:
+        """Check an argument among those of a call."""
+        value = given[self.name]
+        if value is not None or self.if_none == "takes":
+            self.check(self.name, value, given=given)
+        elif self.if_none == "refuses":
+            raise ArgumentTypeError(f"{self.name} must be given, {describe(value)}")
+
+
+def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
+    found: list[ParameterCheck] = []
     for name, parameter in signature(function).parameters.items():
         annotation = parameter.annotation
         if get_origin(annotation) is Literal:
-            found.append((name, _choice(get_args(annotation))))
+            found.append(ParameterCheck(name, _choice(get_args(annotation))))
         elif classes := _classes(annotation):
-            found.append((name, _instance(classes)))
+            found.append(ParameterCheck(name, _instance(classes)))
         if name in ("solution", "motion") and parameter.default is parameter.empty:
-            found.append((name, require_history))
+            found.append(ParameterCheck(name, require_history))
         elif name in CHECKS:
             may_be_none = parameter.default is None or type(None) in get_args(annotation)
-            found.append((name, CHECKS[name] if may_be_none else required(CHECKS[name])))
+            found.append(ParameterCheck(name, CHECKS[name], "passes" if may_be_none else "refuses"))
     return found
 
 
@@ -146,5 +162,5 @@ def _choice(known: tuple[Any, ...]) -> Check:
 
 def require_mechanism(value: Any) -> Mechanism:
     """Return a mechanism; raise TypeError where it is none."""
-    _instance((Mechanism,))("mechanism", value, {})
+    _instance((Mechanism,))("mechanism", value, given={})
     return value

@@ -1,9 +1,13 @@
-"""Requirements on arguments by their names, the same in every public function, whatever the annotations say."""
+"""Requirements on arguments by their names, the same in every public function, whatever the annotations say.
+
+None of them gets None: where a parameter may be None, nothing is required of it then; elsewhere None is refused (arguments.py).
+"""
 
 import dataclasses
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from inspect import isclass
 from typing import Any
 
@@ -28,13 +32,12 @@ from udkjax.scene.requirements import (
 
 
 def _check_state(name: str, value: Any, given: Given) -> None:
-    if value is not None:
-        value = getattr(value, "state", value)  # a closure has one
-        for part in ("q", "v"):
-            require_coordinates(f"{name}.{part}", getattr(value, part), given, flat=False)
-        shapes = np.shape(value.q), np.shape(value.v)
-        if shapes[0] != shapes[1]:
-            raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
+    value = getattr(value, "state", value)  # a closure has one
+    for part in ("q", "v"):
+        require_coordinates(f"{name}.{part}", getattr(value, part), given, flat=False)
+    shapes = np.shape(value.q), np.shape(value.v)
+    if shapes[0] != shapes[1]:
+        raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
 
 
 def _check_mechanism(name: str, value: Any, given: Given) -> None:
@@ -51,14 +54,9 @@ def _check_thresholds(name: str, value: Any, given: Given) -> None:
             require_number(f"{name}.{field.name}", x, "not negative")
 
 
-def _optional_history(name: str, value: Any, given: Given) -> None:
-    if value is not None:
-        require_history(name, value, given)
-
-
 def _check_analysis(name: str, value: Any, given: Given) -> None:
     mechanism = given.get("mechanism")
-    if value is None or not isinstance(mechanism, Mechanism):
+    if not isinstance(mechanism, Mechanism):
         return
     owners = list(dict.fromkeys(owner for owner, _ in value.row_names))
     if value.coordinates != 3 * len(mechanism.body_names) or owners != list(mechanism.constraints):
@@ -68,36 +66,11 @@ def _check_analysis(name: str, value: Any, given: Given) -> None:
 def _of_diffrax(kind: str, example: str) -> Check:
     def check(name: str, value: Any, given: Given):
         diffrax = sys.modules.get("diffrax")  # who has an instance of its classes has imported it
-        if value is not None and not (diffrax and isinstance(value, getattr(diffrax, kind))):
+        if not (diffrax and isinstance(value, getattr(diffrax, kind))):
             meant = f"an instance of diffrax's, such as {name}={example}, or None"
             raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")
 
     return check
-
-
-def required(check: Check) -> Check:
-    """Return the check of an argument that must not be None, by one that lets None pass."""
-
-    def applied(name: str, value: Any, given: Given):
-        if value is None:
-            raise ArgumentTypeError(f"{name} must be given, {describe(value)}")
-        check(name, value, given)
-
-    return applied
-
-
-def _optional(check: Callable[..., None], **choices: Any) -> Check:
-    """Return the check of an argument that may be None."""
-
-    def applied(name: str, value: Any, given: Given):
-        if value is not None:
-            check(name, value, **choices)
-
-    return applied
-
-
-def _require_array(name: str, value: Any, given: Given) -> None:
-    require_finite(name, value)
 
 
 def _of_kind(meant: str, suits: Callable[[Any], bool]) -> Check:
@@ -111,7 +84,7 @@ def _of_kind(meant: str, suits: Callable[[Any], bool]) -> Check:
 
 
 def _has(method: str) -> Callable[[Any], bool]:
-    return lambda x: x is None or (hasattr(x, method) and not isclass(x))
+    return lambda x: hasattr(x, method) and not isclass(x)
 
 
 def _are_names(x: Any) -> bool:
@@ -120,7 +93,7 @@ def _are_names(x: Any) -> bool:
 
 _require_mapping = _of_kind(
     "map names to numbers, such as {name: number}",
-    lambda x: x is None or (isinstance(x, Mapping) and all(isinstance(name, str) for name in x)),
+    lambda x: isinstance(x, Mapping) and all(isinstance(name, str) for name in x),
 )
 
 
@@ -135,7 +108,7 @@ def _is_parameter(x: Any) -> bool:
 
 
 def _require_point(name: str, value: Any, given: Given) -> None:
-    if "of" in given and (value is None or np.shape(value) != (2,)):
+    if "of" in given and np.shape(value) != (2,):
         return  # `path` knows the points of pins, and says what a shape should be
     if array(name, value).shape != (2,):
         raise ArgumentError(f"{name} must be two numbers, x and y in m, {describe(value)}")
@@ -150,16 +123,16 @@ def _require_drivers(name: str, value: Any, given: Given) -> None:
     elif (
         "body" in given
         or isinstance(value, str | np.ndarray)
-        or not isinstance(value, Sequence | None)
-        or (value is not None and not all(map(_is_coordinate, value)))
+        or not isinstance(value, Sequence)
+        or not all(map(_is_coordinate, value))
     ):
         meant = "map two drivers to their values" if "body" in given else "be a list of names"
         raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
 
 
 CHECKS: dict[str, Check] = {
-    "out": _of_kind("be a path, or None", lambda x: x is None or isinstance(x, str | os.PathLike)),
-    "memory": _optional(require_count),
+    "out": _of_kind("be a path, or None", lambda x: isinstance(x, str | os.PathLike)),
+    "memory": require_count,
     "drivers": _require_drivers,
     "parameters": _of_kind(
         "be the name of a parameter, a Parameter, or a list of these",
@@ -167,8 +140,8 @@ CHECKS: dict[str, Check] = {
     ),
     "ignore": _of_kind("be a list of names", _are_names),
     "output": _of_kind("be the name of a coordinate, such as body.crank.angle, or a Coordinate", _is_coordinate),
-    "guesses": _optional(require_finite),
-    "tol": _optional(require_number, sign="not negative"),
+    "guesses": require_finite,
+    "tol": partial(require_number, sign="not negative"),
     "loss": _of_kind(
         'be a name, such as "huber", or a function', lambda x: isinstance(x, str) or (callable(x) and not isclass(x))
     ),
@@ -177,33 +150,33 @@ CHECKS: dict[str, Check] = {
     "mechanism": _check_mechanism,
     "method": _check_thresholds,
     "stabilization": _check_thresholds,
-    "t": _optional(require_number),
-    "ts": _optional(require_times),
+    "t": require_number,
+    "ts": require_times,
     "q": require_coordinates,
     "v": require_coordinates,
     "state": _check_state,
-    "solution": _optional_history,
-    "motion": _optional_history,
+    "solution": require_history,
+    "motion": require_history,
     "analysis": _check_analysis,
-    "rtol": _optional(require_number, sign="not negative"),
-    "atol": _optional(require_number, sign="not negative"),
-    "drift_tol": _optional(require_number, sign="positive", infinite=True),
-    "rank_tol": _optional(require_number, sign="not negative"),
-    "time_tol": _optional(require_number, sign="positive"),
-    "dt": _optional(require_number, sign="positive"),
-    "dt0": _optional(require_number, sign="positive"),
-    "max_steps": _optional(require_count),
-    "max_events": _optional(require_count),
-    "starts": _optional(require_count),
-    "seed": _optional(require_count, least=0),
-    "values": _require_array,
+    "rtol": partial(require_number, sign="not negative"),
+    "atol": partial(require_number, sign="not negative"),
+    "drift_tol": partial(require_number, sign="positive", infinite=True),
+    "rank_tol": partial(require_number, sign="not negative"),
+    "time_tol": partial(require_number, sign="positive"),
+    "dt": partial(require_number, sign="positive"),
+    "dt0": partial(require_number, sign="positive"),
+    "max_steps": require_count,
+    "max_events": require_count,
+    "starts": require_count,
+    "seed": partial(require_count, least=0),
+    "values": require_finite,
     "axes": _require_mapping,
-    "rate": _require_array,
-    "acceleration": _require_array,
-    "value": _optional(require_number),
-    "length": _optional(require_number, sign="positive"),
-    "angle": _optional(require_number),
-    "angular_velocity": _optional(require_number),
+    "rate": require_finite,
+    "acceleration": require_finite,
+    "value": require_number,
+    "length": partial(require_number, sign="positive"),
+    "angle": require_number,
+    "angular_velocity": require_number,
     "held": _require_mapping,
     "inputs": _require_mapping,
     "weights": _require_mapping,

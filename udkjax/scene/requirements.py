@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from inspect import isclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 import jax
@@ -15,8 +16,9 @@ from udkjax.scene.fields import is_traced
 from udkjax.scene.mechanism import Mechanism
 
 Given = Mapping[str, Any]  # all arguments of a call by name, defaults among them
-Check = Callable[[str, Any, Given], None]
+Check = Callable[..., None]  # of the name of an argument, its value, and `given`, all arguments of the call
 Sign = Literal["any", "positive", "not negative"]
+NOTHING: Given = MappingProxyType({})
 
 
 class ArgumentError(ValueError):
@@ -66,7 +68,7 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
     return found
 
 
-def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False) -> None:
+def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: Given = NOTHING) -> None:
     """Require one real number, finite unless said otherwise, of a sign; of a traced one, the shape and the dtype alone."""
     found = array(name, value)
     if found.shape != ():
@@ -81,7 +83,7 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
         raise ArgumentError(f"{name} must be {meant}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
 
 
-def require_count(name: str, value: Any, least: int = 1) -> None:
+def require_count(name: str, value: Any, least: int = 1, given: Given = NOTHING) -> None:
     """Require a whole number that is not below `least`; of a traced one, the shape and the dtype alone."""
     found = None if isinstance(value, bool | np.bool_) else array(name, value)
     if found is None or found.shape != () or not jnp.issubdtype(found.dtype, jnp.integer):
@@ -90,7 +92,7 @@ def require_count(name: str, value: Any, least: int = 1) -> None:
         raise ArgumentError(f"{name} must be at least {least}, not {int(found)}")
 
 
-def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "") -> None:
+def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: Given = NOTHING) -> None:
     """Require finite numbers where they are known; `place` says in words which entry it is."""
     found = array(name, value)
     if isinstance(found, Tracer) or (finite := np.isfinite(found)).all():
@@ -122,7 +124,7 @@ def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
     return f" ({COORDINATES[coordinate]} of {quote(names[body])})"
 
 
-def require_times(name: str, value: Any) -> None:
+def require_times(name: str, value: Any, given: Given = NOTHING) -> None:
     """Require a vector of finite times; of a traced one, the shape alone."""
     found = array(name, value)
     if found.ndim != 1 or not len(found):
