@@ -51,8 +51,7 @@ class InverseDynamics(PrintsTable):
     motion: Kinematics | None  # where it was found here
     efforts: dict[str, Float[Array, "T"]]  # by driver: torque (N m) along an angle, force (N) along a length
     powers: dict[str, Float[Array, "T"]]  # W: effort times the coordinate's rate
-    # The largest part of M a - F that neither joints nor drivers exert, relative to M a and the single loads.
-    residual: Float[Array, "T"]
+    residual: Float[Array, "T"]  # the largest part of M a - F that neither joints nor drivers exert, over M a and single loads
 
     _units = units(ts="s", efforts="N m or N", powers="W")
 
