@@ -140,7 +140,7 @@ def simulate(
         engine=engine,
     )
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
-    is_known = isinstance(mechanism, Mechanism) and mechanism.is_concrete
+    is_known = isinstance(mechanism, Mechanism) and not is_traced(mechanism)
     if isinstance(mechanism, Mechanism):
         start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
         if analysis is None:
@@ -178,7 +178,7 @@ def simulate(
 
 def _has_failed(solution: Solution) -> bool:
     """Return whether a single run, of known numbers, has not reached its end."""
-    return not isinstance(solution.code, Tracer) and not solution.result.is_success
+    return not isinstance(solution.code, Tracer) and bool(solution.result)
 
 
 def _required(solution: Solution, throw: bool) -> Solution:

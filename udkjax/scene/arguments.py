@@ -51,9 +51,11 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
         bound = parameters.bind(*args, **kwargs)
         given = frozenset(bound.arguments)  # defaults are right
         bound.apply_defaults()
-        for check in checks:
-            if check.name in given:
-                check.apply(bound.arguments)
+        for name, check, if_none in checks:
+            if name in given and (bound.arguments[name] is not None or if_none == "takes"):
+                check(name, bound.arguments[name], given=bound.arguments)
+            elif name in given and if_none == "refuses":
+                raise ArgumentTypeError(f"{name} must be given, not None")
         return function(*args, **kwargs)
 
     return call
@@ -62,10 +64,10 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 def argument_problems(function: Callable[..., object], given: Given) -> list[str]:
     """Return what is wrong with some of the arguments that a function is to be called with, the mechanism among them."""
     problems: list[str] = []
-    for check in _checks_of(function):
+    for name, check, if_none in _checks_of(function):
         try:
-            if check.name in given:
-                check.apply(given)
+            if name in given and (given[name] is not None or if_none == "takes"):
+                check(name, given[name], given=given)
         except (TypeError, ValueError) as error:
             problems.append(str(error))
     return problems
@@ -77,14 +79,6 @@ class ParameterCheck(NamedTuple):
     name: str
     check: Check
     if_none: Literal["takes", "passes", "refuses"] = "takes"
-
-    def apply(self, given: Given) -> None:
-        """Check an argument among those of a call."""
-        value = given[self.name]
-        if value is not None or self.if_none == "takes":
-            self.check(self.name, value, given=given)
-        elif self.if_none == "refuses":
-            raise ArgumentTypeError(f"{self.name} must be given, {describe(value)}")
 
 
 def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
