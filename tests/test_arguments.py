@@ -192,7 +192,7 @@ def test_settings_of_studies_are_those_of_simulate():
     assert "method must be" in message(udk.identify, MECH, record, "body.link1.mass", method=udk.SVD)
 
 
-@pytest.mark.parametrize("events", [False, True])
+@pytest.mark.parametrize("events", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_what_turns_out_to_be_of_no_use_is_the_result_of_a_member(events):
     """Traced numbers are known by their shapes alone: the run that they spoil says so, and no other."""
     listed = udk.Event(lambda t, at: at["rod"].angle - 10.0, udk.Log()) if events else None
