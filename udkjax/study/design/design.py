@@ -22,7 +22,7 @@ from udkjax.study.free_numbers import FreeNumbers
 
 SAMPLES = 8  # random mechanisms for each start: the best of them are taken
 # Steps of a search, and the share of the trials that goes on afterwards: most have shown by then where they lead.
-STAGES = ((20, 0.6), (40, 0.5), (100, 0.2))
+STAGES = ((15, 0.4), (30, 0.4), (100, 0.3))
 FEWEST = 16  # trials that go on, at least; as many are polished in the end
 POLISHING = 40  # Newton steps, of which some five are usual at each hardness of the limits
 ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are one

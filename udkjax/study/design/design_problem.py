@@ -1,5 +1,6 @@
 """A design as a least-squares problem, evaluated for batches of trials by machine code in lanes."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -128,6 +129,7 @@ class DesignProblem:
 
         self._fit, self._fit_code = made(slice(G), True)
         self._turn, self._turn_code = made(slice(G, None), False)
+        _, self._residual_code = made(slice(G), False)
         if self.rotation:
             self._margin, self._margin_code = made(slice(0, 0), True)
         self._points = self._point_program()
@@ -266,8 +268,16 @@ class DesignProblem:
         """True if transmission is limited."""
         return self.rotation or self.least > LEAST_TRANSMISSION
 
-    def evaluate(self, trials: Trials, margin: np.ndarray, threads: int | None = None) -> TrialResiduals:
+    def evaluate(
+        self,
+        trials: Trials,
+        margin: np.ndarray,
+        threads: int | None = None,
+        worth: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    ) -> TrialResiduals:
         """Evaluate residuals and limits of trials, each position closed from that of the trial.
+
+        `worth` tells by residuals and limits of lengths of which trials the turn is worth looking at; the others are not there.
 
         The rows of limits are those of lengths, and then of transmission tau, margin (M,) - tau^2: where branches meet it is the
         square that changes evenly with the lengths.
@@ -280,7 +290,9 @@ class DesignProblem:
         limits, slopes = self.lengths(x)
         is_there, tau = np.isfinite(found.end).all(1), table[:, :, G, 0]
         if self.rotation:
-            more, more_slopes, turns = self._turn_limit(x, margin, threads)
+            which = is_there if worth is None else is_there & worth(r, limits)
+            turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknowns))
+            more[which], more_slopes[which], turns[which] = self._turn_limit(x[which], margin[which], threads)
             limits, slopes = np.concatenate([limits, more], 1), np.concatenate([slopes, more_slopes], 1)
             is_there &= turns
         elif self.least > LEAST_TRANSMISSION:
@@ -289,6 +301,11 @@ class DesignProblem:
             by_x = table[:, :, G, 2:]  # values that are unknowns are held: what moves them is another residual's matter
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
         return TrialResiduals(found.q, r, by_value, by_unknowns, tau, limits, slopes, is_there)
+
+    def residuals_at(self, trials: Trials, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return residuals (M, J, G) alone, rows of lengths, and whether all positions exist (M,)."""
+        found = self._residual_code(trials.x, trials.s, self._unit, self.data, trials.q, threads=threads)
+        return found.out[..., :-1], self.lengths(trials.x)[0], np.isfinite(found.end).all(1)
 
     def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return by how much the least transmission of a turn falls short, its derivative, and whether it turns.

@@ -15,7 +15,6 @@ from udkjax.study.drive import Drive
 from udkjax.study.free_numbers import FreeNumbers
 from udkjax.study.kinematics import Kinematics, kinematics
 
-BETWEEN = 16  # values of a motion from one position of the goal to the next
 AGREEMENT = 1e-6  # relative difference, and of the squared scale, between the loss of a search and that of the motion
 
 
@@ -101,13 +100,16 @@ class Designs(PrintsTable):
 
 def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
     """Return a trial as a design whose loss is that of its motion; None where its motion does not bear it out."""
+    turns = problem.turns(x)
+    if problem.rotation and not turns:
+        return None
     mechanism = problem.free.moved(jnp.asarray(x[: problem.free.count]))
     mechanism = redrawn(problem, mechanism, q[0].reshape(-1, 3))
     values = s + float(problem.goal.origin(mechanism)) + (x[problem.free.count] if problem.shifted else 0.0)
     drawn = float(problem.drawn(mechanism))
     if problem.driven.is_angle:
         values = values + TURN * np.round((drawn - values[0]) / TURN)
-    moved = follow(mechanism, problem.driver, drawn, values)
+    moved = follow(mechanism, problem.driver, values)
     if moved is None:
         return None
     numbers = FreeNumbers(mechanism, problem.free.names)
@@ -115,22 +117,15 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
     found = float(np.sum(residuals**2))
     if not abs(found - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
         return None
-    turns = problem.turns(x)
-    if problem.rotation and not turns:
-        return None
     tau = problem.transmission_at(x, s, q)
     parameters = dict(zip(numbers.names, numbers.values, strict=True))
     return FoundDesign(found, mechanism, values, residuals, tau, turns, parameters, problem.driver)
 
 
-def follow(mechanism: Mechanism, driver: Drive, drawn: float, values: np.ndarray) -> np.ndarray | None:
+def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:
     """Return positions (J, bodies, 3) of a motion from the drawn position over values; None where it does not get there."""
-    ends = np.append(drawn, values)
-    along = np.concatenate([np.linspace(a, b, BETWEEN, endpoint=False) for a, b in zip(ends, values, strict=False)])
-    motion = kinematics(mechanism, driver, np.append(along, values[-1]))
-    if not np.all(motion.reached):
-        return None
-    return np.asarray(motion.q)[BETWEEN::BETWEEN]
+    motion = kinematics(mechanism, driver, values)
+    return np.asarray(motion.q) if np.all(motion.reached) else None
 
 
 def redrawn(problem: DesignProblem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:

@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.expressions import Graph, ScalarProgram, trace
-from udkjax.expressions.differential import Differential
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.free_numbers import FreeNumbers
@@ -90,35 +89,26 @@ class LengthLimits:
         ranges = [_read_range(mechanism, pins, ends) for pins, ends in lengths.items()]
         if problems := [p for found in ranges for p in found[3]]:
             raise SceneError(problems, mechanism.name)
-        self._program, self.count = None, sum(np.isfinite(e) and e > 0 for _, *ends, _ in ranges for e in ends)
-        if not self.count:
-            return
+        rows = [(pins, way, end) for pins, low, high, _ in ranges for way, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf]
+        self.count, self._free = len(rows), free.count
+        self._way, self._end = np.array([way for _, way, _ in rows]), np.array([end for *_, end in rows])
 
-        def rows(x: Array) -> Array:
-            pins, found = free.moved(x).drawing.pins, []  # pyright: ignore
-            for (a, b), low, high, _ in ranges:
-                way = pins[b] - pins[a]
-                length = jnp.sqrt(way @ way)
-                found += [low - length] if low > 0 else []
-                found += [length - high] if np.isfinite(high) else []
-            return jnp.stack(found)
+        def between(x: Array) -> Array:  # affine: pins are free numbers, or stay where they are
+            pins = free.moved(x).drawing.pins  # pyright: ignore
+            return jnp.stack([pins[b] - pins[a] for (a, b), *_ in rows])
 
-        graph = Graph()
-        x = np.array([graph.input(k, "x") for k in range(free.count)], object)
-        found = list(trace(rows, jnp.zeros(free.count))(graph, x)[0].flat)
-        differential, zero = Differential(graph, found, list(x)), graph.constant(0.0)
-        slopes = [differential.row(c).get(v.index, zero) for c in found for v in x]
-        self._program, self._free = ScalarProgram(graph, list(x), [*found, *slopes]), free.count
+        x = jnp.asarray(free.vector)
+        self._slopes = np.asarray(jax.jacobian(between)(x)) if rows else np.zeros((0, 2, free.count))
+        self._offset = np.asarray(between(x)) - self._slopes @ free.vector if rows else np.zeros((0, 2))
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return c (M, K) and dc/dx (M, K, P) of vectors (M, P), of which the first entries are the free numbers."""
-        members, P = x.shape
-        slopes = np.zeros((members, self.count, P))
-        if self._program is None:
-            return np.zeros((members, 0)), slopes
-        found = np.stack(self._program.by_numpy(list(x[:, : self._free].T)), 1)
-        slopes[:, :, : self._free] = found[:, self.count :].reshape(members, self.count, self._free)
-        return found[:, : self.count], slopes
+        between = np.tensordot(x[:, : self._free], self._slopes, (1, 2)) + self._offset  # (M, K, 2)
+        length = np.sqrt(np.sum(between**2, axis=2))
+        slopes = np.zeros((*length.shape, x.shape[1]))
+        unit = self._way[:, None] * between / np.maximum(length, np.finfo(float).tiny)[..., None]
+        slopes[:, :, : self._free] = np.sum(unit[..., None] * self._slopes, axis=2)
+        return self._way * (length - self._end), slopes
 
 
 def _read_range(mechanism: Mechanism, pins: Sequence[str], ends: Range) -> tuple[tuple[str, ...], float, float, list[str]]:

@@ -9,7 +9,8 @@ differences of gradients, all of which are trials of one batch. Steps go downhil
 import numpy as np
 
 from udkjax.study.design.design_problem import DesignProblem, TrialResiduals, Trials
-from udkjax.study.design.search import ACTIVE_SETS, ROUNDING, SearchState, goes_on, harden, merit_of
+from udkjax.study.design.search import ROUNDING, SearchState, goes_on, harden, merit_of
+from udkjax.study.design.steps import ACTIVE_SETS
 
 DIFFERENCE = 1e-7  # of the unknowns' scales: small enough for mechanisms that just turn; rounding leaves 1e-8 of a Hessian
 FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, of the largest eigenvalue

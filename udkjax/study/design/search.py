@@ -1,12 +1,8 @@
-"""Levenberg-Marquardt steps of many trials at once, with values of the driver as unknowns of their own.
+"""Searches: trials improved side by side, with limits that harden.
 
-With residuals r(x, s), a position's value s_j moves its own residuals alone. So it is eliminated: with a_j = dr_j/ds_j,
-
-    (A - W^T H^-1 W) dx = -(b - W^T H^-1 g),    ds_j = -(g_j + w_j dx) / h_j,
-    A = sum_j J_j^T J_j,  w_j = a_j^T J_j,  g_j = a_j^T r_j,  h_j = a_j^T a_j,
-
-each diagonal increased by a damping. Limits c(x) <= 0 are kept by an augmented Lagrangian: residuals w max(0, c + u), whose
-multipliers u become max(0, c + u) whenever a trial has settled. Bounds are kept by active sets: unknowns that would leave stay.
+Limits c(x) <= 0 are kept by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u) whenever a
+trial has settled. Where valleys are narrow and bend, steps bend with them: beside a step v, the second derivative of the residuals
+along it, by one more evaluation, gives the acceleration of the geodesic (Transtrum and Sethna 2012, arXiv:1201.5885).
 """
 
 from dataclasses import dataclass
@@ -14,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from udkjax.study.design.design_problem import MARGIN_WEIGHT, DesignProblem, TrialResiduals, Trials
+from udkjax.study.design.steps import StepEquations, in_order
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
 RELAX, TIGHTEN = 0.2, 4.0  # of the damping, after a step that is taken and one that is not
@@ -25,9 +22,8 @@ FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
 KEPT_TO = 1e-8  # scales: what a limit may be exceeded by in the end, before the last polish
 SETTLED = 1e-9  # relative fall of the loss below which a trial has settled
 ROUNDING = 1e-26  # of the squared scale: a loss below is zero to rounding
-LONGEST_MOVE = 0.5  # scales: of an unknown in one step
-ACTIVE_SETS = 5  # rounds in which a step finds out which limits it will press on
-GAP_SHARE = 0.45  # of the gap to the next value that a value may move by in one step: so that their order stays
+AHEAD = 0.1  # of a step: where residuals are evaluated for their second derivative along it
+MOST_BEND = 0.75  # of a step: twice the acceleration, at most
 
 
 @dataclass
@@ -85,31 +81,61 @@ def _first_state(problem: DesignProblem, trials: Trials, threads: int | None) ->
 
 def merit_of(found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the loss with what limits add to it (M,)."""
-    excess = weight[:, None] * np.maximum(found.limits + multipliers, 0.0)
-    return loss_of(found.r) + np.einsum("mk,mk->m", excess, excess)
+    return merit(found.r, found.limits, multipliers, weight)
+
+
+def merit(r: np.ndarray, limits: np.ndarray, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the merit (M,) of residuals and rows of limits, such as the first ones."""
+    excess = weight[:, None] * np.maximum(limits + multipliers, 0.0)
+    return loss_of(r) + np.einsum("mk,mk->m", excess, excess)
 
 
 def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: np.ndarray, threads: int | None):
     trials, found = state.trials.take(active), TrialResiduals(*(a[active] for a in state.found))
-    dx, ds = _find_step(problem, trials, found, state.multipliers[active], state.weight[active], state.damping[active])
-    new = Trials(np.clip(trials.x + dx, problem.low, problem.high), trials.s + ds, trials.q)
-    there = problem.evaluate(new, state.margin[active], threads)
+    equations = StepEquations(problem, trials, found, state.multipliers[active], state.weight[active], state.damping[active])
+    new = _stepped(problem, trials, *_bent_step(problem, equations, threads))
+    before, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
+
+    def worth(r: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        return merit(r, lengths, u[:, : lengths.shape[1]], weight) < before
+
+    there = problem.evaluate(new, state.margin[active], threads, worth)
     exists = there.is_there & np.all(np.sign(there.transmission) == sign[active][:, None], axis=1)
-    merit = np.where(exists, merit_of(there, state.multipliers[active], state.weight[active]), np.inf)
-    with np.errstate(invalid="ignore"):
-        better = merit < state.merit[active]
-        fall = state.merit[active] - merit
+    merits = np.where(exists, merit_of(there, u, weight), np.inf)
+    better, fall = merits < before, before - merits
     taken, kept = active[better], active[~better]
-    settled = fall[better] < SETTLED * state.merit[taken]
+    settled = fall[better] < SETTLED * before[better]
     for a, b in zip((*state.trials, *state.found), (*new[:2], there.q, *there), strict=True):
         a[taken] = b[better]
-    state.merit[taken] = merit[better]
+    state.merit[taken] = merits[better]
     state.damping[taken] = np.maximum(RELAX * state.damping[taken], LEAST_DAMPING)
     state.damping[kept] *= TIGHTEN
     done = np.concatenate(
-        [taken[settled | (merit[better] < ROUNDING * problem.scale**2)], kept[state.damping[kept] > MOST_DAMPING]]
+        [taken[settled | (merits[better] < ROUNDING * problem.scale**2)], kept[state.damping[kept] > MOST_DAMPING]]
     )
     _settle(problem, state, done)
+
+
+def _stepped(problem: DesignProblem, trials: Trials, dx: np.ndarray, ds: np.ndarray) -> Trials:
+    return Trials(np.clip(trials.x + dx, problem.low, problem.high), trials.s + in_order(problem, ds, trials.s), trials.q)
+
+
+def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps with half of their acceleration, where that is short beside them."""
+    dx, ds = equations.find()
+    ds = in_order(problem, ds, equations.trials.s)
+    trials, found = equations.trials, equations.found
+    r, limits, there = problem.residuals_at(Trials(trials.x + AHEAD * dx, trials.s + AHEAD * ds, trials.q), threads)
+    along = np.einsum("mjgp,mp->mjg", found.by_unknowns, dx) + found.by_value * ds[..., None]
+    bend_of_r = ((r - found.r) / AHEAD - along) / AHEAD
+    bend_of_limits, count = np.zeros_like(found.limits), limits.shape[1]
+    slopes = found.limits_by_unknowns[:, :count]
+    bend_of_limits[:, :count] = ((limits - found.limits[:, :count]) / AHEAD - (slopes @ dx[..., None])[..., 0]) / AHEAD
+    bend_of_r[~there] = 0.0
+    ddx, dds = equations.correct(bend_of_r, bend_of_limits)
+    ratio = 2.0 * equations.length(ddx) / np.maximum(equations.length(dx), 1e-300)
+    share = np.where(there & (ratio <= MOST_BEND), 1.0, 0.0)[:, None]
+    return dx + share * ddx, ds + share * dds
 
 
 def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
@@ -142,57 +168,3 @@ def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
         state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
     state.margin[which] = margin
     state.merit[which] = merit_of(TrialResiduals(*(a[which] for a in state.found)), state.multipliers[which], harder)
-
-
-def _find_step(
-    problem: DesignProblem,
-    trials: Trials,
-    found: TrialResiduals,
-    multipliers: np.ndarray,
-    weight: np.ndarray,
-    damping: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    members, P = trials.x.shape
-    J, r = found.by_unknowns.reshape(members, -1, P), found.r.reshape(members, -1)
-    Jt = J.transpose(0, 2, 1)
-    A, b = Jt @ J, (Jt @ r[..., None])[..., 0]
-    diagonal = np.einsum("mpp->mp", A).copy()
-    w = g = h = np.zeros(0)
-    if problem.local:
-        w = np.einsum("mjg,mjgp->mjp", found.by_value, found.by_unknowns)
-        g = np.einsum("mjg,mjg->mj", found.by_value, found.r)
-        h = np.einsum("mjg,mjg->mj", found.by_value, found.by_value)
-        h = h * (1.0 + damping[:, None]) + np.finfo(float).eps * problem.scale**2
-        scaled = w / h[..., None]
-        A, b = A - scaled.transpose(0, 2, 1) @ w, b - np.einsum("mjp,mj->mp", scaled, g)
-    excess, slopes, places = found.limits + multipliers, found.limits_by_unknowns, np.arange(P)
-    pressed = excess > 0
-    for _ in range(ACTIVE_SETS):
-        force = weight[:, None] ** 2 * pressed
-        with_limits = A + slopes.transpose(0, 2, 1) @ (force[..., None] * slopes)
-        gradient = b + np.einsum("mkp,mk->mp", slopes, force * excess)
-        size = diagonal + np.einsum("mkp,mk->mp", slopes**2, force)
-        steepest = np.max(size, axis=1, keepdims=True)
-        with_limits[:, places, places] += damping[:, None] * size + np.finfo(float).eps * (steepest + (steepest == 0))
-        held = ((trials.x <= problem.low) & (gradient > 0)) | ((trials.x >= problem.high) & (gradient < 0))
-        with_limits = np.where(held[:, :, None] | held[:, None, :], 0.0, with_limits)
-        with_limits[:, places, places] += held
-        dx = -np.linalg.solve(with_limits, np.where(held, 0.0, gradient)[..., None])[..., 0]
-        before, pressed = pressed, excess + np.einsum("mkp,mp->mk", slopes, dx) > 0
-        if np.array_equal(before, pressed):
-            break
-    longest = np.max(np.abs(dx[:, : problem.free.count]), axis=1, initial=0.0)
-    dx *= np.minimum(1.0, LONGEST_MOVE * problem.reach / np.maximum(longest, 1e-300))[:, None]
-    if not problem.local:
-        return dx, np.zeros_like(trials.s)
-    ds = -(g + np.einsum("mjp,mp->mj", w, dx)) / h
-    return dx, _in_order(ds, trials.s, np.inf if problem.is_closed else problem.period)
-
-
-def _in_order(ds: np.ndarray, s: np.ndarray, period: float) -> np.ndarray:
-    """Shorten changes of values so that their order stays, around the whole period; of a closed curve its ends may meet."""
-    gap = np.abs(np.diff(s, axis=1))
-    last = np.maximum(period - np.abs(s[:, -1:] - s[:, :1]), 0.0)
-    gap = np.concatenate([gap, last], 1)
-    most = GAP_SHARE * np.minimum(gap, np.roll(gap, 1, axis=1))
-    return np.clip(ds, -most, most)
