@@ -1,8 +1,8 @@
 """Searches: trials improved side by side, with limits that harden.
 
-Limits c(x) <= 0 are kept by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u) whenever a
-trial has settled. Where valleys are narrow and bend, steps bend with them: beside a step v, the second derivative of the residuals
-along it, by one more evaluation, gives the acceleration of the geodesic (Transtrum and Sethna 2012, arXiv:1201.5885).
+Limits c(x) <= 0 are kept by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u) whenever
+a trial has settled. Where valleys are narrow and bend, steps bend with them: beside a step v, the second derivative of the
+residuals along it, by one more evaluation, gives the acceleration of the geodesic (Transtrum and Sethna 2012, arXiv:1201.5885).
 """
 
 from dataclasses import dataclass

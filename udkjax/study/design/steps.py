@@ -5,7 +5,8 @@ With residuals r(x, s), a position's value s_j moves its own residuals alone. So
     (A - W^T H^-1 W) dx = -(b - W^T H^-1 g),    ds_j = -(g_j + w_j dx) / h_j,
     A = sum_j J_j^T J_j,  w_j = a_j^T J_j,  g_j = a_j^T r_j,  h_j = a_j^T a_j,
 
-each diagonal increased by a damping. Limits add rows w max(0, c + u). Bounds are kept by active sets: unknowns that would leave stay.
+each diagonal increased by a damping. Limits add rows w max(0, c + u). Bounds are kept by active sets: unknowns that would leave
+them stay.
 """
 
 import numpy as np
