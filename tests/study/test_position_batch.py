@@ -97,3 +97,11 @@ def test_wrong_input_is_named():
         BATCH(members(2, 0.0), np.zeros((3, 4)))
     with pytest.raises(ValueError, match="finite"):
         BATCH(members(2, 0.0), np.array([0.1, np.nan]))
+
+
+def test_a_member_that_cannot_go_on_does_not_hold_up_the_others():
+    """One member of a register has a rocker that is too short for a turn; the others get around in one value."""
+    given = members(8, 0.0)
+    given["pin.C"][3] = [0.14, 0.02]
+    found = BATCH(given, START + np.array([6.0]))
+    assert not found.reached[3, 0] and np.delete(found.reached, 3, axis=0).all()

@@ -1,7 +1,8 @@
 """`udkjax design`."""
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from udkjax.cli.common import Json, fail, refuse, show
 from udkjax.extras import OptionalImport
@@ -23,6 +24,8 @@ def design(
 ) -> None:
     """Find mechanisms that move as a goal says: a path, poses, or a function; exit with 1 where there is none.
 
+    With `complete = true` in the file all four-bars through nine places, or five poses, are found, whatever --starts and --seed.
+
     Args:
         goal: file with the mechanism, the goal and the limits.
         starts: from how many random mechanisms.
@@ -35,26 +38,24 @@ def design(
             refuse(f"--{name} {value}: must be at least {least}")
     import numpy as np
 
-    import udkjax as udk
     from udkjax.show.summary import table
     from udkjax.study.design.goal_file import read_design
+    from udkjax.study.synthesis.complete_design import CompleteSearch
 
     try:
         search = read_design(goal)
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {goal}: {problem}")
+    if isinstance(search, CompleteSearch):
+        _show_all(goal, search, results, out, json)
+        return
     found = search(starts, seed, results)
     mech = search.problem.mechanism
     lines = {"starts": f"{starts}, of which {len(found.losses)} ended within the limits"}
     for k, one in enumerate(found):
         lines[f"design {k + 1}"] = f"loss {one.loss:.8g}, largest residual {np.max(np.abs(one.residuals)):.3g}"
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        for k, one in enumerate(found):
-            udk.save(one.mechanism, out / f"design{k + 1}.toml")
-            traces = [search.problem.goal.point] if isinstance(search.problem.goal, udk.PathGoal) else None
-            udk.animate(one.mechanism, one.motion(), measures=(), traces=traces).save(out / f"design{k + 1}.html")
-        lines["written"] = str(out)
+        lines["written"] = _write(found, search.problem.goal, out)
     listed = [
         {
             "loss": one.loss,
@@ -73,3 +74,55 @@ def design(
     )
     if not len(found):
         fail("nothing was found within the limits: give more --starts, or wider bounds")
+
+
+def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
+    """Find all solutions of a file; show counts, and the first ones."""
+    import udkjax as udk
+    from udkjax.show.summary import table
+
+    try:
+        found = search()
+    except ValueError as problem:
+        if isinstance(problem, udk.SceneError):
+            raise
+        refuse(f"{file}: {problem}")
+    chosen = [found[k] for k in range(min(results, len(found)))]
+    lines = {"solutions": ", ".join(f"{count} {name}" for name, count in found.paths.items())}
+    lines["real, proven"] = f"{found.classes}, {found.unproven} more without a proof; {len(found)} four-bars"
+    for name in dict.fromkeys(found.defects):
+        lines[f"defect {name}"] = str(found.defects.count(name))
+    for k, one in enumerate(chosen):
+        lines[f"design {k + 1}"] = f"{one.kind}, defect {one.defect}, transmission {one.transmission:.3g}, class {one.number}"
+    if out is not None:
+        lines["written"] = _write(chosen, search.goal, out)
+    names = (
+        "kind",
+        "turns",
+        "defect",
+        "circuits",
+        "branches",
+        "order",
+        "transmission",
+        "confirmed",
+        "radius",
+        "number",
+        "cognate",
+    )
+    listed = [{name: getattr(one, name) for name in (*names, "values", "pins")} for one in chosen]
+    counts = {"solutions": found.paths, "classes": found.classes, "unproven": found.unproven, "four_bars": len(found)}
+    show({**counts, "designs": listed}, table(f"four-bars of {found.mechanism.name or 'a drawing'}", lines), json)
+    if not len(found):
+        fail("no real four-bar meets the goal exactly: drop complete = true for the nearest")
+
+
+def _write(found: Iterable[Any], goal: Any, out: Path) -> str:
+    """Write each design as a drawing and as a page that moves; return where."""
+    import udkjax as udk
+
+    out.mkdir(parents=True, exist_ok=True)
+    traces = [goal.point] if isinstance(goal, udk.PathGoal) else None
+    for k, one in enumerate(found):
+        udk.save(one.mechanism, out / f"design{k + 1}.toml")
+        udk.animate(one.mechanism, one.motion(), measures=(), traces=traces).save(out / f"design{k + 1}.html")
+    return str(out)

@@ -62,7 +62,7 @@ class DesignSearch:
         if transmission >= np.pi / 2:
             raise ValueError(f"transmission must be an angle below a right one (rad), not {transmission:g}")
         numbers = FreeNumbers(mechanism, _all_pins(mechanism) if free is None else free)
-        driver = _only_driver(mechanism) if driver is None else driver
+        driver = only_driver(mechanism) if driver is None else driver
         goal.check(mechanism)
         goal.check_line(mechanism)
         found = read_bounds(numbers, bounds or {}, _places(mechanism, goal), mechanism.name)
@@ -175,7 +175,8 @@ def _all_pins(mechanism: Mechanism) -> list[str]:
     return [f"pin.{name}" for name in mechanism.drawing.groups["pin"]]
 
 
-def _only_driver(mechanism: Mechanism) -> str:
+def only_driver(mechanism: Mechanism) -> str:
+    """Return the name of the only driver; raise `SceneError` where there is none, or more."""
     names = mechanism.driver_names
     if len(names) != 1:
         there = f"there are {', '.join(names)}" if names else "there is none in the scene"

@@ -12,9 +12,11 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.toml_text import parse_toml
 from udkjax.study.design.design import DesignSearch
 from udkjax.study.design.goals import FunctionGoal, Goal, PathGoal, PoseGoal
+from udkjax.study.synthesis.complete_design import CompleteSearch
 
 Table = Mapping[str, Any]
-TOP = ("mechanism", "units", "goal", "free", "driver", "bounds", "length", "transmission", "rotation")
+TOP = ("mechanism", "units", "goal", "complete", "free", "driver", "bounds", "length", "transmission", "rotation")
+SEARCHED = ("free", "bounds", "length", "transmission", "rotation")  # what only a search can hold to
 LENGTH = ("pins", "least", "most")
 # The keys of each kind of goal, and the SI units of those that have some; "value" is that of what drives.
 GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
@@ -30,8 +32,8 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
 }
 
 
-def read_design(path: str | os.PathLike[str]) -> DesignSearch:
-    """Return the search that a file describes.
+def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
+    """Return the search that a file describes; with `complete = true` that of all solutions.
 
     Args:
         path: the file; the mechanism's file is named relative to it.
@@ -46,6 +48,13 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch:
     problems += [f"{key} is missing" for key in ("mechanism", "goal") if key not in table]
     units = Units(table.get("units"))
     problems += units.problems
+    complete = table.get("complete", False)
+    if not isinstance(complete, bool):
+        problems.append("complete must be true or false")
+    elif complete:
+        problems += [
+            f"{key} is given with complete = true, which finds all solutions: leave it out" for key in SEARCHED if key in table
+        ]
     if problems:
         raise SceneError(problems, name)
     mechanism = load(Path(path).parent / str(table["mechanism"]))
@@ -56,6 +65,10 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch:
     if problems:
         raise SceneError(problems, name)
     assert goal is not None and isinstance(transmission, float | int)
+    if complete:
+        if not isinstance(goal, PathGoal | PoseGoal):
+            raise SceneError(['goal.kind must be "path" or "poses" where complete = true'], name)
+        return CompleteSearch(mechanism, goal, table.get("driver"))
     choices = {key: table[key] for key in ("free", "driver", "rotation") if key in table}
     try:
         return DesignSearch(mechanism, goal, bounds=bounds, lengths=lengths, transmission=float(transmission), **choices)

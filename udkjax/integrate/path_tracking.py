@@ -1,0 +1,195 @@
+"""Solutions of polynomial systems followed along paths of their parameters: many side by side, each with steps of its own.
+
+H(z, p) = 0 has the solutions z(s) for p = p0 + s (p1 - p0). Each is predicted by the cubic through its last two points and
+their rates, and corrected by Newton's method; a step is taken where that converges as fast as it does near a solution. s goes
+from 0 to 1 on a curve of the complex plane, s = t + i c t (1 - t), so that another c is another way around the parameters at
+which solutions meet.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.expressions import ScalarProgram
+from udkjax.native.batch_program import BatchProgram
+
+FIRST_STEP = 0.02  # of the way; predicted along the rate, and shortened where that is too far
+SHORTEST_STEP = 1e-10  # of the way: a path that takes shorter ones does not go on
+LEAST_SIZE = 0.1  # units: what an unknown is judged by at least
+LARGEST = 1e7  # units: an unknown beyond that has gone to infinity
+END_TOL = 1e-12  # a Newton step at the end, beside the unknowns, that rounding alone explains where F' is well conditioned
+END_CORRECTIONS = 12
+GROWTH = 2.0  # of a step, at most
+# Towards the end of a path to infinity an unknown goes like a power of the way that is left, of a whole number or a fraction like
+# 1/3; none does on the way to a finite point. Within these bounds a power is one; the way is then at most NEAR_END.
+POWERS = (0.1, 3.0)
+NEAR_END = 0.05
+ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3
+
+
+class Precision(NamedTuple):
+    """How closely paths are followed: what a prediction may be off by, beside the unknowns, and the first and second correction.
+
+    The closer, the less likely does one path go over to another.
+    """
+
+    aim: float = 1e-3
+    first: float = 1e-2
+    second: float = 1e-5
+
+
+class TrackedPaths(NamedTuple):
+    """Ends of paths.
+
+    Attributes:
+        z: unknowns (N, M).
+        status: of each path (M,): ACCEPTED at a regular solution; INFINITE where an unknown goes to infinity or to zero; SINGULAR
+            near a point where Newton's method does not converge to rounding; LOST short of the end.
+        t: how far it came (M,), up to 1.
+        steps: how many steps it took (M,).
+    """
+
+    z: np.ndarray
+    status: np.ndarray
+    t: np.ndarray
+    steps: np.ndarray
+
+
+class _Points(NamedTuple):
+    """Paths under way: point, rate and t now, the same one step before, the next step, its number, and which path it is."""
+
+    z: np.ndarray
+    rate: np.ndarray
+    t: np.ndarray
+    z_before: np.ndarray
+    rate_before: np.ndarray
+    last: np.ndarray
+    step: np.ndarray
+    taken: np.ndarray
+    path: np.ndarray
+
+    def take(self, which: np.ndarray) -> "_Points":
+        return _Points(*(a[..., which] for a in self))
+
+
+class PathTracker:
+    """Follow solutions of a system along lines of its parameters.
+
+    Args:
+        program: from real and imaginary parts of z (N) and s, and of p0 and p1 - p0, to those of the Newton step and of dz/ds.
+        unknowns: N.
+    """
+
+    def __init__(self, program: ScalarProgram, unknowns: int):
+        self.unknowns = unknowns
+        self._program = BatchProgram(program, len(program.inputs) - 2 * unknowns - 2)
+
+    def __call__(
+        self,
+        z: np.ndarray,
+        start: np.ndarray,
+        end: np.ndarray,
+        precision: Precision | None = None,
+        bend: float = 0.0,
+        most: int = 3000,
+    ) -> TrackedPaths:
+        """Follow the solutions z (N, M) at the parameters `start` to those at `end`.
+
+        Args:
+            z: solutions.
+            start: parameters p0, complex.
+            end: parameters p1.
+            precision: how closely.
+            bend: c, of the way that s takes.
+            most: steps of a path.
+        """
+        precision = precision or Precision()
+        moved = end - start
+        shared = np.concatenate([np.real(start), np.imag(start), np.real(moved), np.imag(moved)])
+        count = z.shape[1]
+        out, status = np.array(z, complex), np.full(count, LOST)
+        reached, taken = np.zeros(count), np.zeros(count, int)
+        step, rate = self._evaluate(z, np.zeros(count), bend, shared)
+        zeros = np.zeros(count)
+        points = _Points(
+            z + step, rate, zeros, z, rate, zeros, np.full(count, FIRST_STEP), np.zeros(count, int), np.arange(count)
+        )
+        while len(points.path):
+            points = self._advance(points, bend, shared, precision)
+            size = np.max(np.abs(points.z), axis=0)
+            is_over = (points.t >= 1.0) | (points.step < SHORTEST_STEP) | ~(size < LARGEST) | (points.taken >= most)
+            if is_over.any():
+                gone = points.take(is_over)
+                out[:, gone.path], reached[gone.path], taken[gone.path] = gone.z, gone.t, gone.taken
+                status[gone.path] = _ends(gone)
+                points = points.take(~is_over)
+        there = np.flatnonzero(reached >= 1.0)
+        if len(there):
+            out[:, there], converged = self.polish(out[:, there], end)
+            status[there] = np.where(converged, ACCEPTED, status[there])
+        return TrackedPaths(out, status, reached, taken)
+
+    def polish(self, z: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return solutions (N, M) by Newton's method at some parameters, and whether it converged to rounding."""
+        shared = np.concatenate([np.real(parameters), np.imag(parameters), np.zeros(2 * len(parameters))])
+        zeros, best = np.zeros(z.shape[1]), np.full(z.shape[1], np.inf)
+        for _ in range(END_CORRECTIONS):
+            step, _ = self._evaluate(z, zeros, 0.0, shared)
+            size = _relative(step, z)
+            better = size < best
+            if not better.any():
+                break
+            z, best = np.where(better, z + step, z), np.where(better, size, best)
+        return z, best < END_TOL
+
+    def _evaluate(self, z: np.ndarray, t: np.ndarray, bend: float, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Newton step and dz/dt."""
+        n = self.unknowns
+        found = self._program(np.concatenate([np.real(z), np.imag(z), t[None], (bend * t * (1.0 - t))[None]]), shared)
+        step, rate = (found[k : k + n] + 1j * found[k + n : k + 2 * n] for k in (0, 2 * n))
+        return step, rate * (1.0 + 1j * bend * (1.0 - 2.0 * t))
+
+    def _advance(self, p: _Points, bend: float, shared: np.ndarray, precision: Precision) -> _Points:
+        """Try a step of each path; take it, or shorten it."""
+        step = np.minimum(p.step, 1.0 - p.t)
+        t = np.where(p.step >= 1.0 - p.t, 1.0, p.t + step)
+        guess = _predict(p, step)
+        first, _ = self._evaluate(guess, t, bend, shared)
+        z = guess + first
+        second, rate = self._evaluate(z, t, bend, shared)
+        e1, e2 = _relative(first, z), _relative(second, z)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            good = (e1 < precision.first) & (e2 < precision.second)
+            factor = np.where(good, np.clip((precision.aim / np.maximum(e1, 1e-300)) ** 0.25, 0.3, GROWTH), 0.5)
+        following = step * factor
+        keep = ~good
+        new = _Points(z + second, rate, t, p.z, p.rate, step, following, p.taken + 1, p.path)
+        old = p._replace(step=following, taken=p.taken + 1)
+        return _Points(*(np.where(keep, a, b) for a, b in zip(old, new, strict=True)))
+
+
+def _ends(p: _Points) -> np.ndarray:
+    """Return what became of paths that do not go on, by the power with which their fastest unknown changes."""
+    left = 1.0 - p.t
+    with np.errstate(invalid="ignore", divide="ignore"):
+        power = np.max(np.abs(p.rate) / np.abs(p.z), axis=0) * left
+    escapes = (left < NEAR_END) & (power > POWERS[0]) & (power < POWERS[1])
+    found = np.where(escapes, INFINITE, np.where((left < NEAR_END) & (power <= POWERS[0]), SINGULAR, LOST))
+    return np.where(np.max(np.abs(p.z), axis=0) < LARGEST, found, INFINITE)
+
+
+def _predict(p: _Points, step: np.ndarray) -> np.ndarray:
+    """Extrapolate the cubic through the last two points; of a first step, the tangent."""
+    known = p.last > 0
+    before = np.where(known, p.last, 1.0)
+    u = 1.0 + step / before
+    u2, u3 = u * u, u * u * u
+    cubic = (2 * u3 - 3 * u2 + 1) * p.z_before + (u3 - 2 * u2 + u) * before * p.rate_before
+    cubic += (3 * u2 - 2 * u3) * p.z + (u3 - u2) * before * p.rate
+    return np.where(known, cubic, p.z + step * p.rate)
+
+
+def _relative(step: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return the largest of the unknowns' steps beside themselves (M,); infinite where one is not a number."""
+    size = np.max(np.abs(step) / np.maximum(np.abs(z), LEAST_SIZE), axis=0)
+    return np.where(np.isfinite(size), size, np.inf)

@@ -1,0 +1,125 @@
+"""Real numbers known to within a radius, in arrays: what is computed from them holds whatever was rounded on the way.
+
+A ball is a middle and a radius. Middles are of the longest floating-point type that the processor has; each operation adds to
+the radius what its rounding may be off by, and radii, in float64, are rounded up by INFLATE, which is more than all the
+operations of a certificate could lose.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+LONG = np.longdouble
+ROUNDING = float(np.finfo(LONG).eps)  # relative, of one operation on middles: twice what it can be
+INFLATE = 1.0 + 1e-10  # of a radius, by each operation: some 1e6 roundings of float64
+SMALLEST = float(np.finfo(float).tiny)  # what may be lost to underflow
+
+
+class Ball(NamedTuple):
+    """Numbers between mid - rad and mid + rad."""
+
+    mid: np.ndarray
+    rad: np.ndarray
+
+    __array_ufunc__ = None  # of arrays and balls, the balls' operators are meant
+
+    @classmethod
+    def of(cls, x: Any, rad: Any = 0.0) -> "Ball":
+        """Return numbers as balls."""
+        mid = np.asarray(x, LONG)
+        return cls(mid, np.broadcast_to(np.asarray(rad, float), mid.shape))
+
+    def __add__(self, other: Any) -> "Ball":  # pyright: ignore[reportIncompatibleMethodOverride]
+        b = _ball(other)
+        mid = self.mid + b.mid
+        return Ball(mid, _up(self.rad + b.rad + ROUNDING * _size(mid)))
+
+    __radd__ = __add__
+
+    def __neg__(self) -> "Ball":
+        return Ball(-self.mid, self.rad)
+
+    def __sub__(self, other: Any) -> "Ball":
+        return self + -_ball(other)
+
+    def __rsub__(self, other: Any) -> "Ball":
+        return _ball(other) - self
+
+    def __mul__(self, other: Any) -> "Ball":  # pyright: ignore[reportIncompatibleMethodOverride]
+        b = _ball(other)
+        mid, one, two = self.mid * b.mid, _size(self.mid), _size(b.mid)
+        return Ball(mid, _up(one * b.rad + two * self.rad + self.rad * b.rad + ROUNDING * _size(mid)))
+
+    __rmul__ = __mul__  # pyright: ignore[reportAssignmentType]
+
+    def __truediv__(self, other: Any) -> "Ball":
+        """Return the quotient: of infinite radius where the divisor may be zero."""
+        b = _ball(other)
+        least = _size(b.mid) / INFLATE - b.rad
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mid = self.mid / b.mid
+            rad = _up((self.rad + _size(mid) * b.rad) / least + ROUNDING * _size(mid))
+        return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
+
+    def part(self, index: Any) -> "Ball":
+        """Return some of the numbers."""
+        return Ball(self.mid[index], self.rad[index])
+
+    @property
+    def largest(self) -> np.ndarray:
+        """The largest modulus of any number of the ball, in float64."""
+        return _up(_size(self.mid) + self.rad)
+
+    @property
+    def least(self) -> np.ndarray:
+        """The least modulus of any number of the ball, in float64: zero or less where zero is one of them."""
+        return (_size(self.mid) / INFLATE - self.rad) / INFLATE
+
+    def overlaps(self, other: "Ball") -> np.ndarray:
+        """Return where two balls may have a number in common."""
+        return ~((self - other).least > 0)
+
+
+class ComplexBall(NamedTuple):
+    """Complex numbers of which both parts are balls."""
+
+    re: Ball
+    im: Ball
+
+    def __add__(self, other: "ComplexBall") -> "ComplexBall":  # pyright: ignore[reportIncompatibleMethodOverride]
+        return ComplexBall(self.re + other.re, self.im + other.im)
+
+    def __sub__(self, other: "ComplexBall") -> "ComplexBall":
+        return ComplexBall(self.re - other.re, self.im - other.im)
+
+    def __mul__(self, other: "ComplexBall") -> "ComplexBall":  # pyright: ignore[reportIncompatibleMethodOverride]
+        return ComplexBall(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
+
+    def __truediv__(self, other: "ComplexBall") -> "ComplexBall":
+        size = other.re * other.re + other.im * other.im
+        found = self * ComplexBall(other.re, -other.im)
+        return ComplexBall(found.re / size, found.im / size)
+
+    def part(self, index: Any) -> "ComplexBall":
+        """Return some of the numbers."""
+        return ComplexBall(self.re.part(index), self.im.part(index))
+
+    def overlaps(self, other: "ComplexBall") -> np.ndarray:
+        """Return where two may have a number in common."""
+        return self.re.overlaps(other.re) & self.im.overlaps(other.im)
+
+    def distance(self, z: np.ndarray) -> np.ndarray:
+        """Return how far any number of these may be from complex numbers, at most."""
+        return np.hypot((self.re - np.real(z)).largest, (self.im - np.imag(z)).largest) * INFLATE
+
+
+def _ball(x: Any) -> Ball:
+    return x if isinstance(x, Ball) else Ball.of(x)
+
+
+def _size(x: np.ndarray) -> np.ndarray:
+    return np.abs(x).astype(float) * INFLATE
+
+
+def _up(x: np.ndarray) -> np.ndarray:
+    return x * INFLATE + SMALLEST

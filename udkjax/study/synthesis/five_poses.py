@@ -1,0 +1,119 @@
+"""All dyads through five poses of a link (Burmester): up to four real ones, and so up to six four-bars.
+
+For a joint (x, y) of the link the pivot (a, b) is the solution of four linear equations, M(x, y, 1) (a, b, 1) = 0, whose
+entries are linear, too: M has rank two where its four minors vanish, which are cubics. Four cubics of this kind have six
+common zeros (Hilbert and Burch), two of them the isotropic points at infinity. In coordinates of which no zero is at infinity
+the monomials up to second order are a basis of all polynomials modulo the minors, and the zeros are eigenvectors of a matrix
+of six rows.
+"""
+
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.study.synthesis.balls import ROUNDING, Ball
+from udkjax.study.synthesis.certificate import Certificate, certify
+from udkjax.study.synthesis.nine_points import displacements, power_of_two_near
+from udkjax.study.synthesis.planar_dyads import dyad_system
+
+DYADS = 4  # of generic poses, complex ones counted
+NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
+AT_INFINITY = 1e-7  # a joint or pivot so many times as far away as the poses are from each other is at infinity
+ISOTROPIC = 1e-6  # from the isotropic points, of two homogeneous coordinates of length one
+LEAST_PIVOT = 1e-11  # of the cubic terms of the minors: below it, zeros are no isolated ones
+MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+CUBIC = ((3, 0), (2, 1), (1, 2), (0, 3))
+SINE_TOL = 8.0 * ROUNDING  # what a sine of the longest floating-point type may be off by
+
+
+class RealDyads(NamedTuple):
+    """Dyads through five poses, in units of `scale` from the first place.
+
+    Attributes:
+        boxes: proven to hold one solution each: x, y of the joint, a, b of the pivot.
+        turns: of the link in each pose, as complex numbers (5,).
+        infinite: how many have a joint or a pivot at infinity, complex ones counted.
+        unproven: how many more appear to be real, but could not be proven.
+        scale: m, a power of two.
+    """
+
+    boxes: Certificate
+    turns: np.ndarray
+    infinite: int
+    unproven: int
+    scale: float
+
+
+def find_real_dyads(poses: np.ndarray) -> RealDyads:
+    """Return the real dyads through five poses (5, 3); raise `ValueError` where dyads are no isolated ones."""
+    scale = power_of_two_near(poses[:, :2]) if np.ptp(poses[:, :2], axis=0).any() else 1.0
+    d = displacements(np.asarray(poses[:, :2], np.longdouble) / scale)
+    angle = np.asarray(poses[:, 2], np.longdouble) - np.longdouble(poses[0, 2])
+    turn = angle[1:, None]
+    rounded = SINE_TOL + ROUNDING * np.abs(turn).astype(float)
+    d = d._replace(c=Ball.of(np.cos(turn), rounded), s=Ball.of(np.sin(turn), rounded))
+    joints, pivots = _zeros(*(part.mid[:, 0].astype(float) for part in d))
+    points = np.concatenate([joints, pivots])
+    is_finite = (np.abs(points[[2, 5]]) > AT_INFINITY * np.max(np.abs(points[[0, 1, 3, 4]]), axis=0)).all(axis=0)
+    u = np.concatenate([joints[:2] / joints[2], pivots[:2] / pivots[2]])[:, is_finite]
+    reality = np.max(np.abs(np.imag(u)), axis=0) / (1.0 + np.max(np.abs(u), axis=0))
+    near = reality < NEARLY_REAL
+    found = certify(dyad_system(d), np.real(u)[:, near])
+    proven = np.flatnonzero(found.is_proven & _first_of_each(found))
+    sure = int(np.count_nonzero(~found.is_proven & (reality[near] < SURELY_REAL)))
+    turns = np.exp(1j * angle.astype(float))
+    return RealDyads(found.take(proven), turns, int(np.count_nonzero(~is_finite)), sure, scale)
+
+
+def _first_of_each(found: Certificate) -> np.ndarray:
+    """Return which boxes do not overlap one before them."""
+    keep = np.ones(len(found.is_proven), bool)
+    for j, i in combinations(range(len(keep)), 2):
+        keep[i] &= not (keep[j] and found.balls.part(np.s_[:, i]).overlaps(found.balls.part(np.s_[:, j])).all())
+    return keep
+
+
+def _zeros(dx: np.ndarray, dy: np.ndarray, c: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return homogeneous joints (3, 4) and pivots (3, 4) of all dyads, complex."""
+    half = 0.5 * (dx**2 + dy**2)
+    # L[j, k] are the coefficients by (x, y, 1) of entry k of row j.
+    L = np.array([
+        [[1 - c, s, -dx], [-s, 1 - c, -dy], [dx * c + dy * s, dy * c - dx * s, half]],
+    ])[0].transpose(2, 0, 1)  # fmt: skip
+    Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]  # no zero of it is at infinity, with probability one
+    L = L @ Q
+    minors = [_determinant(L[list(rows)]) for rows in combinations(range(4), 3)]
+    table = np.array([[minor.get(m, 0.0) for m in (*CUBIC, *MONOMIALS)] for minor in minors])
+    table /= np.linalg.norm(table, axis=1, keepdims=True) + (np.linalg.norm(table, axis=1, keepdims=True) == 0)
+    if np.linalg.svd(table[:, :4], compute_uv=False)[-1] < LEAST_PIVOT:
+        raise ValueError("dyads through these poses are no isolated ones: change a pose that others repeat, mirror or translate")
+    reduced = -np.linalg.solve(table[:, :4], table[:, 4:])
+    steps = []
+    for move in ((1, 0), (0, 1)):
+        rows = []
+        for m in MONOMIALS:
+            to = (m[0] + move[0], m[1] + move[1])
+            rows.append(np.eye(6)[MONOMIALS.index(to)] if to in MONOMIALS else reduced[CUBIC.index(to)])
+        steps.append(np.array(rows))
+    _, vectors = np.linalg.eig(0.6 * steps[0] + 0.8 * steps[1])
+    joints = Q @ np.stack([vectors[1], vectors[2], vectors[0]])
+    joints = joints / np.linalg.norm(joints, axis=0)
+    off = [np.abs(joints[2]) + np.abs(joints[0] + way * 1j * joints[1]) for way in (1, -1)]
+    order = np.argsort(np.minimum(*off))
+    joints = joints[:, np.sort(order[2:])]
+    rows = np.einsum("jkx,xm->mjk", L @ Q.T, joints)
+    pivots = np.linalg.svd(rows)[2][:, -1].conj().T
+    return joints, pivots
+
+
+def _determinant(A: np.ndarray) -> dict[tuple[int, int], float]:
+    """Return the determinant of a matrix (3, 3) of linear forms (3,) by monomials of two variables; the third one is one."""
+    found: dict[tuple[int, int], float] = {}
+    for columns in permutations(range(3)):
+        sign = np.linalg.det(np.eye(3)[list(columns)])
+        for p, q, r in np.ndindex(3, 3, 3):
+            m = ((p, q, r).count(0), (p, q, r).count(1))
+            i, j, k = columns
+            found[m] = found.get(m, 0.0) + sign * A[0, i, p] * A[1, j, q] * A[2, k, r]
+    return found

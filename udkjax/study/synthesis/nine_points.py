@@ -1,0 +1,252 @@
+"""All four-bars through nine points: a parameter homotopy from 1,442 known classes of solutions, then certificates of the real
+ones.
+
+Generic nine points have 8,652 solutions in complex numbers, 1,442 classes of six: Roberts's three cognates, each with its
+dyads in either order. One of each class, at displacements that are complex numbers drawn at random, is in a file beside this
+module (made by experiments/nine_points.py); each is followed to the displacements that are asked for.
+
+Source: C. W. Wampler, A. P. Morgan, A. J. Sommese, Complete solution of the nine-point path synthesis problem for four-bar
+linkages, J. Mech. Des. 114 (1992).
+"""
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from udkjax.integrate.path_tracking import ACCEPTED, INFINITE, SINGULAR, PathTracker, Precision
+from udkjax.study.synthesis.balls import LONG, Ball
+from udkjax.study.synthesis.boxes import certainly_different
+from udkjax.study.synthesis.certificate import Certificate, certify
+from udkjax.study.synthesis.dyad_programs import JOINTS, POINTS, UNKNOWNS, newton_and_tangent
+from udkjax.study.synthesis.planar_dyads import Displacements, four_bar_system
+
+CLASSES = 1442
+STARTS = Path(__file__).with_name("nine_points.npz")
+FIRST = Precision(3e-3, 3e-2, 1e-5)
+CLOSE = Precision(3e-4, 3e-3, 1e-6)
+BENDS = (0.0, 0.6, -0.6)  # ways around the parameters at which solutions meet, tried in turn while classes are missing
+ALIKE = 1e-7  # relative: classes whose pivots differ by less are one; more, where there would be too many classes
+# Beside the largest unknown: coordinates whose conjugates agree so well may be a real four-bar, which the certificate decides.
+NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
+REFINED = 1e-8  # a Newton step with residuals in long numbers, beside the unknowns, that shows a regular solution
+REFINEMENTS = 8
+
+
+class Paths(NamedTuple):
+    """What became of the paths of a homotopy.
+
+    Attributes:
+        tracked: how many there are: one for each class of generic data.
+        regular: distinct classes that were found.
+        infinite: paths to four-bars with a joint at infinity.
+        singular: paths to solutions at which others meet, or which are no isolated ones.
+        lost: paths that could not be followed to their end.
+    """
+
+    tracked: int
+    regular: int
+    infinite: int
+    singular: int
+    lost: int
+
+
+class RealClasses(NamedTuple):
+    """Four-bars of real classes, one each, in units of `scale` from the first place.
+
+    Attributes:
+        boxes: proven to hold one solution each: x, y, a, b of both dyads, then cosines and sines of the coupler's turns.
+        paths: what became of all paths.
+        unproven: how many more appear to be real, but could not be proven.
+        scale: m, a power of two.
+    """
+
+    boxes: Certificate
+    paths: Paths
+    unproven: int
+    scale: float
+
+
+def find_real_classes(points: np.ndarray) -> RealClasses:
+    """Return the real classes of four-bars through nine points (9, 2)."""
+    scale = power_of_two_near(points)
+    places = np.asarray(points, LONG) / scale
+    d = places[1:] - places[0]
+    z, paths = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
+    x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
+    reality = np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0))
+    near = reality < NEARLY_REAL
+    joints, turns = 0.5 * (x + conjugates)[:, near], z[JOINTS:, near]
+    turns = turns / np.abs(turns)
+    u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
+    found = certify(four_bar_system(displacements(places)), u)
+    keep = np.flatnonzero(found.is_proven)
+    keep = keep[distinct(isotropic(found.middle[:, keep]))]
+    sure = np.count_nonzero(~found.is_proven & (reality[near] < SURELY_REAL))
+    proven = certainly_different(found.take(keep))
+    boxes, sure = found.take(keep[proven]), int(sure + len(keep) - len(proven))
+    return RealClasses(boxes, paths, sure, scale)
+
+
+def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths]:
+    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of a size of one."""
+    target = np.concatenate([d, d.conj()])
+    start, parameters = start_solutions()
+    follow = tracker()
+
+    def take(which: np.ndarray, precision: Precision, bend: float) -> tuple[np.ndarray, np.ndarray]:
+        ends = follow(start[:, which], parameters, target, precision, bend)
+        return _refined(ends.z, ends.status, target)
+
+    every = np.arange(start.shape[1])
+    z, status = take(every, FIRST, BENDS[0])
+    again = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
+    if len(again):
+        z[:, again], status[again] = take(again, CLOSE, BENDS[0])
+    known = _merged(z[:, status == ACCEPTED])
+    for bend in BENDS[1:]:
+        if known.shape[1] == CLASSES or not len(again):
+            break
+        more, found = take(every, CLOSE, bend)
+        before, known = known.shape[1], _merged(known, more[:, found == ACCEPTED])
+        if known.shape[1] == before:
+            break
+    missing = CLASSES - known.shape[1]
+    infinite = min(int(np.count_nonzero(status == INFINITE)), missing)
+    singular = min(int(np.count_nonzero(status == SINGULAR)), missing - infinite)
+    return known, Paths(CLASSES, known.shape[1], infinite, singular, missing - infinite - singular)
+
+
+@cache
+def tracker() -> PathTracker:
+    """Return the tracker of four-bars through nine points, compiled."""
+    return PathTracker(newton_and_tangent(), UNKNOWNS)
+
+
+@cache
+def start_solutions() -> tuple[np.ndarray, np.ndarray]:
+    """Return the stored solutions (16, 1442) and their displacements (16,)."""
+    with np.load(STARTS) as file:
+        joints, parameters = file["joints"], file["displacements"]
+    z, converged = tracker().polish(np.concatenate([joints, turns_of(joints, parameters)]), parameters)
+    if not converged.all():
+        raise RuntimeError(f"{STARTS} is damaged: {np.count_nonzero(~converged)} of its solutions are none")
+    return z, parameters
+
+
+def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Return the turns t (8, M) of four-bars whose joints are known: both dyads' equations are linear in t and 1/t."""
+    d, D = parameters[:POINTS, None], parameters[POINTS:, None]
+    rows = []
+    for x, X, a, A in (joints[:4], joints[4:]):
+        rows.append((x * (D - A), X * (d - a), a * D + A * d - d * D - x * A - X * a))
+    (u, v, w), (p, q, r) = rows
+    return (w * q - v * r) / (u * q - v * p)
+
+
+def displacements(places: np.ndarray) -> Displacements:
+    """Return displacements from the first of some places (J + 1, 2), as balls: places are exact, differences rounded."""
+    moved = Ball.of(places[1:]) - Ball.of(places[:1])
+    return Displacements(moved.part(np.s_[:, :1]), moved.part(np.s_[:, 1:]))
+
+
+def power_of_two_near(points: np.ndarray) -> float:
+    """Return the power of two next to the size of some points: dividing by it rounds nothing."""
+    spread = points - points.mean(axis=0)
+    return 2.0 ** np.round(np.log2(np.sqrt(np.mean(np.sum(spread**2, axis=1)))))
+
+
+def isotropic(u: np.ndarray) -> np.ndarray:
+    """Return x, X, a, A, y, Y, b, B (8, M) of real coordinates."""
+    z = (u[0:JOINTS:2] + 1j * u[1:JOINTS:2]).astype(complex)
+    return np.stack([z, z.conj()], 1).reshape(JOINTS, -1)
+
+
+# --- which of them are of one class
+
+
+def class_keys(z: np.ndarray) -> np.ndarray:
+    """Return numbers (4, M) that all six of a class share: symmetric functions of the pivots a, b, c of all cognates."""
+    x, X, a, A, y, Y, b, B = z[:JOINTS]
+    c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
+    return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
+
+
+def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """Return which of some solutions (M,) are in a class with others."""
+    found, places = np.zeros(z.shape[1], bool), np.flatnonzero(of)
+    found[places[np.unique(_pairs(z[:, places]))]] = True
+    return found
+
+
+def distinct(z: np.ndarray) -> np.ndarray:
+    """Return the places of the first solutions of each class: there are no more classes than generic points have."""
+    alike = ALIKE
+    while True:
+        keep = np.ones(z.shape[1], bool)
+        for i, j in _pairs(z, alike):
+            keep[j] &= not keep[i]
+        if np.count_nonzero(keep) <= CLASSES:
+            return np.flatnonzero(keep)
+        alike *= 10.0
+
+
+def _pairs(z: np.ndarray, alike: float = ALIKE) -> np.ndarray:
+    """Return pairs i < j of solutions of one class, sorted."""
+    if not z.shape[1]:
+        return np.zeros((0, 2), int)
+    keys = class_keys(z)
+    size = np.maximum(np.abs(keys), 1e-300)
+    keys = keys / size * np.log1p(size)  # near differences become relative ones
+    table = np.concatenate([np.real(keys), np.imag(keys)]).T
+    pairs = KDTree(np.where(np.isfinite(table), table, 0.0)).query_pairs(alike, output_type="ndarray")
+    return pairs[np.lexsort(pairs.T[::-1])]
+
+
+def _merged(*sets: np.ndarray) -> np.ndarray:
+    z = np.concatenate(sets, axis=1)
+    return z[:, distinct(z)]
+
+
+# --- ends of paths
+
+
+def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ends (16, M) and their status: what has not converged is tried with longer numbers."""
+    status, z = status.copy(), z.copy()
+    open_ends = np.flatnonzero((status != ACCEPTED) & np.isfinite(z).all(axis=0))
+    if not len(open_ends):
+        return z, status
+    w, p = z[:, open_ends].astype(np.clongdouble), target.astype(np.clongdouble)
+    size = np.full(len(open_ends), np.inf)
+    for _ in range(REFINEMENTS):
+        columns = np.maximum(np.abs(w), 0.1).astype(float)
+        slopes = _jacobian(w.astype(complex), target) * columns.T[:, None, :]
+        singular = ~(np.linalg.slogdet(np.where(np.isfinite(slopes), slopes, 0.0))[1] > -np.inf)
+        slopes[singular] = np.eye(UNKNOWNS)
+        step = np.linalg.solve(slopes, _residuals(w, p).T.astype(complex)[..., None])[..., 0].T
+        size = np.where(singular, np.inf, np.max(np.abs(step), axis=0))
+        w = w - np.where(np.isfinite(step), step, 0.0) * columns
+    good = size < REFINED
+    z[:, open_ends[good]], status[open_ends[good]] = w[:, good], ACCEPTED
+    return z, status
+
+
+def _residuals(z: np.ndarray, p: np.ndarray) -> np.ndarray:
+    t, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    return np.concatenate(
+        [t * x * (D - A) + X * (d - a) / t + d * D - a * D - A * d + x * A + X * a for x, X, a, A in (z[:4], z[4:JOINTS])]
+    )
+
+
+def _jacobian(z: np.ndarray, p: np.ndarray) -> np.ndarray:
+    t, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    found, places = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex), np.arange(POINTS)
+    for k, first in ((0, 0), (4, POINTS)):
+        x, X, a, A = z[k : k + 4]
+        for column, slope in enumerate((t * (D - A) + A, (d - a) / t + a, X - X / t - D, x - t * x - d)):
+            found[:, first : first + POINTS, k + column] = slope.T
+        found[:, first + places, JOINTS + places] = (x * (D - A) - X * (d - a) / t**2).T
+    return found
