@@ -68,7 +68,7 @@ def main(sets: int = SETS) -> None:
     print(f"    again {time.process_time() - begin:.2f} s CPU; paths {found.paths}, published {case['classes']} classes")
     print(f"    real classes proven {found.classes}, published {case['real_classes']}; without a proof {found.unproven}")
     print(
-        f"    four-bars {len(found)}, published {case['real_solutions_with_cognates_and_swaps']}; largest radius {found.radius.max():.1e} m"
+        f"    four-bars {len(found)}, published {case['real_solutions_with_cognates_and_swaps']}; to {found.radius.max():.1e} m"
     )
     print(
         f"    confirmed by motion {found.confirmed.mean():.2%} of positions; without defect {found.defects.count('none')}",

@@ -65,3 +65,43 @@ def test_mistakes_in_a_goal_are_named(folder, capsys, old, new, says):
     goal.write_text(GOAL.replace(old, new))
     assert udkjax("design", goal) == 2
     assert says in capsys.readouterr().err
+
+
+POSES = """
+mechanism = "four_bar.toml"
+complete = true
+units = {length = "cm", angle = "deg"}
+[goal]
+kind = "poses"
+body = "coupler"
+pin = "P"
+targets = [[1, 1, 0], [2, 0.5, 0], [3, 1.5, 40], [2, 2, 86], [1.5, 1.9, 109]]
+"""
+
+
+def test_all_four_bars_are_found_shown_and_written(folder, capsys):
+    goal = folder / "goal.toml"
+    goal.write_text(POSES)
+    assert udkjax("design", goal, "--results", 1, "--out", folder / "out", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["solutions"]["dyads"] == 4 and found["classes"] in (2, 4) and found["unproven"] == 0
+    (one,) = found["designs"]
+    mech = udk.load(folder / "out" / "design1.toml")
+    np.testing.assert_allclose(mech.parameters()["pin.P"], [0.01, 0.01], atol=1e-12)
+    np.testing.assert_allclose(mech.parameters()["pin.A"], one["pins"]["A"], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("complete = true", "complete = 1", "must be true or false"),
+        ("complete = true", "complete = true\ntransmission = 10", "leave it out"),
+        (", [1.5, 1.9, 109]", "", "five poses; there are 4"),
+        ('pin = "P"', "", "name the pin"),
+        ('kind = "poses"', 'kind = "function"', "unknown key"),
+    ],
+)
+def test_mistakes_of_complete_goals_are_told(folder, capsys, old, new, says):
+    (folder / "goal.toml").write_text(POSES.replace(old, new))
+    assert udkjax("design", folder / "goal.toml") == 2
+    assert says in capsys.readouterr().err

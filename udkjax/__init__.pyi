@@ -140,9 +140,6 @@ from udkjax.study.power_balance import power_balance as power_balance
 from udkjax.study.reaction_peaks import envelope as envelope
 from udkjax.study.reaction_peaks import pin_reactions as pin_reactions
 from udkjax.study.reaction_peaks import reaction_peaks as reaction_peaks
-from udkjax.study.synthesis import CompleteDesign as CompleteDesign
-from udkjax.study.synthesis import CompleteDesigns as CompleteDesigns
-from udkjax.study.synthesis import design_all as design_all
 from udkjax.study.sweep import Axis as Axis
 from udkjax.study.sweep import LatinHypercube as LatinHypercube
 from udkjax.study.sweep import Random as Random
@@ -150,6 +147,9 @@ from udkjax.study.sweep import Sobol as Sobol
 from udkjax.study.sweep import SweepError as SweepError
 from udkjax.study.sweep import Zipped as Zipped
 from udkjax.study.sweep import sweep as sweep
+from udkjax.study.synthesis import CompleteDesign as CompleteDesign
+from udkjax.study.synthesis import CompleteDesigns as CompleteDesigns
+from udkjax.study.synthesis import design_all as design_all
 from udkjax.study.transmission import Workspace as Workspace
 from udkjax.study.transmission import coupler_curve as coupler_curve
 from udkjax.study.transmission import mechanical_advantage as mechanical_advantage

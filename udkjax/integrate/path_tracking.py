@@ -28,7 +28,7 @@ ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3
 
 
 class Precision(NamedTuple):
-    """How closely paths are followed: what a prediction may be off by, beside the unknowns, and the first and second correction.
+    """Bounds to which paths are followed: of a prediction, and of the first and second correction, beside the unknowns.
 
     The closer, the less likely does one path go over to another.
     """

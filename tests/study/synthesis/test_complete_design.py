@@ -39,15 +39,15 @@ def test_the_published_problem_has_its_64_real_classes(published):
 
 def test_pins_hold_their_links_in_all_positions(published):
     """Each four-bar, its coupler turned by the angle that keeps one crank as long as it was, keeps the other one as well."""
-    O, A, B, P, C = ([1, 1j] @ published.pins[f"pin.{name}"].T for name in "OABPC")
+    pivot, joint, other, traced, end = ([1, 1j] @ published.pins[f"pin.{name}"].T for name in "OABPC")
     places = np.array(DATA["points"]) @ [1, 1j]
     for k in range(0, len(published), 7):
-        x, y, a, b = A[k] - P[k], B[k] - P[k], O[k], C[k]
+        x, y, a, b = joint[k] - traced[k], other[k] - traced[k], pivot[k], end[k]
         for place in places[1:]:
             # |place + t x - a| = |A - a|: t x (place - a)* has a known real part; of both roots one keeps the other crank, too.
-            w, size = x * np.conj(place - a), np.abs(A[k] - a) ** 2 - np.abs(place - a) ** 2 - np.abs(x) ** 2
+            w, size = x * np.conj(place - a), np.abs(joint[k] - a) ** 2 - np.abs(place - a) ** 2 - np.abs(x) ** 2
             t = np.exp(1j * (np.array([1, -1]) * np.arccos(np.clip(size / (2 * np.abs(w)), -1, 1)) - np.angle(w)))
-            off = np.abs(np.abs(place + t * y - b) - np.abs(B[k] - b))
+            off = np.abs(np.abs(place + t * y - b) - np.abs(other[k] - b))
             assert off.min() < 1e-6 * (1 + np.abs(b) + np.abs(y))
 
 

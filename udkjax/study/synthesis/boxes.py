@@ -1,4 +1,4 @@
-"""What follows for pins of four-bars, and of their cognates, from the boxes that hold exact solutions."""
+"""Boxes of the pins of four-bars and of their cognates, from those that hold exact solutions."""
 
 from itertools import permutations
 from typing import NamedTuple

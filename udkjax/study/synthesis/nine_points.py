@@ -36,7 +36,7 @@ REFINEMENTS = 8
 
 
 class Paths(NamedTuple):
-    """What became of the paths of a homotopy.
+    """Counts of the ends of a homotopy's paths.
 
     Attributes:
         tracked: how many there are: one for each class of generic data.

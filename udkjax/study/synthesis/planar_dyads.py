@@ -17,7 +17,7 @@ Numbers = Any  # arrays or balls
 
 
 class Displacements(NamedTuple):
-    """Where the traced point went from its first position (J, 1), and by which angles its link turned, where these are known."""
+    """Ways of the traced point from its first position (J, 1), and cosines and sines of its link's turns, where known."""
 
     x: Numbers
     y: Numbers
