@@ -39,19 +39,20 @@ class Solver(Memory):
         self.plan = plan
         self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
         self.places.add("fallback_tol")
+        self.dense_layouts = []
         layout = DenseLayout(self, code.matrices(m, n), (m, n))
         functions = []
-        for name in ("index", "factor", "solve"):
+        names = ["index", "factor", "solve", *(["solve_transposed"] if isinstance(method, pinv.SVD) else [])]
+        for name in names:
             f = Function(name, [(POINTER, "work")], width)
-            d = DenseMatrices(layout, f)
             if name == "index":
-                d.number_columns()
+                layout.number_columns(f)
             else:
-                getattr(code, name)(d)
+                getattr(code, name)(DenseMatrices(layout, f))
             functions.append(f)
         declared = sorted(set().union(*(f.declared for f in functions)))
         text = "\n".join([*declared, *(f.text() for f in functions)])
-        self._library = machine.library(text, ["index", "factor", "solve"])
+        self._library = machine.library(text, names)
         self._layout = layout
 
     def _view(self, memory, name):
@@ -61,17 +62,18 @@ class Solver(Memory):
         stride = self._layout.registers[name] * self.plan.vector
         return memory[start : start + rows * stride].reshape(rows, -1, width)[:, :columns]
 
-    def __call__(self, matrices, right, tols):
+    def __call__(self, matrices, right, tols, solve="solve"):
         """x and the ranks, of as many matrices as there are lanes."""
+        given, to = ("b", "x") if solve == "solve" else ("x", "b")
         size = self.places.size * self.plan.width
         memory = np.zeros(size + 8)
         memory = memory[(-memory.ctypes.data // 8) % 8 :][:size]
         memory[: self.plan.width] = tols
         self._view(memory, "D")[:] = np.moveaxis(matrices, 0, -1)
-        self._view(memory, "b")[0] = np.moveaxis(right, 0, -1)
-        for name in ("index", "factor", "solve"):
+        self._view(memory, given)[0] = np.moveaxis(right, 0, -1)
+        for name in ("index", "factor", solve):
             machine.function(self._library[name], ctypes.c_void_p)(memory.ctypes.data)
-        return np.moveaxis(self._view(memory, "x")[0], -1, 0), self._view(memory, "rank")[0, 0]
+        return np.moveaxis(self._view(memory, to)[0], -1, 0), self._view(memory, "rank")[0, 0]
 
 
 def solved(make, matrices, right, tols, width, relative=True):
@@ -111,6 +113,43 @@ def test_every_lane_has_a_rank_of_its_own(name, m, n, width):
     x, found = solved(METHODS[name], matrices, right, 1e-6, width)
     assert_array_equal(found, ranks)
     assert_allclose(x, [np.linalg.pinv(D, rcond=1e-6) @ b for D, b in zip(matrices, right, strict=True)], rtol=0, atol=1e-12)
+
+
+def one(matrix, right, tol, solve="solve"):
+    """By singular values, of one matrix."""
+    D = np.array(matrix, float)
+    m, n = D.shape
+    solver = Solver(pinv.SVD(1.0), m, n, 1)
+    return solver(D[None], np.array(right, float)[None], tol, solve)[0][0]
+
+
+@pytest.mark.parametrize("m, n", [(1, 6), (12, 12), (9, 5), (7, 11)])
+def test_transposed(m, n):
+    matrices, _ = random_matrices(m, n, [min(m, n), max(min(m, n) - 2, 1)])
+    for D in matrices:
+        x = np.random.default_rng(1).standard_normal(n)
+        assert_allclose(one(D, x, 1e-9, "solve_transposed"), np.linalg.pinv(D, rcond=1e-9).T @ x, rtol=0, atol=1e-12)
+
+
+def test_small_singular_values_are_exact_to_many_digits():
+    """Of rows of very different lengths, where what is found from D D^T would have none."""
+    (inner,), _ = random_matrices(3, 3, [3])
+    D, x = np.diag([1.0, 1e-5, 1e-10]) @ inner, [1.0, 2.0, 3.0]
+    assert_allclose(one(D, D @ x, 1e-14), x, rtol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-60, 1e60])
+def test_what_is_scaled_is_solved_alike(scale):
+    (D,), (b,) = random_matrices(4, 6, [3])
+    assert_allclose(one(scale * D, scale * b, 1e-9), one(D, b, 1e-9), rtol=1e-12)
+
+
+def test_zeros_and_numbers_that_are_none():
+    """Zeros have no rank, and what is not finite comes to an end."""
+    assert_array_equal(one(np.zeros((3, 4)), np.ones(3), 1e-9), np.zeros(4))
+    assert_allclose(one([[0.0, 0.0], [0.0, 2.0], [0.0, 0.0]], [5.0, 1.0, 7.0], 1e-9), [0.0, 0.5])
+    for bad in (np.nan, np.inf):
+        assert np.isnan(one([[1.0, bad], [2.0, 3.0]], [1.0, 1.0], 1e-9)).any()
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -17,7 +17,9 @@ from udkjax.native.ir import INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.members import write_begin, write_run
 from udkjax.native.module import Module
+from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.tableau import EULER
+from udkjax.native.weighted_rows import WeightedRows
 
 CORRECTED = "qv"  # what a correction is of, by its number in a record
 
@@ -32,13 +34,18 @@ class Closing(Module):
         plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, written_out=False, steps=False)
         super().__init__(plan, active=active)
         self.active, self.count = active, len(self.moving)
-        correction = LeastNormCorrection if code.is_small else EliminationCorrection
-        self.corrections = {x: correction(self, f"newton_{x}") for x in CORRECTED}
+        self._rows = WeightedRows(self, SVDCode(relative=True)) if code.is_small else None
+        self.corrections = {x: self._correction(f"newton_{x}") for x in CORRECTED}
         self.places.add("correction", max(x.stored for x in self.corrections.values()))
+
+    def _correction(self, name: str) -> LeastNormCorrection | EliminationCorrection:
+        return LeastNormCorrection(self, name, self._rows) if self._rows else EliminationCorrection(self, name)
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_programs()
+        if self._rows:
+            self._rows.write()
         for correction in self.corrections.values():
             correction.evaluation()
         self.write_derivatives()

@@ -15,11 +15,9 @@ vectors turn is left out, which costs as much of the derivative as their product
 Those of large scenes are by elimination of all rows, without those that depend on others.
 """
 
-from collections.abc import Iterator
-
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
 from udkjax.expressions.loop_program import LoopProgram, Reset
-from udkjax.native.ir import POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.module import Module
 from udkjax.native.program_derivative import ProgramDerivative
 from udkjax.native.weighted_rows import WeightedRows
@@ -44,21 +42,20 @@ class EliminationCorrection(ProgramDerivative):
 
 
 class LeastNormCorrection:
-    """A correction by singular values, of one lane. What is stored: x corrected, z, y."""
+    """A correction by singular values, of one lane. What is stored: x corrected, z, y.
 
-    def __init__(self, module: Module, name: str):
-        self._module, self._name, self._x = module, name, name[-1]
-        self._rows = WeightedRows(module)
+    An evaluation leaves the factors of A, by which derivatives at the same state solve.
+    """
+
+    def __init__(self, module: Module, name: str, rows: WeightedRows):
+        self._module, self._name, self._x, self._rows = module, name, name[-1], rows
         self.stored = 2 * module.n + module.m
         self._parts = module.code.rows("psi" if self._x == "q" else "psi_dot")
         fixed = {"t", "sines"} if module.moving else {"t", "sines", "constants"}
         self._derivative = LoopDerivative(self._parts, fixed)
         if "root" not in module.places.places:
-            sizes = {"psi_q": module.code.scratch["psi_q"], "psi": module.m, "root": module.n}
             module.places.add("root", module.n)
-            module.places.add("A", module.m * module.n)
-            module.places.add("right", module.n)
-            for name, size in sizes.items():
+            for name, size in {"psi_q": module.code.scratch["psi_q"], "psi": module.m, "root": module.n}.items():
                 module.places.add(f"change {name}", size)
 
     def place(self, name: str) -> int:
@@ -72,57 +69,48 @@ class LeastNormCorrection:
         return {prefix + x: ("work", self._module.places[f"change {x}"]) for x in ("psi_q", "psi", "root")}
 
     def _at(self, f: Function, name: str, i: Value) -> Value:
-        return f.load(f.given["work"], i + self._module.places[name])
+        return self._rows.array(f, name, i)
 
     def _put(self, f: Function, name: str, i: Value, x: Value):
-        f.store(x, f.given["work"], i + self._module.places[name])
+        self._rows.put(f, name, i, x)
 
     def _stored(self, f: Function, name: str, i: Value) -> Value:
         return f.load(f.given["stored"], i + self.place(name))
 
-    def _solve(self, f: Function, right: str, x: Value, transposed: bool = False):
-        """x = A^+ b, or (A^+)^T b, of an array in `work`, with A in an array of its own."""
-        n, m = self._module.n, self._module.m
-        rows, columns = (n, m) if transposed else (m, n)
-        A, b = self._rows.reserve(f, m * n, rows)
-        with f.each(m) as i, f.each(n) as k:
-            f.store(self._at(f, "A", i * n + k), A, k * m + i if transposed else i * n + k)
-        with f.each(rows) as i:
-            f.store(self._at(f, right, i), b, i)
-        self._rows.solve(f, A, b, x, (rows, columns, 1))
-
-    def _load_rows(self, f: Function):
-        """Compute A, and W r in `psi`, of the state."""
-        module = self._module
-        module.invoke(f, f"rows_{self._x}")
-        self._rows.write(f, module.address(f, "A"))
-        with f.each(module.m) as i:
-            self._put(f, "psi", i, self._at(f, "psi", i) * self._rows.weight(f, i))
+    def _weight(self, f: Function, i: Value) -> Value:
+        return self._rows.array(f, "weights", i)
 
     def evaluation(self):
+        """Write `evaluation_...(work, out, stored)`: the correction and z, with the rank."""
         module = self._module
         at = module.arrays | {"root": ("work", module.places["root"])}
         module.loops.write(LoopProgram([module.code.sincos, *self._parts]), f"rows_{self._x}", ("work", "out"), at)
-        f, _ = module.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
-        self._load_rows(f)
-        z = f.at(f.given["stored"], self.place("z"))
-        self._solve(f, "psi", z)
+        f, s = module.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
+        module.invoke(f, f"rows_{self._x}")
+        self._rows.factor(f)
+        s.rank = self._rows.matrices(f).row("rank").entry(0)
+        z = self._rows.solve(f, "psi")
         with f.each(module.n) as i:
-            f.store(self._at(f, f"state {self._x}", i) - self._at(f, "root", i) * self._stored(f, "z", i), f.given["stored"], i)
+            f.store(z.entry(i), f.given["stored"], i + self.place("z"))
+            f.store(self._at(f, f"state {self._x}", i) - self._at(f, "root", i) * z.entry(i), f.given["stored"], i)
 
     def write_adjoint(self):
         """`adjoint_...(work, stored)`: y, which derivatives need besides."""
-        module = self._module
-        f, _ = module.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
-        with f.each(module.n) as i:
-            self._put(f, "right", i, self._stored(f, "z", i))
-        self._solve(f, "right", f.at(f.given["stored"], self.place("y")), transposed=True)
+        f, _ = self._module.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
+        x = self._rows.matrices(f).row("x")
+        x.clear()
+        with f.each(self._module.n) as i:
+            x.put(i, self._stored(f, "z", i))
+        y = self._rows.solve_transposed(f)
+        with f.each(self._module.m) as i:
+            f.store(y.entry(i), f.given["stored"], i + self.place("y"))
 
     def prepare_derivative(self, f: Function):
         """Compute what derivatives need besides, behind an evaluation."""
         f.call(f"adjoint_{self._name}", f.given["work"], self._module.address(f, "correction"))
 
     def forward(self):
+        """Write `forward_...(work, stored, tangent, out)`: the change of the correction along one direction."""
         module, w = self._module, self._module.tangents
         at = module.arrays | {"root": ("work", module.places["root"])} | self._changes(TANGENT)
         places = {"constants": "constants", "q": "state q", "v": "state v"}
@@ -132,32 +120,30 @@ class LeastNormCorrection:
         arguments = [(POINTER, "work"), (POINTER, "stored"), (POINTER, "tangent"), (POINTER, "out")]
         f, _ = module.function(f"forward_{self._name}", arguments)
         f.call(name, f.given["work"], f.given["tangent"])
-        g, dz = self._rows.reserve(f, module.n, module.n)
+        d = self._rows.matrices(f)
+        g, right = Value(f, f.reserve(DOUBLE, module.n), POINTER), d.row("b")
         with f.each(module.n) as i:
             f.store(0.0, g, i)
+        right.clear()
         with f.each(module.m) as i:
-            self._put(f, "change psi", i, self._at(f, "change psi", i) * self._rows.weight(f, i))
-
-        def entries() -> Iterator[tuple[Value, Value, Value]]:
-            """The row, the column and the change of each entry of A."""
-            for row, column, place, factor in self._rows.entries(f):
-                change = self._at(f, "change psi_q", place) * self._at(f, "root", column)
-                change = change + self._at(f, "psi_q", place) * self._at(f, "change root", column)
-                yield row, column, change * (factor * self._rows.weight(f, row))
-
-        for row, column, dA in entries():
+            right.put(i, self._at(f, "change psi", i) * self._weight(f, i))
+        for row, column, place, factor in self._rows.entries(f):
+            change = self._at(f, "change psi_q", place) * self._at(f, "root", column)
+            change = change + self._at(f, "psi_q", place) * self._at(f, "change root", column)
+            dA = change * (factor * self._weight(f, row))
             f.store(f.load(g, column) + dA * self._stored(f, "y", row), g, column)
-            self._put(f, "change psi", row, self._at(f, "change psi", row) - dA * self._stored(f, "z", column))
-        with f.each(module.m) as i, f.each(module.n) as k:
-            self._put(f, "change psi", i, self._at(f, "change psi", i) - self._at(f, "A", i * module.n + k) * f.load(g, k))
-        self._solve(f, "change psi", dz)
+            right.put(row, right.entry(row) - dA * self._stored(f, "z", column))
+        for row, column, value in self._rows.weighted_entries(f):
+            right.put(row, right.entry(row) - value * self._at(f, "root", column) * f.load(g, column))
+        dz = self._rows.solve_right(f)
         with f.each(module.n) as i:
-            change = self._at(f, "root", i) * (f.load(dz, i) + f.load(g, i))
+            change = self._at(f, "root", i) * (dz.entry(i) + f.load(g, i))
             change = change + self._at(f, "change root", i) * self._stored(f, "z", i)
             before = f.load(f.given["tangent"], i + w[f"state {self._x}"])
             f.store(before - change, f.given["tangent"], i + w[f"result {self._x}"])
 
     def reverse(self):
+        """Write `reverse_...(work, stored, bar)`: from cotangents of the correction to those of the state and the constants."""
         module, p = self._module, self._module.places
         found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v"}
         at = module.arrays | {"root": ("work", p["root"])} | self._changes(COTANGENT)
@@ -167,23 +153,24 @@ class LeastNormCorrection:
         name = f"row_cotangents_{self._x}"
         module.loops.write(LoopProgram([*cleared, *self._derivative.reverse.parts]), name, ("work",), at)
         f, _ = module.function(f"reverse_{self._name}", [(POINTER, "work"), (POINTER, "stored"), (POINTER, "bar")])
-        u, h = self._rows.reserve(f, module.m, module.n)
+        h, x = Value(f, f.reserve(DOUBLE, module.n), POINTER), self._rows.matrices(f).row("x")
+        x.clear()
         with f.each(module.n) as i:
             bar = self._at(f, f"bar result {self._x}", i)
-            self._put(f, "right", i, -(self._at(f, "root", i) * bar))
+            right = -(self._at(f, "root", i) * bar)
+            x.put(i, right)
+            f.store(right, h, i)
             self._put(f, "change root", i, -(self._stored(f, "z", i) * bar))
-        self._solve(f, "right", u, transposed=True)
-        with f.each(module.n) as k:
-            f.store(self._at(f, "right", k), h, k)
-            with f.each(module.m) as i:
-                f.store(f.load(h, k) - self._at(f, "A", i * module.n + k) * f.load(u, i), h, k)
+        u = self._rows.solve_transposed(f)
+        for row, column, value in self._rows.weighted_entries(f):
+            f.store(f.load(h, column) - value * self._at(f, "root", column) * u.entry(row), h, column)
         with f.each(module.code.scratch["psi_q"]) as i:
             self._put(f, "change psi_q", i, f.const(0.0))
         with f.each(module.m) as i:
-            self._put(f, "change psi", i, f.load(u, i) * self._rows.weight(f, i))
+            self._put(f, "change psi", i, u.entry(i) * self._weight(f, i))
         for row, column, place, factor in self._rows.entries(f):
-            factor = factor * self._rows.weight(f, row)
-            of_A = self._stored(f, "y", row) * f.load(h, column) - f.load(u, row) * self._stored(f, "z", column)
+            factor = factor * self._weight(f, row)
+            of_A = self._stored(f, "y", row) * f.load(h, column) - u.entry(row) * self._stored(f, "z", column)
             moved = self._at(f, "change psi_q", place) + of_A * factor * self._at(f, "root", column)
             self._put(f, "change psi_q", place, moved)
             moved = self._at(f, "change root", column) + of_A * factor * self._at(f, "psi_q", place)

@@ -5,18 +5,18 @@ It has two functions of `work`, for the lanes that are `wanted`, at their state:
     fallback                 accelerations a, and q and v after a Newton step each, in arrays of their own
     fallback_tangent_part    the parts of `state dq` and `state dv` within the manifold, in arrays of their own
 
-For small scenes the method is the pseudoinverse by singular values (least_norm.py), lane by lane; for large ones elimination
+For small scenes the method is the pseudoinverse by singular values, lane by lane; for large ones elimination
 of all rows, without those that depend on others, which near singular configurations has about half as many digits.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from udkjax.native.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.manifold import iterate_newton, with_threshold
 from udkjax.native.module import Module
+from udkjax.native.pseudoinverses.dense import MatrixRow
+from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.steps import ROUNDING_PIVOT
 from udkjax.native.weighted_rows import WeightedRows
 
@@ -81,51 +81,36 @@ def _write_elimination(module: Module):
 
 def _write_singular_values(module: Module):
     """Write `fallback` and `fallback_tangent_part` by singular values."""
-    n, m, number, rows = module.n, module.m, module.lane_number, WeightedRows(module)
+    rows = WeightedRows(module, SVDCode(relative=True), by_lane=True)
+    rows.write()
+    of_lane = [(POINTER, "work"), (INT, "lane")]
 
-    def each_lane(f: Function, s: Lane) -> Iterator[Value]:
+    def put(f: Function, x: str, start: str, change: MatrixRow, sign: float):
+        with f.each(module.n) as i:
+            part = rows.array(f, "root", i) * change.entry(i) * sign
+            rows.put(f, f"fallback {x}", i, rows.array(f, start, i) + part)
+
+    f = module.new_function("fallback_of_lane", of_lane, 1)
+    rows.factor(f)
+    for x, right, place, start, sign in (
+        ("a", "terms", module.n, "terms", 1.0),
+        ("q", "psi", 0, "state q", -1.0),
+        ("v", "psi_dot", 0, "state v", -1.0),
+    ):
+        put(f, x, start, rows.solve(f, right, place), sign)
+    f = module.new_function("fallback_tangent_part_of_lane", of_lane, 1)
+    rows.factor(f)
+    for x in ("dq", "dv"):
+        put(f, x, f"state {x}", rows.solve_rates(f, f"state {x}"), -1.0)
+    for name, threshold in (("fallback", None), ("fallback_tangent_part", np.sqrt(ROUNDING_PIVOT))):
+        f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
         module.invoke(f, "rows_and_loads")
-        with f.each(f.width) as k, f.if_(f.lane(s.wanted, k) > 0.5):
-            yield k
 
-    def solve(f: Function, k: Value, right: Value, count: int, x: Value, tol: Value | None = None):
-        """Solve D y = W right for so many right-hand sides."""
-        (D,) = rows.reserve(f, m * n)
-        rows.write(f, D, k)
-        with f.each(m) as i:
-            weight = rows.weight(f, i, k)
-            with f.each(count) as j:
-                place = i * count + j
-                f.store(f.load(right, place) * weight, right, place)
-        rows.solve(f, D, right, x, (m, n, count), tol, k)
+        def each_lane(f: Function = f, s: Lane = s, name: str = name):
+            with f.each(f.width) as k, f.if_(f.lane(s.wanted, k) > 0.5):
+                f.call(f"{name}_of_lane", f.given["work"], k)
 
-    def put(f: Function, name: str, k: Value, i: Value, x: Value):
-        f.store(x, f.given["work"], (i + module.places[name]) * f.width + k)
-
-    f, s = module.function("fallback", [(POINTER, "work"), (POINTER, "out")])
-    right, x = rows.reserve(f, 3 * m, 3 * n)
-    for k in each_lane(f, s):
-        with f.each(m) as i:
-            for j, (name, start) in enumerate((("terms", n), ("psi", 0), ("psi_dot", 0))):
-                f.store(number(f, name, k, i + start), right, i * 3 + j)
-        solve(f, k, right, 3, x)
-        with f.each(n) as i:
-            root = number(f, "root", k, i)
-            for j, (name, start, sign) in enumerate((("a", "terms", 1.0), ("q", "state q", -1.0), ("v", "state v", -1.0))):
-                part = root * f.load(x, i * 3 + j) * sign
-                put(f, f"fallback {name}", k, i, number(f, start, k, i) + part)
-    f, s = module.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
-    right, x = rows.reserve(f, 2 * m, 2 * n)
-    for k in each_lane(f, s):
-        with f.each(2 * m) as i:
-            f.store(0.0, right, i)
-        for row, column, place, factor in rows.entries(f):
-            entry = number(f, "psi_q", k, place) * factor
-            for j, name in enumerate(("state dq", "state dv")):
-                to = row * 2 + j
-                f.store(f.fma(entry, number(f, name, k, column), f.load(right, to)), right, to)
-        solve(f, k, right, 2, x, f.const(np.sqrt(ROUNDING_PIVOT)))
-        with f.each(n) as i:
-            root = number(f, "root", k, i)
-            for j, name in enumerate(("dq", "dv")):
-                put(f, f"fallback {name}", k, i, number(f, f"state {name}", k, i) - root * f.load(x, i * 2 + j))
+        if threshold is None:
+            each_lane()
+        else:
+            with_threshold(f, module.places["fallback_tol"], f.const(threshold, DOUBLE, f.width), each_lane)

@@ -20,7 +20,7 @@ from udkjax.native.module import Module
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.lu import LUCode
-from udkjax.native.pseudoinverses.qr import apply_reflector, pivoted_qr, qr_matrices, reversed_each
+from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.weighted_rows import RowEntries
 
@@ -52,10 +52,6 @@ class FormulatedAccelerations(ABC):
         with f.each(module.n) as i:
             a = f.fma(self._unit(f, i), x.entry(i), self._array(f, "terms", i))
             f.store(a, f.given["out"], i * f.width, f.width)
-
-    def number_columns(self, f: Function):
-        """Store the numbers of columns, once a run."""
-        DenseMatrices(self._layout, f).number_columns()
 
     @abstractmethod
     def solve(self, d: DenseMatrices) -> MatrixRow:
@@ -157,7 +153,7 @@ class NullSpaceAccelerations(FormulatedAccelerations):
             is_there = place < float(d.m)
             vector.clear()
             vector.put_at(d.whole(f.select(is_there, place, 0.0)), f.select(is_there, d.wide(1.0), 0.0))
-            self.apply_q(d, "basis", k)
+            apply_q(d, "basis", k)
             with f.each(k) as j:
                 d.axpy(-d.dot(d.row("weighted", j), vector), d.row("basis", j), vector)
 
@@ -176,11 +172,6 @@ class NullSpaceAccelerations(FormulatedAccelerations):
             d.over_registers(vector.registers, normalize)
             d.axpy(-d.dot(weighted, x), vector, x)
         return x
-
-    def apply_q(self, d: DenseMatrices, name: str, i: Operand = 0):
-        """Write Q times a row."""
-        with reversed_each(d, d.steps) as k:
-            apply_reflector(d, "v", "tau", k, name, i)
 
 
 class NullSpaceQRAccelerations(NullSpaceAccelerations):
@@ -209,7 +200,7 @@ class NullSpaceQRAccelerations(NullSpaceAccelerations):
                 left.value = left.value - d.row("D", i).at(place) * x.entry(i)
             end = d.row("diagonal").entry(k)
             x.put(k, f.select(counts, left.value / f.select(counts, end, 1.0), 0.0))
-        self.apply_q(d, "b")
+        apply_q(d)
 
 
 class NullSpaceSVDAccelerations(NullSpaceAccelerations):
@@ -220,10 +211,6 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
         super().__init__(module, min(m, n))
         self._method = SVDCode(relative=True)
         self._rows = DenseLayout(module, self._method.matrices(m, n), (m, n), "null space rows", TOL)
-
-    def number_columns(self, f: Function):
-        super().number_columns(f)
-        DenseMatrices(self._rows, f).number_columns()
 
     def solve_rows(self, d: DenseMatrices):
         f, of = d.f, DenseMatrices(self._rows, d.f)

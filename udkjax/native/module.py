@@ -57,6 +57,7 @@ class Module(Memory):
         self._lay_out()
         self.tangents = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
+        self.dense_layouts = []
         self.loops = LoopWriter(plan.width, cold=plan.written_out)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
@@ -221,9 +222,14 @@ class Module(Memory):
             self.loops.write(self.code.prologue, name, ("numbers", "constants"), at, width=1)
 
     def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
-        f = Function(name, arguments, self.plan.width, cold=name in COLD and not self.is_dense)
-        self.functions.append(f)
+        f = self.new_function(name, arguments, self.plan.width)
         return f, Lane(f, self.places)
+
+    def new_function(self, name: str, arguments: Sequence[tuple[str, str]], width: int) -> Function:
+        """Return a function of so many lanes."""
+        f = Function(name, arguments, width, cold=name in COLD and not self.is_dense)
+        self.functions.append(f)
+        return f
 
     def write_derivatives(self):
         """Hook: writes the functions of derivatives; none by default."""
@@ -237,11 +243,23 @@ class Module(Memory):
     def record_output(self, f: Function, s: Lane):
         """Hook: called with a state between steps (`state t`, `state q`, `result v`) of lanes that are `due`."""
 
+    def weigh_rows(self):
+        """Reserve room for the weights of rows, which then are those of the member in each lane."""
+        if "weights" not in self.places.places:
+            self.places.add("weights", self.m)
+
     def begin_memory(self, f: Function):
-        """Hook: called once a run, with all memory zero; does nothing by default."""
+        """Store what no member changes, once a run, with all memory zero."""
+        for layout in self.dense_layouts:
+            layout.number_columns(f)
 
     def begin_rows(self, f: Function, lane: Value, length: Value):
-        """Hook: called once the scales of the rows of a member are in its lane; does nothing by default."""
+        """Store the weights of the rows of a member, whose scales are in its lane."""
+        if "weights" in self.places.places:
+            with f.each(self.m) as i:
+                place = i * self.plan.width + lane
+                scale = f.load(f.given["work"], place + self.start("rows", "work"))
+                f.store(length / scale, f.given["work"], place + self.start("weights", "work"))
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         """Hook: called with a member that is taken into a lane; does nothing by default."""

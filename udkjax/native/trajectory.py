@@ -24,7 +24,7 @@ from udkjax.native.dense_equations import DenseEquations
 from udkjax.native.dense_output import write_between, write_differences, write_outputs
 from udkjax.native.fallback import write_fallback
 from udkjax.native.formulations import FORMULATE
-from udkjax.native.ir import DOUBLE, Function, Value
+from udkjax.native.ir import DOUBLE, Function
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.members import write_begin, write_finish, write_run
 from udkjax.native.module import Module
@@ -49,12 +49,6 @@ class Trajectory(Module):
         if self.formulated:
             self.formulated.write()
 
-    def begin_memory(self, f: Function):
-        if self.dense:
-            self.dense.number_columns(f)
-        if self.formulated:
-            self.formulated.number_columns(f)
-
     def accelerate(self, f: Function, to: str):
         self.invoke(f, FORMULATE if self.formulated else "accelerations", to)
 
@@ -64,10 +58,6 @@ class Trajectory(Module):
             self.copy(f, "result v", "state v")
             self.invoke(f, FORMULATE, "result a")
             self.copy(f, "saved v", "state v")
-
-    def begin_rows(self, f: Function, lane: Value, length: Value):
-        if self.dense:
-            self.dense.begin_member(f, lane, length)
 
     def text(self) -> str:
         """LLVM's text of the whole module."""

@@ -1,13 +1,13 @@
-"""Rows for rank-revealing methods: D = W Psi_q M^(-1/2), dense, with W the characteristic length over the scale of each row.
+"""Rows for dense methods: D = W Psi_q M^(-1/2), with W the characteristic length over the scale of each row.
 
-They come from the arrays `psi_q` and `root`, which holds M^(-1/2), of a lane.
+They come from the arrays `psi_q` and `root`, which holds M^(-1/2).
 """
 
 from collections.abc import Iterator
 
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
-from udkjax.native.least_norm import LEAST_NORM, least_norm
+from udkjax.native.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.module import Module
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 
 _ENTRIES, _FACTORS = "@entries", "@factors"
 
@@ -35,40 +35,81 @@ class RowEntries:
 
 
 class WeightedRows(RowEntries):
-    """The rows of a module, one lane at a time."""
+    """The rows of a module, and what a dense method solves by them: in all lanes, or lane by lane.
 
-    def __init__(self, module: Module):
+    Where it is lane by lane, functions that use it have one lane, and its number as their argument `lane`.
+    """
+
+    def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False):
         super().__init__(module)
-        self._module = module
-        if all(f.name != LEAST_NORM for f in module.functions):
-            module.functions.append(least_norm(module.plan.vector))
+        self._in, self._method = module, method
+        shape, width = (module.m, module.n), 1 if by_lane else module.plan.width
+        self._layout = DenseLayout(module, method.matrices(*shape), shape, width=width)
+        self._arguments = [(POINTER, "work"), *([(INT, "lane")] if by_lane else [])]
+        module.weigh_rows()
 
-    def weight(self, f: Function, row: Value, lane: Operand = 0) -> Value:
-        """Return the weight of a row."""
-        lane = f.like(lane, INT, 1)
-        return self._module.lane_number(f, "length", lane, 0) / self._module.lane_number(f, "rows", lane, row)
+    def write(self):
+        """Write the functions that factorize and solve."""
+        for name in ("factor", "solve"):
+            f = self._in.new_function(f"{name}_rows", self._arguments, self._layout.width)
+            getattr(self._method, name)(self.matrices(f))
 
-    def write(self, f: Function, D: Value, lane: Operand = 0):
-        """Write D (m, n), row by row, to an address."""
-        number, lane, n = self._module.lane_number, f.like(lane, INT, 1), self._module.n
-        with f.each(self._module.m * n) as i:
-            f.store(0.0, D, i)
+    def matrices(self, f: Function) -> DenseMatrices:
+        """Return the matrices in a function."""
+        return DenseMatrices(self._layout, f)
+
+    def array(self, f: Function, name: str, i: Operand) -> Value:
+        """One number of an array, in all lanes of the function."""
+        place = f.like(i, INT, 1) * self._in.plan.width + self._in.start(name, "work")
+        return f.load(f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
+
+    def put(self, f: Function, name: str, i: Operand, x: Value):
+        """Store one number of an array, in all lanes of the function."""
+        place = f.like(i, INT, 1) * self._in.plan.width + self._in.start(name, "work")
+        f.store(x, f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
+
+    def weighted_entries(self, f: Function) -> Iterator[tuple[Value, Value, Value]]:
+        """Run the block for each entry of W Psi_q: its row, its column and its value."""
         for row, column, place, factor in self.entries(f):
-            weight = self.weight(f, row, lane) * factor
-            f.store(number(f, "psi_q", lane, place) * weight * number(f, "root", lane, column), D, row * n + column)
+            yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", row)
 
-    def solve(
-        self, f: Function, D: Value, b: Value, x: Value, shape: tuple[int, int, int], tol: Value | None = None, lane: Operand = 0
-    ):
-        """Solve for x = D^+ b, of D (rows, columns) and so many right-hand sides; leave the rank of D in `rank`.
+    def factor(self, f: Function):
+        """Factorize D, of the entries of Psi_q at hand."""
+        d = self.matrices(f)
+        with f.each(d.m) as i:
+            d.row("D", i).clear()
+        for row, column, value in self.weighted_entries(f):
+            d.row("D", row).put(column, value * self.array(f, "root", column))
+        self._call(f, "factor_rows")
 
-        D and b are overwritten. Singular values count beyond `tol` times the largest, by default `fallback_tol`.
-        """
-        lane = f.like(lane, INT, 1)
-        tol = self._module.lane_number(f, "fallback_tol", lane, 0) if tol is None else tol
-        rank = f.at(f.given["work"], lane + self._module.places["rank"] * f.width)
-        f.call(LEAST_NORM, D, b, x, *(f.const(c, INT) for c in shape), tol, rank)
+    def solve(self, f: Function, right: str, start: int = 0) -> MatrixRow:
+        """Return D^+ W b, with b in an array."""
+        d = self.matrices(f)
+        b = d.row("b")
+        b.clear()  # what fills the last register has been multiplied by what was no number, perhaps
+        with f.each(d.m) as i:
+            b.put(i, self.array(f, right, i + start) * self.array(f, "weights", i))
+        return self.solve_right(f)
 
-    def reserve(self, f: Function, *counts: int) -> Iterator[Value]:
-        """Reserve room for so many numbers each."""
-        return (Value(f, f.reserve(DOUBLE, max(c, 1)), POINTER) for c in counts)
+    def solve_right(self, f: Function) -> MatrixRow:
+        """Return D^+ b, with b in its row."""
+        self._call(f, "solve_rows")
+        return self.matrices(f).row("x")
+
+    def solve_transposed(self, f: Function) -> MatrixRow:
+        """Return (D^+)^T x, with x in its row, of a method that solves so."""
+        d = self.matrices(f)
+        self._method.solve_transposed(d)
+        return d.row("b")
+
+    def solve_rates(self, f: Function, change: str) -> MatrixRow:
+        """Return D^+ W Psi_q dq."""
+        d = self.matrices(f)
+        b = d.row("b")
+        b.clear()
+        for row, column, value in self.weighted_entries(f):
+            b.put(row, f.fma(value, self.array(f, change, column), b.entry(row)))
+        return self.solve_right(f)
+
+    def _call(self, f: Function, name: str):
+        f.call(name, *(f.given[argument] for _, argument in self._arguments))

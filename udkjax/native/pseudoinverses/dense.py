@@ -36,6 +36,10 @@ class DenseMethod(ABC):
     def solve(self, d: "DenseMatrices") -> None:
         """Write how the row `x` becomes D^+ b of the row `b`, which is overwritten."""
 
+    def solve_transposed(self, d: "DenseMatrices") -> None:
+        """Write how the row `b` becomes (D^+)^T x of the row `x`."""
+        raise NotImplementedError(type(self).__name__)
+
 
 class DenseLayout:
     """The matrices of a method in the memory of a module.
@@ -46,6 +50,7 @@ class DenseLayout:
         shape: Those of D.
         prefix: Of the names of their places.
         tol: The name of the threshold of the rank.
+        width: How many matrices lie side by side: one of each lane, or a single one. By default those of all lanes.
     """
 
     def __init__(
@@ -55,14 +60,23 @@ class DenseLayout:
         shape: tuple[int, int],
         prefix: str = "dense",
         tol: str = "fallback_tol",
+        width: int | None = None,
     ):
         self.module, self.shape, self.prefix, self.tol = module, shape, prefix, tol
+        self.width = module.plan.width if width is None else width
         m, n = shape
         shapes = {"D": (m, n), "b": (1, m), "x": (1, n), "index": (1, max(m, n)), **matrices}
-        self.shapes, self.registers, vector, width = shapes, {}, module.plan.vector, module.plan.width
+        self.shapes, self.registers, vector = shapes, {}, module.plan.vector
         for name, (rows, columns) in shapes.items():
-            self.registers[name] = -(-columns * width // vector)
-            module.places.add(f"{prefix} {name}", rows * self.registers[name] * max(vector // width, 1))
+            self.registers[name] = -(-columns * self.width // vector)
+            module.places.add(f"{prefix} {name}", -(-rows * self.registers[name] * vector // module.plan.width))
+        module.dense_layouts.append(self)
+
+    def number_columns(self, f: Function):
+        """Store the numbers of columns, which nothing changes."""
+        start = self.module.places[f"{self.prefix} index"] * self.module.plan.width
+        with f.each(self.shapes["index"][1]) as j:
+            f.store(f.like(j, DOUBLE, self.width), f.given["work"], j * self.width + start, self.width)
 
 
 class MatrixRow:
@@ -156,7 +170,8 @@ class DenseMatrices:
     @property
     def tol(self) -> Value:
         """The threshold of the rank."""
-        return self.f.load(self.f.given["work"], self.module.places[self.layout.tol] * self.f.width, self.f.width)
+        f, place = self.f, self.module.places[self.layout.tol] * self.module.plan.width
+        return f.load(f.given["work"], f.given["lane"] + place if "lane" in f.given else place, f.width)
 
     def threshold(self, method: DenseMethod, square_of_scale: Value) -> Value:
         """Return the square of the threshold, from that of the method's scale of D."""
@@ -165,16 +180,11 @@ class DenseMatrices:
 
     # --- rows
 
-    def number_columns(self):
-        """Store the numbers of columns, which nothing changes."""
-        row = self.row("index")
-        with self.f.each(self.layout.shapes["index"][1]) as j:
-            row.put(j, self.number(j))
-
     def row(self, name: str, i: Operand = 0) -> MatrixRow:
         """Return row i of a matrix."""
         f, registers = self.f, self.layout.registers[name]
-        start, stride = self.module.places[f"{self.layout.prefix} {name}"] * f.width, registers * self.vector
+        start = self.module.places[f"{self.layout.prefix} {name}"] * self.module.plan.width
+        stride = registers * self.vector
         place = f.like(i, INT, 1) * stride + start if isinstance(i, Value) else int(i) * stride + start
         return MatrixRow(self, f.at(f.given["work"], place), registers)
 
@@ -233,13 +243,13 @@ class DenseMatrices:
         return self.sum(a.registers, lambda r, total: self.f.fma(a[r], b[r], total))
 
     def axpy(self, factor: Value, x: MatrixRow, y: MatrixRow):
-        """Add a multiple of the row x to the row y."""
+        """Add a multiple of the row x to the row y, of which the shorter one counts."""
         wide = self.spread(factor)
 
         def add(r: Operand):
             y[r] = self.f.fma(wide, x[r], y[r])
 
-        self.over_registers(y.registers, add)
+        self.over_registers(min(x.registers, y.registers), add)
 
     def largest(self, row: MatrixRow, count: int) -> Value:
         """The largest of the first entries of a row."""

@@ -112,6 +112,12 @@ def apply_q_transposed(d: DenseMatrices):
         d.axpy(-(d.dot(v, b) * d.row("tau").entry(k)), v, b)
 
 
+def apply_q(d: DenseMatrices, name: str = "b", i: Operand = 0):
+    """Write Q times a row."""
+    with reversed_each(d, d.steps) as k:
+        apply_reflector(d, "v", "tau", k, name, i)
+
+
 def reflect_row(d: DenseMatrices, name: str, k: Value, is_active: Value, reflectors: str, factors: str) -> Value:
     """Write the reflection from the right that leaves of row k of a matrix nothing behind column k; return what stays there."""
     f, row, z = d.f, d.row(name, k), d.row(reflectors, k)

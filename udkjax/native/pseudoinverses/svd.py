@@ -11,9 +11,11 @@ The rows of R are nearly orthogonal from the first, so that fewer rounds do (Drm
 from dataclasses import dataclass
 
 from udkjax.native.ir import INT, Operand, Value
-from udkjax.native.least_norm import ORTHOGONAL, SWEEPS
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
-from udkjax.native.pseudoinverses.qr import apply_q_transposed, pivoted_qr, qr_matrices
+from udkjax.native.pseudoinverses.qr import apply_q, apply_q_transposed, pivoted_qr, qr_matrices
+
+SWEEPS = 30  # at most; some six or eight do
+ORTHOGONAL = 1e-15  # cosines of angles between rows that are orthogonal but for rounding
 
 
 @dataclass(frozen=True)
@@ -84,3 +86,11 @@ class SVDCode(DenseMethod):
         x.clear()
         with d.f.each(d.steps) as i:
             d.axpy(d.dot(d.row("u", i), b) * d.row("lengths").entry(i), d.row("D", i), x)
+
+    def solve_transposed(self, d: DenseMatrices):
+        """Write how the row `b` becomes (D^+)^T x of the row `x`."""
+        b, x = d.row("b"), d.row("x")
+        b.clear()
+        with d.f.each(d.steps) as i:
+            d.axpy(d.dot(d.row("D", i), x) * d.row("lengths").entry(i), d.row("u", i), b)
+        apply_q(d)
