@@ -39,7 +39,7 @@ class Solver(Memory):
         self.plan = plan
         self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
         self.places.add("fallback_tol")
-        self.dense_layouts = []
+        self.begins = []
         layout = DenseLayout(self, code.matrices(m, n), (m, n))
         functions = []
         names = ["index", "factor", "solve", *(["solve_transposed"] if isinstance(method, pinv.SVD) else [])]

@@ -1,15 +1,11 @@
 """Access of a run's code to its memory, its inputs and its outputs."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from udkjax.native.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, Plan
-
-if TYPE_CHECKING:
-    from udkjax.native.pseudoinverses.dense import DenseLayout
 
 
 class Memory:
@@ -23,7 +19,7 @@ class Memory:
     plan: Plan
     places: Layout
     tangents: Layout  # of one direction of a derivative
-    dense_layouts: list["DenseLayout"]  # of matrices
+    begins: list[Callable[[Function], None]]  # write what is stored once a run
     n: int  # coordinates
     m: int  # rows of Psi
     rowcount: int  # registers that they take

@@ -57,7 +57,7 @@ class Module(Memory):
         self._lay_out()
         self.tangents = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
-        self.dense_layouts = []
+        self.begins = []
         self.loops = LoopWriter(plan.width, cold=plan.written_out)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
@@ -250,8 +250,8 @@ class Module(Memory):
 
     def begin_memory(self, f: Function):
         """Store what no member changes, once a run, with all memory zero."""
-        for layout in self.dense_layouts:
-            layout.number_columns(f)
+        for begin in self.begins:
+            begin(f)
 
     def begin_rows(self, f: Function, lane: Value, length: Value):
         """Store the weights of the rows of a member, whose scales are in its lane."""

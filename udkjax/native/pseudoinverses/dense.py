@@ -70,7 +70,7 @@ class DenseLayout:
         for name, (rows, columns) in shapes.items():
             self.registers[name] = -(-columns * self.width // vector)
             module.places.add(f"{prefix} {name}", -(-rows * self.registers[name] * vector // module.plan.width))
-        module.dense_layouts.append(self)
+        module.begins.append(self.number_columns)
 
     def number_columns(self, f: Function):
         """Store the numbers of columns, which nothing changes."""
