@@ -103,7 +103,6 @@ def test_a_live_page_has_the_engine_and_the_sliders_that_are_named(run, tmp_path
     [
         ((SCENE, "--live", "pin.Q", "--out", "page.html"), 'no parameter "pin.Q"'),
         ((SCENE, "--live", "--out", "page.gif"), "--live makes a page that simulates"),
-        ((SCENE, "examples/slider_crank.toml", "--t1", 1, "--live", "--out", "page.html"), "one mechanism and one solution"),
     ],
 )
 def test_what_cannot_be_live_is_refused(words, said, tmp_path, capsys):

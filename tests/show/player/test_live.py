@@ -22,7 +22,7 @@ def live(slider_crank, run):
 def test_sliders_are_of_the_numbers_that_are_named(live, slider_crank):
     sliders = live.data["live"]["sliders"]
     assert [s["name"] for s in sliders] == ["motor.motor.speed", "pin.P[0]", "pin.P[1]"]
-    assert [s["name"] for s in sliders] == [p["name"] for p in live.data["live"]["engine"]["parameters"]]
+    assert [s["name"] for s in sliders] == [p["name"] for p in live.data["live"]["engines"][0]["parameters"]]
     assert [s["unit"] for s in sliders] == ["rad/s", "m", "m"]
     assert all(s["low"] <= s["value"] <= s["high"] for s in sliders)
     everything = sliders_of(slider_crank, True)
@@ -85,9 +85,9 @@ def test_symbols_follow_the_numbers_that_they_are_made_of():
 def test_a_run_that_begins_elsewhere_keeps_its_beginning():
     pendulum = udk.library.simple_pendulum()
     run = udk.simulate(pendulum, np.linspace(0.0, 0.5, 6))
-    assert udk.animate(pendulum, run, measures=(), live=["gravity"]).data["live"]["start"] is None
+    assert udk.animate(pendulum, run, measures=(), live=["gravity"]).data["live"]["runs"][0]["start"] is None
     later = Motion(ts=np.asarray(run.ts), q=np.asarray(run.q)[[5] * 6], v=np.asarray(run.v)[[5] * 6])
-    start = udk.animate(pendulum, later, measures=(), live=["gravity"]).data["live"]["start"]
+    start = udk.animate(pendulum, later, measures=(), live=["gravity"]).data["live"]["runs"][0]["start"]
     np.testing.assert_allclose(start["q"], np.ravel(run.q[5]))
     np.testing.assert_allclose(start["v"], np.ravel(run.v[5]))
 
@@ -101,10 +101,20 @@ def test_ten_seconds_are_simulated_where_no_run_is_given():
 def test_the_tolerances_are_those_of_the_run(live):
     pendulum = udk.library.simple_pendulum()
     exact = udk.simulate(pendulum, np.linspace(0.0, 0.5, 6), rtol=1e-11, atol=1e-10)
-    settings = udk.animate(pendulum, exact, measures=(), live=["gravity"]).data["live"]["engine"]["settings"]
+    settings = udk.animate(pendulum, exact, measures=(), live=["gravity"]).data["live"]["engines"][0]["settings"]
     assert (settings["rtol"], settings["atol"]) == (1e-11, 1e-10)
-    settings = live.data["live"]["engine"]["settings"]  # of a motion that knows none
+    settings = live.data["live"]["engines"][0]["settings"]  # of a motion that knows none
     assert (settings["rtol"], settings["atol"]) == (1e-8, 1e-8)
+
+
+def test_runs_of_one_mechanism_share_an_engine_and_a_number_of_one_alone_has_a_slider(slider_crank, run):
+    pendulum = udk.library.simple_pendulum()
+    runs = {"one": run, "two": run, "other": udk.simulate(pendulum, np.linspace(0.0, 0.5, 6))}
+    mechanisms = {"one": slider_crank, "two": slider_crank, "other": pendulum}
+    data = udk.animate(mechanisms, runs, live=["pin.P[0]", "gravity[1]"]).data["live"]
+    assert [each["engine"] for each in data["runs"]] == [0, 0, 1] and len(data["engines"]) == 2
+    assert [s["name"] for s in data["sliders"]] == ["gravity[1]", "pin.P[0]"]
+    assert [each["sliders"] for each in data["runs"]] == [[[0, -9.81], [1, 0.5]]] * 2 + [[[0, -9.81]]]
 
 
 def test_the_torque_of_a_driver_is_among_its_measures(live):
@@ -114,8 +124,6 @@ def test_the_torque_of_a_driver_is_among_its_measures(live):
 def test_what_cannot_be_live_says_why(slider_crank, run):
     with pytest.raises(SceneError, match=r"pin\.Q"):
         udk.animate(slider_crank, run, live=["pin.Q"])
-    with pytest.raises(ValueError, match="one mechanism and one solution"):
-        udk.animate(slider_crank, {"one": run, "two": run}, live=True)
     unstable = udk.simulate(slider_crank, np.linspace(0.0, 0.1, 3), stabilization=None, drift_tol=1.0)
     with pytest.raises(ValueError, match="solves by projection, and the run has stabilization=NoneType"):
         udk.animate(slider_crank, unstable, live=True)

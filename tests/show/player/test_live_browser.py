@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.show.player.conftest import Motion
 from tests.show.player.test_browser import HOST, PLAYER, on_screen, picture, plain, ring_centre, until
 from udkjax.show.player.measure_curves import reaction_arrows
 from udkjax.show.player.page import as_json, module
@@ -59,11 +60,11 @@ def pendulum():
 
 
 def shown_q(page):
-    return np.array(page.evaluate(f"[...{LIVE}.run.q]")).reshape(len(page.evaluate(f"[...{LIVE}.run.ts]")), -1)
+    return np.array(page.evaluate(f"[...{LIVE}.runs[0].run.q]")).reshape(len(page.evaluate(f"[...{LIVE}.runs[0].run.ts]")), -1)
 
 
 def measure(page, name):
-    return np.array(page.evaluate(f"[...{LIVE}.run.measures.find(m => m.name === {name!r}).values]"))
+    return np.array(page.evaluate(f"[...{LIVE}.runs[0].run.measures.find(m => m.name === {name!r}).values]"))
 
 
 def note(page):
@@ -131,13 +132,13 @@ def test_arrows_of_forces_are_those_of_the_new_motion(opened, slider_crank):
     anchors, forces, unique = reaction_arrows(other, udk.simulate(other, TS))
     assert all(unique)
     with opened(animation) as page:
-        before = page.evaluate(f"[...{LIVE}.run.forces]")
+        before = page.evaluate(f"[...{LIVE}.runs[0].run.forces]")
         page.evaluate(f"{LIVE}.change({names})")
-        shown = np.array(page.evaluate(f"[...{LIVE}.run.forces]")).reshape(forces.shape)
+        shown = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.forces]")).reshape(forces.shape)
         assert_allclose(shown, forces, atol=1e-6 * np.abs(forces).max())
-        assert_allclose(page.evaluate(f"{LIVE}.run.reactions.anchors"), anchors, atol=1e-12)
+        assert_allclose(page.evaluate(f"{LIVE}.runs[0].run.reactions.anchors"), anchors, atol=1e-12)
         page.locator(".panel canvas").press("Backspace")
-        assert page.evaluate(f"[...{LIVE}.run.forces]") == before
+        assert page.evaluate(f"[...{LIVE}.runs[0].run.forces]") == before
 
 
 @pytest.mark.slow
@@ -147,7 +148,7 @@ def test_forces_that_redundant_joints_share_are_not_shown_of_a_new_motion(opened
         button = page.get_by_role("button", name="Reactions")
         assert button.is_enabled()
         page.evaluate(f"{LIVE}.change({{'gravity[1]': -5}})")
-        assert button.is_disabled() and page.evaluate(f"{LIVE}.run.reactions") is None
+        assert button.is_disabled() and page.evaluate(f"{LIVE}.runs[0].run.reactions") is None
 
 
 def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
@@ -166,6 +167,22 @@ def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
         turn = np.array([[np.cos(place[2]), -np.sin(place[2])], [np.sin(place[2]), np.cos(place[2])]])
         expected = on_screen(page, 0, place[:2] + turn @ arm)
         assert np.abs(ring_centre(picture(page), expected, THEMES["light"]["ink"]) - expected).max() < 0.6
+
+
+def test_a_slider_changes_all_runs_that_have_its_number(opened, slider_crank):
+    """Each keeps its own values of what nobody has moved, and a hand pulls at one of them."""
+    heavy = slider_crank.with_parameters({"link.rod.mass": 9.0})
+    mechanisms = {"light": slider_crank, "heavy": heavy}
+    runs = {label: udk.simulate(one, TS) for label, one in mechanisms.items()}
+    with opened(udk.animate(mechanisms, runs, live=["link.rod.mass", "pin.P[0]"])) as page:
+        page.evaluate(f"{LIVE}.change({{'pin.P[0]': 0.4}})")
+        assert "light: 2 s solved anew" in note(page) and "heavy: 2 s solved anew" in note(page)
+        for k, one in enumerate(mechanisms.values()):
+            other = one.with_parameters({"pin.P[0]": 0.4})
+            shown = np.array(page.evaluate(f"[...{LIVE}.runs[{k}].run.q]")).reshape(len(TS), -1)
+            assert_allclose(shown, np.asarray(udk.simulate(other, TS).q).reshape(len(TS), -1), atol=1e-8)
+            torque = page.evaluate(f"[...{LIVE}.runs[{k}].run.measures.find(m => m.name === 'torque of motor').values]")
+            assert_allclose(torque, udk.efforts(other, udk.simulate(other, TS))["motor"], atol=1e-5)
 
 
 def test_a_slider_by_mouse_and_keys(opened, live):
@@ -199,6 +216,19 @@ def test_loops_that_cannot_be_closed_are_said_and_the_last_motion_stays(opened):
         assert "0 degrees of freedom here, 1 at first" in note(page) or "do not close" in note(page)
 
 
+@pytest.mark.parametrize("apart", [3.0, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_rows_that_other_numbers_make_redundant_are_found(opened, apart):
+    """A bar whose third pin is misplaced cannot be mounted on three cranks, or not be moved; with the right place it can."""
+    name = "joint.B3.points[0][0]"
+    sound = udk.library.parallelogram()
+    stiff = sound.with_parameters({name: 1.0 + apart})
+    still = Motion(ts=TS, q=np.tile(np.asarray(stiff.q0), (len(TS), 1, 1)), v=np.zeros((len(TS), 4, 3)))
+    with opened(udk.animate(stiff, still, live={name: (0.0, 9.0)}, measures=())) as page:
+        page.evaluate(f"{LIVE}.change({{{name!r}: 1.0}})")
+        assert "solved anew" in note(page)
+        assert_allclose(shown_q(page), np.asarray(udk.simulate(sound, TS).q).reshape(len(TS), -1), rtol=0, atol=1e-6)
+
+
 def test_where_the_first_motion_failed_other_numbers_may_come_to_its_end(opened):
     """A crank that a motor turns cannot turn fully with a short rod; with a longer one it can."""
     drawing = udk.Drawing(
@@ -227,7 +257,7 @@ def test_where_the_first_motion_failed_other_numbers_may_come_to_its_end(opened)
 def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
     with opened(live) as page:
         first, values = shown_q(page), page.evaluate(f"[...{LIVE}.values]")
-        symbols = page.evaluate(f"JSON.stringify({LIVE}.run.symbols)")
+        symbols = page.evaluate(f"JSON.stringify({LIVE}.runs[0].run.symbols)")
         show_all(page)
         move(page, "P x", 0.4)
         move(page, "rod mass", 3.0)
@@ -235,7 +265,7 @@ def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
         page.locator(".panel canvas").press("Backspace")
         assert_array_equal(shown_q(page), first)
         assert page.evaluate(f"[...{LIVE}.values]") == values
-        assert page.evaluate(f"JSON.stringify({LIVE}.run.symbols)") == symbols
+        assert page.evaluate(f"JSON.stringify({LIVE}.runs[0].run.symbols)") == symbols
         assert page.get_by_role("spinbutton", name="rod mass, number").input_value() == "1.5"
 
 
@@ -278,27 +308,29 @@ def test_a_hand_pulls_through_the_dynamics(opened, pendulum):
     with opened(animation) as page:
         total = measure(page, "kinetic energy") + measure(page, "potential energy")
         assert np.ptp(total) < 1e-5  # recorded in single precision
-        q = np.array(page.evaluate(f"[...{LIVE}.run.pose(0)]")).reshape(-1, 3)
+        q = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.pose(0)]")).reshape(-1, 3)
         start = on_screen(page, 0, q[1, :2])
         goal = on_screen(page, 0, (0.5, 0.4))
         page.mouse.move(*start)
         assert page.locator(".panel canvas.holds").count() == 1
         drag(page, start, goal, 1500)
-        held = page.evaluate(f"({{t: {LIVE}.hand.state.t, q: [...{LIVE}.hand.state.q], spring: {LIVE}.hand.spring}})")
+        held = page.evaluate(
+            f"({{t: {LIVE}.runs[0].hand.state.t, q: [...{LIVE}.runs[0].hand.state.q], spring: {LIVE}.runs[0].hand.spring}})"
+        )
         assert held["t"] > 0.3  # it is in time
         reached = np.array(held["q"]).reshape(-1, 3)[1, :2]
         assert np.linalg.norm(reached - [0.5, 0.4]) < 0.5 * np.linalg.norm(q[1, :2] - [0.5, 0.4])
         page.mouse.up()
         page.evaluate(f"{PLAYER}.pause()")
-        ts = np.array(page.evaluate(f"[...{LIVE}.run.ts]"))
-        after = ts >= page.evaluate(f"{LIVE}.run.ts[{LIVE}.run.ts.length - 1]") - 1.9
+        ts = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.ts]"))
+        after = ts >= page.evaluate(f"{LIVE}.runs[0].run.ts[{LIVE}.runs[0].run.ts.length - 1]") - 1.9
         total = measure(page, "kinetic energy") + measure(page, "potential energy")
         assert np.ptp(total[after]) < 1e-5 * max(1.0, np.abs(total).max())  # free again: nothing is added
         assert measure(page, "violation").max() < 1e-9
         # The motion behind the hand is that of Python from the same state.
         k = int(np.flatnonzero(after)[0])
-        states = np.array(page.evaluate(f"[...{LIVE}.run.q]")).reshape(len(ts), -1, 3)
-        rates = np.array(page.evaluate(f"[...{LIVE}.run.v]")).reshape(len(ts), -1, 3)
+        states = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.q]")).reshape(len(ts), -1, 3)
+        rates = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.v]")).reshape(len(ts), -1, 3)
         run = udk.simulate(mechanism, ts[k : k + 10], udk.State(states[k], rates[k]))
         assert_allclose(states[k : k + 10], run.q, atol=1e-6)
 
@@ -315,7 +347,7 @@ def test_beside_the_bodies_a_drag_moves_the_view(opened, pendulum):
 
 def test_a_finger_pulls(opened, pendulum):
     with opened(pendulum[1], "", "", 390, 844, has_touch=True, is_mobile=True) as page:
-        q = page.evaluate(f"[...{LIVE}.run.pose(0)]")
+        q = page.evaluate(f"[...{LIVE}.runs[0].run.pose(0)]")
         x, y = on_screen(page, 0, (q[3], q[4]))
         client = page.context.new_cdp_session(page)
 
@@ -327,9 +359,9 @@ def test_a_finger_pulls(opened, pendulum):
         for k in range(1, 6):
             touch("touchMove", x - 10 * k, y - 10 * k)
         page.wait_for_timeout(300)
-        assert page.evaluate(f"{LIVE}.hand !== null && {LIVE}.hand.state.t > 0.02")
+        assert page.evaluate(f"{LIVE}.runs[0].hand !== null && {LIVE}.runs[0].hand.state.t > 0.02")
         touch("touchEnd")
-        until(page, f"{LIVE}.hand === null && {PLAYER}.playing")
+        until(page, f"{LIVE}.runs[0].hand === null && {PLAYER}.playing")
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
@@ -349,11 +381,11 @@ def test_a_long_motion_is_solved_a_picture_at_a_time(opened, pendulum):
     """With so few steps for each picture that it takes several; the motion is that of Python all the same."""
     mechanism, animation = pendulum
     with opened(animation) as page:
-        page.evaluate(f"{LIVE}.steps = 9")
-        script = f"{LIVE}.change({{'gravity[1]': -7.0}}); [{LIVE}.run.ts.length, {LIVE}.panel.note.textContent]"
+        page.evaluate(f"{LIVE}.runs[0].steps = 9")
+        script = f"{LIVE}.change({{'gravity[1]': -7.0}}); [{LIVE}.runs[0].run.ts.length, {LIVE}.panel.note.textContent]"
         count, words = page.evaluate(script)
         assert 1 < count < len(TS) and "Solving" in words
-        until(page, f"{LIVE}.job === null")
+        until(page, f"{LIVE}.runs[0].job === null")
         run = udk.simulate(mechanism.with_parameters({"gravity[1]": -7.0}), TS)
         assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), atol=1e-6)
 
@@ -412,6 +444,6 @@ def test_the_widget_simulates_without_python(browser, live, tmp_path):
     widget = "document.getElementById('one').player"
     page.evaluate(f"{widget}.live.ready")
     page.evaluate(f"{widget}.live.change({{'motor.motor.speed': 2.0}})")
-    angle = np.array(page.evaluate(f"[...{widget}.live.run.q]")).reshape(len(TS), -1)[:, 2]
+    angle = np.array(page.evaluate(f"[...{widget}.live.runs[0].run.q]")).reshape(len(TS), -1)[:, 2]
     assert_allclose(angle, 2.0 * TS, atol=1e-7)
     page.close()

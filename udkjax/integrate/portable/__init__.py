@@ -11,18 +11,20 @@ closing      {thresholds, settings, tol and rounding: what counts as closed (equ
 guess        {q, v}: places in `numbers` of the initial guess
 rows         scales of the rows of Psi (m, rad)
 scales       {length (m), rate (1/s), mass (kg)}
-rank         of Psi_q outside of singular configurations; null: not known, and there is no "run"
+marks        how many rows of Psi have a mark, behind the numbers: one for those that are independent, which the module "mark"
+             finds; 0 where all are
 settings     of a run, by name, in their order; `smallest` and `omega` follow from the times and the state
 smallest     step, in units of rounding of the end time
 drift_tol    violation of Psi, in units of the rows' scales, beyond which a run has failed
 info         names of the first numbers of a run's result "info"; behind them are its last q and v
 sampled      places in `numbers` of what has samples; `samples`: base64 of float64, a row for each interval between breaks
 masses       of each body the places in `numbers` of its mass and inertia
-efforts      a list of {driver, unit, place: of its row in x0, or null where it is redundant}
-forces       how the forces of joints are found (joint_forces.py); none where rows are redundant
+efforts      a list of {driver, unit, row: of Psi, place: of that row in x0}
+forces       how the forces of joints are found (joint_forces.py), while no row is redundant
 pulls        of each body the places in `numbers` of a spring that holds it: point x, y, target x, y, stiffness, damping; or []
 why          why there is no "run"; empty where there is
-modules      run, close, evaluate: {code: base64 of deflated WebAssembly, data_end, fields or places and size, inputs, results}
+modules      run, close, evaluate, mark: {code: base64 of deflated WebAssembly, data_end, fields or places and size, inputs,
+             results}
 
 udkjax/show/player/engine.js runs it: `loadEngine(data)` gives an object with `close(parameters, guess)` and
 `run(parameters, state, times)`, which say there what they return.

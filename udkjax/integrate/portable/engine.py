@@ -24,7 +24,7 @@ from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.native.evaluation import Evaluation
 from udkjax.native.layout import INFO, INPUTS
-from udkjax.native.operations import Close, Operation
+from udkjax.native.operations import Close, MarkRows, Operation
 from udkjax.native.steps import SMALLEST_STEP
 from udkjax.native.wasm import compile_wasm, wasm_module
 from udkjax.native.wasm.object_code import LinkedModule
@@ -34,7 +34,6 @@ from udkjax.scene.units import units_of
 
 Json = dict[str, Any]
 MAX_STEPS = 20_000  # of a run in a page: beyond, it would not answer for seconds
-UNKNOWN_ROWS = "the guess cannot be closed, or not moved: which rows are redundant is not known"
 
 
 class PortableEngine(NamedTuple):
@@ -80,6 +79,8 @@ def portable_engine(
     values = scalar_parameters(mechanism, parameters)
     dress: Callable[[Mechanism], Mechanism] = with_pulls if pull else lambda given: given.without_origin
     dressed, analysis = dress(mechanism), analyse(mechanism)
+    if _may_move_by_redundancy(mechanism, analysis):
+        analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page finds them
     numbers = NumberProgram(mechanism, values, dress)
     data: Json = {
         "format": 1,
@@ -87,7 +88,7 @@ def portable_engine(
         "parameters": [{"name": name, "unit": units_of(mechanism, name), "value": x} for name, x in values.items()],
         "numbers": floats(numbers.base),
         "count": numbers.count,
-        "rank": analysis.rank,
+        "marks": len(analysis.scales.rows) if analysis.redundant_rows is None else 0,
         "sampled": [],
         "samples": "",
         "thresholds": [0.0, 0.0],
@@ -96,14 +97,22 @@ def portable_engine(
     }
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
-    data["why"] = UNKNOWN_ROWS if analysis.redundant_rows is None else problem.compiled.plan.why_not_native
+    data["why"] = problem.compiled.plan.why_not_native
     modules = {"close": _close(dressed, data)}
+    if data["marks"]:
+        modules["mark"] = _operation(MarkRows(scene_programs(dressed).with_all_rows))
     if runs and not data["why"]:
         modules["run"] = _run(problem, data)
         if data["sampled"] and any(k >= numbers.count for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
     modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
     return PortableEngine(data | {"modules": modules}, numbers, dressed)
+
+
+def _may_move_by_redundancy(mechanism: Mechanism, analysis: Analysis) -> bool:
+    """Return whether constraints are redundant, not known to be independent, or as many as coordinates without the drivers'."""
+    undriven = len(analysis.row_names) - len(mechanism.driver_names)
+    return analysis.redundant_rows != () or undriven >= 3 * len(mechanism.bodies)
 
 
 def floats(x: Any) -> str:
@@ -174,19 +183,19 @@ def _close(mechanism: Mechanism, data: Json) -> Json:
 
 def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json) -> Json:
     """Return the module of evaluations; which efforts it finds goes into the data."""
-    code = scene_programs(mechanism, analysis.redundant_rows or ())
+    code = scene_programs(mechanism, analysis.redundant_rows)
     evaluation = Evaluation(code, [numbers.function()])
     data["efforts"] = [
-        {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", "place": places}
+        {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", **places}
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
-    data["forces"] = [] if analysis.redundant_rows or data["why"] else joint_forces(mechanism, code)
+    data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
     linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
     return _module(linked, places=evaluation.places, size=evaluation.size)
 
 
-def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[int | None]:
-    """Return where in the solution of the linear system the row of each driver is; None where it is left out."""
-    found = code.eliminated_rows
+def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[Json]:
+    """Return the row of each driver, and its place in the solution of the linear system."""
     names = [name for name, _ in code.row_names]
-    return [found.get(names.index(name)) for name in mechanism.driver_names]
+    rows = [names.index(name) for name in mechanism.driver_names]
+    return [{"row": row, "place": code.eliminated_rows[row]} for row in rows]

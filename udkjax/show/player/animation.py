@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from udkjax.integrate.simulate import simulate
 from udkjax.scene import Mechanism
 from udkjax.scene.arguments import checked, require_mechanism
-from udkjax.scene.requirements import ArgumentError, require_history
+from udkjax.scene.requirements import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
@@ -136,7 +136,8 @@ def animate(
         title: by default the mechanism's name.
         live: numbers that the page changes by sliders, by their names (`parameters()`), whole or one entry: the motion is closed
             and solved anew in the page, which a hand can pull at, too. {"pin.B[0]": (0.5, 2.0)} gives a slider its range; True
-            takes every number of the scene. Of one run, by default ten seconds. Its measures are violation, energy and effort,
+            takes every number of the scene. Of several runs a slider changes all that have its number. By default ten
+            seconds. Its measures are violation, energy and effort,
             which the page finds anew, behind those of your own, which it shows of the first motion alone; "rank" is none.
 
     Returns:
@@ -147,7 +148,7 @@ def animate(
         ValueError: a batch, a name that is not known, a run without any state, or one that cannot be live.
     """
     if live:
-        mechanism, solution, measures = _live_run(mechanism, solution, measures)
+        solution, measures = _live_runs(mechanism, solution, measures)
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
@@ -162,29 +163,27 @@ def animate(
             warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)
     data = player_data(title or found[0][0].name or "mechanism", found)
     if live:
-        one, run = found[0][0], next(iter(runs.values()))
-        assert run is not None
-        data["live"] = live_data(one, run, data["runs"][0], data["runs"][0]["symbols"], live)
+        shown: Any = [(one, run, record) for (one, *_), run, record in zip(found, runs.values(), data["runs"], strict=True)]
+        data["live"] = live_data(shown, live)
     return Animation(data, failures)
 
 
-def _live_run(
+def _live_runs(
     mechanism: Mechanism | Mapping[str, Mechanism],
     solution: ShownMotion | Mapping[str, ShownMotion] | None,
     measures: Measures,
-) -> tuple[Mechanism, ShownMotion, Measures]:
-    """Return the mechanism, the run and the measures of a live page."""
-    one: Any = next(iter(mechanism.values())) if isinstance(mechanism, Mapping) and len(mechanism) == 1 else mechanism
-    run: Any = next(iter(solution.values())) if isinstance(solution, Mapping) and len(solution) == 1 else solution
-    if isinstance(one, Mapping) or isinstance(run, Mapping):
-        raise ArgumentError("live: a page solves one run anew: give one mechanism and one solution")
-    one = require_mechanism(one)
-    if run is None:
-        run = simulate(one, np.linspace(0.0, LIVE_SECONDS, LIVE_INSTANTS), throw=False)
+) -> tuple[ShownMotion | Mapping[str, ShownMotion], Measures]:
+    """Return the runs and the measures of a live page."""
+    mechanisms = [require_mechanism(m) for m in (mechanism.values() if isinstance(mechanism, Mapping) else [mechanism])]
+    runs: Any = solution
+    if runs is None:
+        ts = np.linspace(0.0, LIVE_SECONDS, LIVE_INSTANTS)
+        found = [simulate(one, ts, throw=False) for one in mechanisms]
+        runs = dict(zip(mechanism, found, strict=True)) if isinstance(mechanism, Mapping) else found[0]
     given: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
-    efforts = ["effort"] if one.driver_names else []
+    efforts = ["effort"] if any(one.driver_names for one in mechanisms) else []
     wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # what the page finds anew, too
-    return one, run, {name: given.get(name) for name in wanted if name != "rank"}
+    return runs, {name: given.get(name) for name in wanted if name != "rank"}
 
 
 @checked

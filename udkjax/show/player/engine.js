@@ -4,6 +4,7 @@
 //   engine.parameters                          a list of {name, unit, value}
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
+//   engine.mark(parameters, state)             -> a number for each row of Psi, one where it is independent near a state; or null
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
 //   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
@@ -98,11 +99,13 @@ class Engine {
 
   breaks(numbers) { return numbers.slice(this.data.count).sort(); }
 
-  /** The numbers of the equations as a module takes them: with two thresholds, and with the samples that hold at a time. */
-  dressed(numbers, thresholds, t) {
-    const found = new Float64Array(this.data.count + 2);
-    found.set(numbers.subarray(0, this.data.count));
-    found.set(thresholds, this.data.count);
+  /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
+   *  that hold at a time. */
+  dressed(numbers, thresholds, t, marks = null) {
+    const {count} = this.data, found = new Float64Array(count + (marks?.length ?? 0) + 2);
+    found.set(numbers.subarray(0, count));
+    if (marks) found.set(marks, count);
+    found.set(thresholds, found.length - 2);
     const passed = this.breaks(numbers).filter(b => b <= t).length;
     this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
     return found;
@@ -133,13 +136,23 @@ class Engine {
     return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
   }
 
-  /** Integrate the motion from a closed state {q, v} at times[0].
+  /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
+  mark(parameters, {t, q, v}) {
+    const {data} = this;
+    if (!data.marks) return null;
+    const given = this.dressed(this.numbers(parameters), data.closing.thresholds, t);
+    const settings = [data.scales.length, Math.max(data.scales.rate, largest(v, this.unit))];
+    const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
+    return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
+  }
+
+  /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
    *
    *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
    *  that of the ground (m), stiffness (N/m) and damping (N s/m).
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
-   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; and the `last` state.
+   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; and its `marks`.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
@@ -148,7 +161,8 @@ class Engine {
     const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
     const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
     const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega, max_steps: limit});
-    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0]), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
+    const marks = state.marks ?? this.mark(parameters, {t: times[0], ...state});
+    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0], marks), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
       samples: this.samples};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
@@ -156,27 +170,29 @@ class Engine {
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
     const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
     if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
-    const limited = ended.code === 2, last = {t: ended.t, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
+    const limited = ended.code === 2, last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
     return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
-      steps: ended.accepted, tried: ended.tried, limited, last};
+      steps: ended.accepted, tried: ended.tried, limited, last, marks};
   }
 
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
-   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other. */
-  measure(parameters, {ts, q, v, count}, efforts = false, forces = false) {
-    const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
+   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
+   *  whose shares would be a choice. */
+  measure(parameters, {ts, q, v, count, marks = null}, efforts = false, forces = false) {
+    const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
+    const wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
-    const given = module.reserve(8 * (data.count + 2)), work = module.reserve(8 * module.module.size);
+    const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
     module.view(work, module.module.size).fill(0);
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
-      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
-      forces: new Float64Array(forces ? 2 * data.forces.length * count : 0)};
+      efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
+      forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // until then the constants hold: samples change them
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
-        module.view(given, data.count + 2).set(this.dressed(numbers, data.thresholds, ts[i]));
+        module.view(given, data.count + data.marks + 2).set(this.dressed(numbers, data.thresholds, ts[i], marks));
         module.exports.prologue(given, work);
         next = breaks.find(b => b > ts[i]) ?? Infinity;
       }
@@ -187,7 +203,7 @@ class Engine {
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
       if (!wanted.length && !found.forces.length) continue;
       module.exports.accelerations(work, work);
-      for (const {driver, place} of wanted) if (place !== null) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
+      for (const {driver, place} of wanted) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
       if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
     }
     return found;

@@ -4,7 +4,7 @@ const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second
 const DAMPING = 0.7;  // of the critical one
 const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
 
-/** Pulls while it is held; `live` gives the engine, and shows what comes of it. */
+/** Pulls while it is held; `live` is the run, which has the engine and shows what comes of it. */
 export class Hand {
   constructor(live, held, target) {
     const {engine, values} = live, numbers = engine.numbers(values), {speed} = live.player;
@@ -13,7 +13,7 @@ export class Hand {
     this.spring = {stiffness: mass * rate ** 2, damping: 2 * DAMPING * mass * rate};
     this.before = null;
     this.state = live.stateNow();
-    live.begin(this.state);
+    live.record(this.state);
     this.request = requestAnimationFrame(now => this.frame(now));
   }
 
@@ -28,8 +28,8 @@ export class Hand {
     const {live, state, held, spring, target} = this, t = state.t + step;
     const pull = {body: held.body, point: held.point, target, ...spring};
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
-    if (!run.done) return live.say(`the pull is too much: ${run.words}`, true);
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n)};
+    if (!run.done) return live.live.say(`the pull is too much: ${run.words}`, true);
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks};
     live.append(this.state, run.violation[1]);
     return null;
   }
@@ -38,7 +38,7 @@ export class Hand {
 
   release() {
     cancelAnimationFrame(this.request);
-    this.live.goOn(this.state);
+    this.live.letGo(this.state);
   }
 }
 

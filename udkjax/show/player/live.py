@@ -1,10 +1,14 @@
-"""The data that a live page has besides: the engine of its mechanism, sliders, and symbols that follow what they change.
+"""The data that a live page has besides: the engines of its mechanisms, sliders, and symbols that follow what they change.
 
-live     engine (udkjax/integrate/portable), sliders (live_parameters.py), follow (followers.py), start: the state that closing
-         begins with, or null where that is the scene's own guess; times: all of a motion that failed, or null
+sliders  live_parameters.py
+engines  udkjax/integrate/portable; runs of one mechanism share one
+runs     of each run: engine, its number; sliders: [number of a slider, the value that this mechanism has] for each parameter of
+         the engine; follow (followers.py); start: the state that closing begins with, or null where that is the scene's own
+         guess; times: all of a motion that failed, or null
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +19,7 @@ from udkjax.native.program import UnsupportedError
 from udkjax.scene import Mechanism
 from udkjax.scene.requirements import ArgumentError
 from udkjax.show.player.followers import followers
-from udkjax.show.player.live_parameters import Live, sliders_of
+from udkjax.show.player.live_parameters import Live, Slider, in_sections, names_in, sliders_of
 from udkjax.show.player.measure_curves import ShownMotion
 from udkjax.show.player.packing import Json
 from udkjax.show.player.player_data import MOST_INSTANTS
@@ -24,33 +28,51 @@ TOLERANCE = 1e-8  # rtol and atol of a run that does not know its own: those of 
 SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteristic time: the scene's own initial state
 
 
-def live_data(mechanism: Mechanism, solution: ShownMotion, record: Mapping, symbols: Sequence[Json], live: Live) -> Json:
-    """Return what a live page has besides, as plain data.
+def live_data(runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live) -> Json:
+    """Return what a live page of some runs has besides, as plain data; each run with what the player shows of it.
 
     Raises:
-        SceneError: a parameter is unknown.
-        ArgumentError: the mechanism, or the run, is nothing that a page can solve anew; says why.
+        SceneError: no mechanism has a parameter of that name.
+        ArgumentError: a mechanism, or a run, is nothing that a page can solve anew; says why.
     """
+    sliders: dict[str, Slider] = {}
+    engines: dict[tuple[int, float, float], int] = {}
+    data: Json = {"engines": [], "runs": []}
+    unknown = [] if isinstance(live, bool) else [n for n in live if not any(names_in(m, [n]) for m, _, _ in runs)]
+    for mechanism, solution, record in runs:
+        _require_solvable(solution)
+        own = sliders_of(mechanism, unknown or names_in(mechanism, live))
+        sliders = {slider.name: slider for slider in own} | sliders
+        rtol, atol = (float(getattr(solution, name, TOLERANCE)) for name in ("rtol", "atol"))
+        key = id(mechanism), rtol, atol
+        if key not in engines:
+            engines[key] = len(engines)
+            data["engines"].append(_engine(mechanism, own, rtol, atol))
+        follow = followers(mechanism, record, record["symbols"])
+        start, times = _start(mechanism, solution), _times(solution)
+        data["runs"].append({"engine": engines[key], "sliders": own, "follow": follow, "start": start, "times": times})
+    order = {slider.name: k for k, slider in enumerate(in_sections(sliders.values()))}
+    for run in data["runs"]:
+        run["sliders"] = [[order[slider.name], slider.value] for slider in run["sliders"]]
+    return data | {"sliders": [slider.data for slider in in_sections(sliders.values())]}
+
+
+def _require_solvable(solution: ShownMotion):
     if getattr(solution, "events", None) is not None:
         raise ArgumentError("live: a run with events cannot be solved anew in a page; leave out live, or the events")
     stabilization = getattr(solution, "settings", {}).get("stabilization", "Projection")
     if stabilization != "Projection":
         raise ArgumentError(f"live: a page solves by projection, and the run has stabilization={stabilization}: leave out live")
-    sliders = sliders_of(mechanism, live)
-    rtol, atol = (float(getattr(solution, name, TOLERANCE)) for name in ("rtol", "atol"))
+
+
+def _engine(mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: float) -> Json:
     try:
         engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol)
     except UnsupportedError as error:
         raise ArgumentError(f"live: a page has no instruction for {error}: name the numbers to change, without those") from None
     if engine.data["why"]:
         raise ArgumentError(f"live: a page cannot solve the motion anew: {engine.data['why']}")
-    return {
-        "engine": engine.data,
-        "sliders": [slider.data for slider in sliders],
-        "follow": followers(mechanism, record, symbols),
-        "start": _start(mechanism, solution),
-        "times": _times(solution),
-    }
+    return engine.data
 
 
 def _times(solution: ShownMotion) -> list[float] | None:

@@ -1,7 +1,7 @@
 """Sliders of a live page: which numbers of a scene they change, what they are called, and from where to where they go."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -75,8 +75,23 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
         if not low <= value <= high or not low < high:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not hold its value {value:g}")
         found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high)))
+    return in_sections(found)
+
+
+def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
+    """Return sliders in the order of their sections."""
     order = [*dict.fromkeys(SECTIONS.values())]
-    return sorted(found, key=lambda slider: order.index(slider.section) if slider.section in order else len(order))
+    return sorted(sliders, key=lambda slider: order.index(slider.section) if slider.section in order else len(order))
+
+
+def names_in(mechanism: Mechanism, live: Live) -> Live:
+    """Return what is wanted of a mechanism: the names that it has."""
+    if isinstance(live, bool):
+        return live
+    known = mechanism.parameters()
+    if isinstance(live, Mapping):
+        return {name: ends for name, ends in live.items() if _base(name) in known}
+    return [name for name in live if _base(name) in known]
 
 
 def section_of(name: str) -> str:

@@ -11,7 +11,7 @@ from udkjax.show.player.packing import Json
 
 MODULES = (  # after those they import
     *("motion", "painter", "symbols", "strip", "style", "elements", "pointers"),
-    *("engine", "follow", "hand", "sliders", "address", "live"),
+    *("engine", "follow", "hand", "sliders", "address", "live_run", "live"),
     *("player", "mount"),
 )
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.

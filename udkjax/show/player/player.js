@@ -89,7 +89,7 @@ export class Player {
     if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
     if (run.note) caption.append(" ", run.note);
     const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
-    followPointers(this, canvas);
+    followPointers(this, canvas, () => this.live?.runs[k]);
     return panel;
   }
 
@@ -281,19 +281,20 @@ export class Player {
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
-    for (const {run, canvas} of this.panels) {
+    this.panels.forEach(({run, canvas}, k) => {
+      const live = this.live?.runs[k];
       const {context, width, height} = this.context(canvas);
-      if (!width || !height) continue;
+      if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
-      this.live?.paintGhost(painter, context, t);
+      live?.paintGhost(painter, context, t);
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
-      this.live?.paintHand(painter);
+      live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);
       painter.bar(step, height);
-    }
+    });
     if (this.stripCanvas) {
       const {context, width, height} = this.context(this.stripCanvas);
       drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);

@@ -1,8 +1,8 @@
 // Fingers, mouse and wheel on a canvas.
 
-/** Drag moves the view, or of a live page pulls at the body that is there;
+/** Drag moves the view, or pulls at the body that is there, where the canvas shows the run of a live page;
  *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
-export function followPointers(player, canvas) {
+export function followPointers(player, canvas, liveRun) {
   const down = new Map();
   let moved = 0, hand = null;  // the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
@@ -10,11 +10,11 @@ export function followPointers(player, canvas) {
     canvas.setPointerCapture(event.pointerId);
     down.set(event.pointerId, point(event));
     moved = 0;
-    if (down.size === 1 && event.button === 0 && player.live?.bodyAt(canvas, point(event), event.pointerType)) hand = event.pointerId;
+    if (down.size === 1 && event.button === 0 && liveRun()?.bodyAt(canvas, point(event), event.pointerType)) hand = event.pointerId;
   });
   canvas.addEventListener("pointermove", event => {
     if (!down.has(event.pointerId)) {
-      if (player.live) canvas.classList.toggle("holds", Boolean(player.live.bodyAt(canvas, point(event), event.pointerType)));
+      if (liveRun()) canvas.classList.toggle("holds", Boolean(liveRun().bodyAt(canvas, point(event), event.pointerType)));
       return;
     }
     const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
@@ -22,8 +22,8 @@ export function followPointers(player, canvas) {
     moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
     if (moved < 4) return;
     if (hand === event.pointerId) {
-      if (player.live.hand) player.live.move(canvas, now);
-      else if (!player.live.grasp(canvas, old, event.pointerType)) hand = null;
+      if (liveRun().hand) liveRun().move(canvas, now);
+      else if (!liveRun().grasp(canvas, old, event.pointerType)) hand = null;
       return;
     }
     const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
@@ -37,7 +37,7 @@ export function followPointers(player, canvas) {
     player.draw();
   });
   const up = event => {
-    if (hand === event.pointerId) { hand = null; player.live.release(); }
+    if (hand === event.pointerId) { hand = null; liveRun().release(); }
     if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) player.toggle("playing");
   };
   canvas.addEventListener("pointerup", up);

@@ -76,7 +76,7 @@ export const LIVE_STYLE = `
 .live { width: 300px; flex: none; display: flex; flex-direction: column; min-height: 0; background: var(--panel);
   border-left: 1px solid var(--line); font-size: 13px; }
 .live .actions { display: flex; gap: 4px; flex-wrap: wrap; padding: 6px 10px; border-bottom: 1px solid var(--line); }
-.live .note { margin: 0; padding: 7px 14px; color: var(--soft); min-height: 34px; border-bottom: 1px solid var(--line); }
+.live .note { margin: 0; padding: 7px 14px; color: var(--soft); min-height: 34px; white-space: pre-line; border-bottom: 1px solid var(--line); }
 .live .note.bad { color: var(--force); font-weight: 600; }
 .live .rows { overflow: auto; flex: 1; min-height: 0; padding: 4px 14px 14px; }
 .live summary { cursor: pointer; font-weight: 600; padding: 8px 0 4px; }

@@ -1,0 +1,242 @@
+// One run of a live page: its first motion, and the motion of other numbers, which its engine solves a part at a time.
+
+import {Follower} from "./follow.js";
+import {Hand, bodyAt} from "./hand.js";
+import {Run, boundsOf, place} from "./motion.js";
+
+const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
+const GHOST = 0.28;  // how much one sees of the first motion
+const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
+// Of code times steps that a processor of today runs in 5 ms, a third of the time of a picture: the same on each machine, so that the
+// same numbers give the same motion.
+const STEP_BYTES = 4e7;
+const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
+
+export class LiveRun {
+  /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
+  constructor(live, run, record, data) {
+    const {ts, q, v, measures, frame, reactions, forces} = run;
+    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces}});
+    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed
+    this.follower = new Follower(run, data.follow);
+    Object.assign(this, {changed: false, hand: null, job: null, marks: null});
+  }
+
+  use(engine) {
+    this.engine = engine;
+    this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // of one picture
+    this.usual = this.freedoms(this.close(null), null);
+  }
+
+  /** The numbers of this run's sliders; those that nobody has moved are its own. */
+  get values() {
+    const {values, data: {sliders}} = this.live;
+    return Float64Array.from(this.data.sliders, ([k, own]) => (values[k] === sliders[k].value ? own : values[k]));
+  }
+
+  get end() { return this.run.ts[this.run.ts.length - 1]; }
+
+  close(values) { return this.engine.close(values, {t: this.times[0], ...this.data.start}); }
+
+  /** The degrees of freedom near a closed state, whose marks are found. */
+  freedoms(state, values) {
+    this.marks = state.marks = this.engine.mark(values, state);
+    return this.engine.size - (state.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank);
+  }
+
+  lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
+
+  reset() {
+    const {ts, q, v, measures, frame, reactions, forces} = this.first;
+    this.drop();
+    this.run.replace(ts, q, v, measures, frame);
+    this.showReactions(reactions, forces);
+    this.follower.follow(this.engine.numbers(null));
+    this.changed = false;
+  }
+
+  // Solving
+
+  /** Begin to solve the motion of the numbers as they are; returns words where its loops do not close. */
+  begin() {
+    this.drop();
+    const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
+    if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
+    const run = {ts: times, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+    this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
+    this.follower.follow(engine.numbers(values));
+    return "";
+  }
+
+  /** Solve on for as many steps as fit into one picture; returns what is said, and whether it ended too early. */
+  goOn() {
+    const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
+    const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
+    const part = engine.run(values, job.state, times, null, Math.min(this.steps, most - job.tried));
+    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = run.ts[run.ts.length - 1] - run.ts[0];
+    run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
+    run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
+    run.violation.set(part.violation.subarray(skip, skip + count), from);
+    run.count = job.from = from + count;
+    job.steps += part.steps;
+    job.tried += part.tried;
+    job.state = part.last;
+    this.show(run);
+    if (part.limited && job.tried < most) return {words: `Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
+    this.job = null;
+    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps.`
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    const words = job.freedoms === this.usual ? ended : `${ended} ${job.freedoms} degrees of freedom here, ${this.usual} at first.`;
+    return {words, bad: !part.done};
+  }
+
+  drop() {
+    this.job = null;
+    const {hand} = this;
+    this.hand = null;
+    if (hand) cancelAnimationFrame(hand.request);
+  }
+
+  // What is shown
+
+  show(run) {
+    const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
+    const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
+    const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
+    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1);
+    this.showReactions(this.reactions(found.forces), found.forces);
+    this.changed = true;
+  }
+
+  /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
+  reactions(forces) {
+    const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
+    if (!forces.length || !reactions) return null;
+    const largest = Float64Array.from({length: forces.length / each}, (_, i) => {
+      const now = forces.subarray(i * each, (i + 1) * each);
+      return now.reduce((most, x, k) => (k % 2 ? most : Math.max(most, Math.hypot(x, now[k + 1]))), 0);
+    }).sort();
+    const usual = largest[Math.floor(USUAL * (largest.length - 1))] || largest[largest.length - 1];
+    return usual > 0 ? {...this.run.arrows, usual} : null;
+  }
+
+  showReactions(reactions, forces) {
+    Object.assign(this.run, {reactions, forces});
+    const button = this.player.buttons.reactions;
+    if (button) button.disabled = !this.player.runs.some(run => run.reactions);
+  }
+
+  /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
+  measures(run, found) {
+    const {length} = this.engine.data.scales;
+    const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
+    const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
+    const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
+      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
+    return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
+  }
+
+  // The hand
+
+  /** The state at the time that is shown. */
+  stateNow() {
+    const t = this.player.t, {q, v} = this.run.state(t);
+    return {...this.engine.close(this.values, {t, q, v}), t};
+  }
+
+  /** What is on a panel's canvas at a place (px), if a hand can grasp it. */
+  bodyAt(canvas, point, pointer = "mouse") {
+    if (!this.engine) return null;
+    const painter = this.player.painter(canvas);
+    painter.pose = this.run.pose(this.player.t);
+    return bodyAt(painter, this.run.symbols, point, REACH[pointer] ?? REACH.touch);
+  }
+
+  grasp(canvas, point, pointer) {
+    const held = this.bodyAt(canvas, point, pointer);
+    if (!held) return false;
+    this.live.finish();
+    this.player.pause();
+    this.hand = new Hand(this, held, this.metres(canvas, point));
+    return true;
+  }
+
+  move(canvas, point) { this.hand?.move(this.metres(canvas, point)); }
+
+  release() {
+    const {hand} = this;
+    this.hand = null;
+    hand?.release();
+  }
+
+  metres(canvas, [x, y]) {
+    const view = this.player.view(canvas.clientWidth, canvas.clientHeight);
+    return [(x - view.x) / view.scale, (view.y - y) / view.scale];
+  }
+
+  /** Begin a record that a hand goes on with: of what was until now. */
+  record(state) {
+    const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
+    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
+    this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+    this.marks = state.marks ??= this.engine.mark(this.values, state);
+    this.append(state, state.violation);
+  }
+
+  /** Add one state to the record, and show it. */
+  append({t, q, v}, violation) {
+    const {past} = this;
+    past.ts.push(t);
+    past.q.push(...q);
+    past.v.push(...v);
+    past.violation.push(violation);
+    this.showPast();
+    this.player.setEnd(Math.max(t, this.player.data.end));
+    this.player.t = t;
+    this.player.draw();
+  }
+
+  showPast() {
+    const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
+    this.show({...run, count: run.ts.length});
+  }
+
+  /** Solve on from where the hand lets go, for as long as the first motion is. */
+  letGo(state) {
+    const {engine, past} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
+    const run = engine.run(this.values, state, times);
+    for (let k = 1; k < run.count; k++) {
+      past.ts.push(run.ts[k]);
+      past.q.push(...run.q.subarray(k * n, (k + 1) * n));
+      past.v.push(...run.v.subarray(k * n, (k + 1) * n));
+      past.violation.push(run.violation[k]);
+    }
+    this.showPast();
+    this.player.setEnd(this.live.end);
+    this.live.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
+    this.player.play();
+  }
+
+  // Pictures
+
+  paintGhost(painter, context, t) {
+    if (!this.changed || !this.player.show.ghost) return;
+    painter.pose = this.ghost.pose(Math.min(t, this.first.ts[this.first.ts.length - 1]));
+    context.globalAlpha = GHOST;
+    painter.draw(this.ghost.symbols);
+    context.globalAlpha = 1;
+  }
+
+  paintHand(painter) {
+    const {hand} = this;
+    if (!hand) return;
+    const from = painter.px(place(painter.pose, [hand.held.body, ...hand.held.point])), to = painter.px(hand.target);
+    painter.line([from, to], 1.6, painter.theme.accent, {dash: [5, 3]});
+    painter.circle(from, 3.2 * painter.pt, {fill: painter.theme.accent});
+    painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
+  }
+
+  /** Left, bottom, right, top (m) of all that is drawn of the motion as it is now. */
+  bounds() { return boundsOf(this.run, 0.1 * this.engine.data.scales.length); }
+}
