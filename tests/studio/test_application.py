@@ -170,6 +170,17 @@ def test_curves_need_forces(client):
     assert np.abs(work - change).max() < 1e-3 * np.abs(change).max()  # of the trapezoidal rule at 401 instants
 
 
+def test_what_motors_hold_still_needs_their_efforts(client):
+    """An arm of 2 kg and 1 m that a motor turns from the vertical: at rest in each position it needs m g sin(angle) / 2."""
+    arm = 'format = 2\nground = ["O"]\n[pins]\nO = [0, 0]\nA = [0, 1]\n[[link]]\nname = "arm"\npins = ["O", "A"]\nmass = 2\n'
+    found = client.ask("diagnose", text=arm + '[[motor]]\npin = "O"\nspeed = 3\n', about="holding").json()
+    curves, times = {curve["name"]: curve["values"] for curve in found["curves"]}, np.array(found["times"])
+    np.testing.assert_allclose(curves["motor1: effort"], -9.81 * np.sin(3 * times), atol=1e-9)
+    np.testing.assert_allclose(curves["O: force on arm"], 2 * 9.81, rtol=1e-12)
+    (problem,) = client.ask("diagnose", text=arm, about="holding").json()["problems"]
+    assert "motors do not hold all of it" in problem
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["html", "svg", "csv", "py", "gif", "dxf", "png"])
 def test_exports_are_written_into_the_folder(client, suffix):

@@ -177,6 +177,47 @@ def test_a_cam_lifts_a_follower_on_a_spring(studio):
 
 
 @pytest.mark.slow
+def test_gears_are_drawn(studio):
+    studio.tool("b")
+    studio.drag((60, 100), (80, 100))
+    studio.tool("b")
+    studio.drag((110, 100), (140, 100))
+    studio.tool("g")
+    studio.click(60, 100)
+    studio.click(110, 100)
+    studio.tool("w")
+    studio.drag((60, 100), (110, 100))
+    studio.tool("m")
+    studio.click(60, 100)
+    studio.settle()
+    assert studio.document["gear"] == [{"links": ["disc1", "disc2"], "teeth": [20, 30]}]
+    assert "motor1 turns all the way round" in studio.findings
+    assert_moves_as_simulated(studio, studio.js("studio.state.text"))
+
+
+@pytest.mark.slow
+def test_a_pin_in_a_slot_of_a_link_is_drawn_and_held_by_its_motor(studio):
+    """A quick return: the crank's pin in a slot of the lever."""
+    studio.link((60, 100), (60, 130))
+    studio.link((60, 60), (60, 160))
+    studio.tool("g")
+    studio.click(60, 100)
+    studio.click(60, 60)
+    studio.tool("k")
+    studio.drag((60, 130), (60, 150))
+    studio.tool("m")
+    studio.click(60, 100)
+    studio.settle()
+    assert studio.document["slot"] == [{"pin": "B", "along": ["C", "D"], "on": "link2"}]
+    text = studio.js("studio.state.text")
+    assert_moves_as_simulated(studio, text)
+    studio.page.get_by_role("tab", name="Statics").click()
+    studio.page.get_by_role("button", name="where motors hold").click()
+    studio.until("studio.curves.servedFor() !== null")
+    assert {"motor1: effort", "A: force on link1", "slot1: force on link2"} <= set(studio.js("studio.curves.names()"))
+
+
+@pytest.mark.slow
 def test_the_six_bar_of_seven_pins_is_drawn(studio):
     studio.link((40, 100), (60, 130))
     studio.tool("a")
@@ -450,17 +491,21 @@ def test_curves_scrub_and_forces_and_rest_are_computed_when_asked_for(studio):
     studio.js("studio.files.openTemplate('parallelogram')")
     studio.settle()
     box = studio.page.locator(".strip canvas").bounding_box()
-    studio.page.mouse.click(box["x"] + 12 + (box["width"] - 24) / 4, box["y"] + 60)
+    studio.page.mouse.click(box["x"] + 12 + (box["width"] - 80) / 4, box["y"] + 60)
     assert studio.js("studio.motion.t / studio.motion.end") == pytest.approx(0.25, abs=0.002)
+    studio.page.get_by_role("tab", name="Dynamics").click()
     studio.page.get_by_role("button", name="compute forces").click()
-    studio.until("studio.curves.served !== null && !studio.parts.forces.disabled")
-    assert studio.js("studio.curves.chosen").endswith("(not unique)")  # of a linkage with one link too many
+    studio.until("studio.curves.servedFor() !== null")
+    assert studio.js("studio.curves.name").endswith("(not unique)")  # of a linkage with one link too many
+    studio.page.get_by_role("tab", name="Statics").click()
     studio.page.get_by_role("button", name="find the position of rest").click()
-    studio.until("studio.parts.status.textContent.startsWith('at rest')")
+    studio.until("studio.curves.fact.textContent.startsWith('at rest')")
     drawn = udk.loads(studio.js("studio.state.text"))
     rest = np.asarray(udk.equilibrium(drawn, stable=True).q)
     np.testing.assert_allclose(np.reshape(studio.js("Array.from(studio.motion.posed.q)"), (-1, 3)), rest, atol=1e-9)
-    assert "Hz" in studio.status()
+    assert "Hz" in studio.page.locator(".fact").inner_text()
+    studio.page.get_by_role("button", name="where motors hold").click()
+    studio.until("studio.curves.fact.textContent.startsWith('motors do not hold')")
     studio.page.keyboard.press("Home")
     assert studio.js("studio.motion.posed") is None
 

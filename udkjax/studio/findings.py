@@ -10,7 +10,7 @@ from udkjax.integrate.assembly import AssemblyError
 from udkjax.scene import GROUND, Mechanism, SceneError
 from udkjax.scene.joints import Revolute, Slot
 from udkjax.studio.limits import RefusedError
-from udkjax.studio.shown_runs import force_curves
+from udkjax.studio.shown_runs import force_curves, holding_curves
 from udkjax.study.diagnosis import Diagnosis, diagnose
 from udkjax.study.diagnosis.fixes import Fix
 from udkjax.study.equilibrium import equilibrium
@@ -27,10 +27,10 @@ def examine(mechanism: Mechanism, about: str) -> Json:
 
     Args:
         mechanism: the drawing's.
-        about: "structure" (freedoms, redundancy, reactions), "travel" (how far each motor turns), "dynamics" (curves), or
-            "statics" (a position of rest).
+        about: "structure" (freedoms, redundancy, reactions), "travel" (how far each motor turns), "dynamics" (curves of forces),
+            "rest" (a position of rest), or "holding" (curves of forces where motors hold it still).
     """
-    subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves, "statics": rest}
+    subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves, "rest": rest, "holding": holding_curves}
     if about not in subjects:
         raise RefusedError(400, f"about: must be one of {', '.join(subjects)}")
     try:

@@ -1,14 +1,17 @@
 """The run that the studio shows of a drawing: how long it lasts, and its curves of forces and energies."""
 
 import math
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from udkjax.equations import analyse, efforts, unique_reactions
 from udkjax.integrate import Solution, simulate
-from udkjax.scene import Driver, Mechanism, Polynomial
+from udkjax.integrate.assembly import close
+from udkjax.scene import Driver, Mechanism, Polynomial, SceneError
 from udkjax.show.player.measure_curves import measures_of
+from udkjax.study.channels import StateHistory
 from udkjax.study.reaction_peaks import pin_reactions
 
 Json = dict[str, Any]
@@ -48,17 +51,51 @@ def recorded_motion(mechanism: Mechanism) -> Json:
 
 
 def force_curves(mechanism: Mechanism) -> Json:
-    """Return curves of the run that need forces: efforts of motors, forces at pins, energies, violation of the constraints.
-
-    A value that is not a number is null. Of redundant constraints the forces are the share of least norm, and marked.
-    """
+    """Return curves of the run that need forces: efforts and powers of motors, forces at pins, energies, violation of the constraints."""
     run = shown_run(mechanism)
-    curves = []
-    for name, effort in efforts(mechanism, run).items():
-        driver = mechanism.drivers[name]
-        curves.append(_curve(f"{name}: effort", "N m" if driver.coordinate == "angle" else "N", effort))
-        curves.append(_curve(f"{name}: power", "W", np.asarray(effort) * _rate(driver, np.asarray(run.ts))))
-    unique = unique_reactions(mechanism, run, about="joint")
+    ts, found = np.asarray(run.ts), _efforts(mechanism, run)
+    powers = [_curve(f"{n}: power", "W", np.asarray(x) * _rate(mechanism.drivers[n], ts)) for n, x in efforts(mechanism, run).items()]
+    measures = [_curve(m.name, m.unit, m.values) for m in measures_of(mechanism, run, ("energy", "violation"), "")]
+    return {"times": ts.tolist(), "curves": [*found, *powers, *_pin_forces(mechanism, run), *measures], "cause": run.cause}
+
+
+def holding_curves(mechanism: Mechanism) -> Json:
+    """Return curves of what holds a mechanism still in each position of its run: efforts of motors and forces at pins.
+
+    Raises:
+        SceneError: motors do not hold all of it.
+    """
+    if mobility_of(mechanism) > 0:
+        raise SceneError(["motors do not hold all of it still: what they leave free, loads would move"])
+    run = shown_run(mechanism)
+    still = {name: replace(driver, motion=Polynomial((driver.motion(0.0),))) for name, driver in mechanism.drivers.items()}
+    held = Mechanism(mechanism.bodies, mechanism.joints, still, mechanism.forces, gravity=mechanism.gravity)
+    rest = Positions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
+    curves = [*_efforts(held, rest), *_pin_forces(held, rest)]
+    return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
+
+
+class Positions(NamedTuple):
+    """Positions over time, at rest: q and v (T, bodies, 3)."""
+
+    ts: Any
+    q: Any
+    v: Any
+
+
+def mobility_of(mechanism: Mechanism) -> int:
+    """Return how many degrees of freedom the motors leave."""
+    return 3 * len(mechanism.bodies) - int(close(mechanism, 0.0).rank)
+
+
+def _efforts(mechanism: Mechanism, run: StateHistory) -> list[Json]:
+    units = {name: "N m" if driver.coordinate == "angle" else "N" for name, driver in mechanism.drivers.items()}
+    return [_curve(f"{name}: effort", units[name], effort) for name, effort in efforts(mechanism, run).items()]
+
+
+def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[Json]:
+    """Return curves of the forces at pins; of redundant constraints they are the share of least norm, and marked."""
+    curves, unique = [], unique_reactions(mechanism, run, about="joint")
     for pin, bodies in pin_reactions(mechanism, run).items():
         for body, load in bodies.items():
             if body == "ground":
@@ -67,8 +104,7 @@ def force_curves(mechanism: Mechanism) -> Json:
             parts = [x[body] for name, x in unique.items() if body in x and (name == pin or name.startswith(f"{pin}-"))]
             known = all(bool(np.asarray(x)[np.isfinite(load[:, 0]), :2].all()) for x in parts)
             curves.append(_curve(f"{pin}: force on {body}", "N", np.hypot(load[:, 0], load[:, 1]), known))
-    curves += [_curve(m.name, m.unit, m.values) for m in measures_of(mechanism, run, ("energy", "violation"), "")]
-    return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
+    return curves
 
 
 def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:
@@ -79,5 +115,6 @@ def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:
 
 
 def _curve(name: str, unit: str, values: Any, unique: bool = True) -> Json:
+    """Return a curve; a value that is not a number is null."""
     numbers = [x if math.isfinite(x) else None for x in np.asarray(values, float).tolist()]
     return {"name": name, "unit": unit, "values": numbers, "unique": unique}

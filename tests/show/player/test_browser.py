@@ -182,7 +182,7 @@ def test_keys_and_scrubbing(shown, animation):
         page.get_by_role("slider", name="time").fill("5000")
         assert time() == pytest.approx(1.0)
         strip = page.locator(".strip canvas").bounding_box()
-        page.mouse.click(strip["x"] + 12 + 0.25 * (strip["width"] - 24), strip["y"] + 70)
+        page.mouse.click(strip["x"] + 12 + 0.25 * (strip["width"] - 80), strip["y"] + 70)
         assert time() == pytest.approx(0.5, abs=0.01)
 
 
@@ -228,10 +228,10 @@ def test_the_strip_shows_the_measure(shown, animation):
         page.evaluate(f"{PLAYER}.seek(1.0)")
         strip = page.locator(".strip canvas").bounding_box()
         pixels = picture(page)
-        x = round(strip["x"] + 12 + 0.75 * (strip["width"] - 24))
-        column = pixels[round(strip["y"] + 32) : round(strip["y"] + strip["height"]), x]
-        curve = np.flatnonzero(np.abs(column - rgb(THEMES["light"]["bodies"][0])).max(axis=1) < 60) + 32
-        top, bottom = 34, strip["height"] - 10
+        x = round(strip["x"] + 12 + 0.75 * (strip["width"] - 80))
+        column = pixels[round(strip["y"] + 38) : round(strip["y"] + strip["height"]), x]
+        curve = np.flatnonzero(np.abs(column - rgb(THEMES["light"]["bodies"][0])).max(axis=1) < 60) + 38
+        top, bottom = 40, strip["height"] - 10
         assert curve.mean() == pytest.approx(bottom - 0.75 * (bottom - top), abs=1.5)
         assert page.get_by_role("combobox", name="measure").locator("option").all_text_contents() == ["crank angle", "speed"]
 

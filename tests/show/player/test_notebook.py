@@ -22,6 +22,8 @@ CELLS = (
     "udk.animate(udk.library.slider_crank(), run, measures=())",
     "widget.time = 1.25",
     "widget.time",
+    "live = udk.animate(udk.library.slider_crank(), live=['motor.motor.speed'])\nlive.widget()",
+    "live",
 )
 
 
@@ -75,7 +77,9 @@ def lab(tmp_path_factory):
         log.close()
 
 
-def test_the_widget_plays_in_jupyterlab(browser, lab):
+@pytest.fixture
+def notebook(browser, lab):
+    """The notebook in a page, and how one of its cells is run."""
     page = browser.new_page(viewport={"width": 1200, "height": 1000})
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))
@@ -87,6 +91,13 @@ def test_the_widget_plays_in_jupyterlab(browser, lab):
         page.locator(".jp-Notebook .jp-CodeCell").nth(k).locator(".cm-content").click()
         page.keyboard.press("Control+Enter")
 
+    yield page, run_cell
+    assert not [problem for problem in problems if "player" in problem.lower()], problems
+    page.close()
+
+
+def test_the_widget_plays_in_jupyterlab(notebook):
+    page, run_cell = notebook
     run_cell(0)
     widget = page.locator(".jp-Notebook .jp-CodeCell").nth(0)
     widget.get_by_role("button", name="play").wait_for(timeout=90_000)
@@ -104,5 +115,21 @@ def test_the_widget_plays_in_jupyterlab(browser, lab):
     run_cell(1)  # an animation shows itself as a page in a frame
     frame = page.locator(".jp-Notebook .jp-CodeCell").nth(1).frame_locator("iframe")
     frame.get_by_role("button", name="play").wait_for(timeout=60_000)
-    assert not [problem for problem in problems if "player" in problem.lower()], problems
-    page.close()
+
+
+def test_live_players_simulate_when_the_kernel_is_gone(notebook, lab):
+    page, run_cell = notebook
+    run_cell(0)
+    for k in (4, 5):
+        run_cell(k)
+    cells = page.locator(".jp-Notebook .jp-CodeCell")
+    shown = cells.nth(4), cells.nth(5).frame_locator("iframe")
+    for player in shown:
+        player.get_by_text("Move a slider").wait_for(timeout=90_000)
+    for kernel in json.load(urllib.request.urlopen(f"{lab}/api/kernels")):
+        urllib.request.urlopen(urllib.request.Request(f"{lab}/api/kernels/{kernel['id']}", method="DELETE"))
+    for player in shown:
+        number = player.get_by_role("spinbutton", name="motor speed, number")
+        number.fill("2")
+        number.press("Enter")
+        player.get_by_text("10 s solved anew").wait_for(timeout=20_000)

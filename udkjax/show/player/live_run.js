@@ -38,10 +38,11 @@ export class LiveRun {
 
   close(values) { return this.engine.close(values, {t: this.times[0], ...this.data.start}); }
 
-  /** The degrees of freedom near a closed state, whose marks are found. */
+  /** The degrees of freedom near a closed state, whose marks are found; null where branches of the motion meet. */
   freedoms(state, values) {
     this.marks = state.marks = this.engine.mark(values, state);
-    return this.engine.size - (state.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank);
+    const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
+    return this.marks && state.rank < rank && rank === this.marks.length ? null : this.engine.size - rank;
   }
 
   lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
@@ -86,7 +87,7 @@ export class LiveRun {
     this.job = null;
     const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps.`
       : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
-    const words = job.freedoms === this.usual ? ended : `${ended} ${job.freedoms} degrees of freedom here, ${this.usual} at first.`;
+    const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
     return {words, bad: !part.done};
   }
 

@@ -5,7 +5,7 @@ import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES} from "./painter.js";
 import {followPointers} from "./pointers.js";
-import {drawStrip} from "./strip.js";
+import {drawStrip, stripPart} from "./strip.js";
 import {LIVE_STYLE} from "./sliders.js";
 import {STYLE} from "./style.js";
 import {SymbolPainter} from "./symbols.js";
@@ -99,7 +99,7 @@ export class Player {
     for (const name of this.measures) select.append(make("option", {value: name}, name));
     const seek = event => {
       const box = this.stripCanvas.getBoundingClientRect();
-      this.seek(this.data.start + (this.data.end - this.data.start) * clamp((event.clientX - box.left - 12) / (box.width - 24), 0, 1));
+      this.seek(this.data.start + (this.data.end - this.data.start) * stripPart(event.clientX - box.left, box.width));
     };
     this.stripCanvas.addEventListener("pointerdown", event => { this.stripCanvas.setPointerCapture(event.pointerId); seek(event); });
     this.stripCanvas.addEventListener("pointermove", event => { if (event.buttons) seek(event); });

@@ -1,11 +1,16 @@
 // The strip below the scene: curves of a measure over time.
 
-import {short} from "./motion.js";
+import {clamp, short} from "./motion.js";
 import {Painter} from "./painter.js";
+
+const LEFT = 12, RIGHT = 68;  // px beside the curves; at the right stand the least and the largest value
+
+/** The part of the timeline at x (px) in a strip of some width, from 0 to 1. */
+export const stripPart = (x, width) => clamp((x - LEFT) / (width - LEFT - RIGHT), 0, 1);
 
 /** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
 export function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
-  const left = 12, right = width - 12, top = 34, bottom = height - 10;
+  const left = LEFT, right = width - RIGHT, top = 40, bottom = height - 10;
   const found = runs.map(run => run.measures.find(m => m.name === name));
   const log = found.some(m => m?.log);
   const scaled = y => (log ? Math.log10(Math.max(Math.abs(y), 1e-300)) : y);
@@ -35,9 +40,9 @@ export function drawStrip(context, width, height, runs, name, start, end, t, the
     context.stroke();
   });
   painter.line([[x(t), top - 4], [x(t), bottom]], 1.2, theme.ink);
-  const ends = {back: theme.panel, align: "right", size: 11}, back = value => (log ? 10 ** value : value);
-  painter.text(short(back(high)), [right, top + 3], theme.soft, ends);
-  painter.text(short(back(low)), [right, bottom - 7], theme.soft, ends);
+  const ends = {size: 11, halo: false}, back = value => (log ? 10 ** value : value);
+  painter.text(short(back(high)), [right + 7, top], theme.soft, ends);
+  painter.text(short(back(low)), [right + 7, bottom - 1], theme.soft, ends);
   // Values at this time, from the right: one for each run, in its colour; without the runs' names where there is no room.
   const now = runs.map((run, k) => {
     const [i, j, , s] = run.find(t), value = found[k]?.values[s < 0.5 ? i : j];
@@ -46,7 +51,7 @@ export function drawStrip(context, width, height, runs, name, start, end, t, the
   context.font = "600 12px system-ui";
   const whole = now.map(({words}, k) => `${runs[k].label}  ${words}`);
   const room = whole.reduce((sum, words) => sum + context.measureText(words).width + 18, taken) < width;
-  let edge = right;
+  let edge = width - LEFT;
   for (let k = runs.length - 1; k >= 0; k--) {
     const colour = theme.bodies[k % theme.bodies.length], {value} = now[k], words = room && runs.length > 1 ? whole[k] : now[k].words;
     if (!now[k].words) continue;

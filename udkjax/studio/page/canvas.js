@@ -3,6 +3,7 @@
 import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {middle, symbolsOf} from "./drawn_symbols.js";
 import {carry} from "./mover.js";
+import {linkShape} from "./shapes.js";
 import {THEMES} from "./player/painter.js";
 import {SymbolPainter} from "./player/symbols.js";
 import {angleUnit, lengthUnit, shown} from "./units.js";
@@ -10,6 +11,7 @@ import {toPixels} from "./view.js";
 
 const HALO = 7;  // px around what is selected
 const LABEL = 12;  // px
+const BESIDE = 14, ROOM = 26;  // px from a bar to its name, and between that and a pin
 
 export class DrawingCanvas {
   constructor(element) {
@@ -140,13 +142,12 @@ export class DrawingCanvas {
       const chosen = selection.some(item => item.kind === "pin" && item.name === name);
       if (show.names || chosen) painter.text(name, [x + 9, y - 12], theme.ink, {size: LABEL, weight: chosen ? 700 : 400});
     }
+    const taken = [...this.places.values()];
     list(document, "link").forEach((link, k) => {
       const chosen = selection.some(item => item.kind === "link" && item.index === k);
-      const place = middle(link, document);
-      if ((show.names || chosen) && place && (link.pins?.length > 1 || chosen)) {
-        const [x, y] = toPixels(painter.view, carry(motions, k, place));
-        painter.text(link.name ?? "", [x, y + 17], painter.colour(k), {size: LABEL, weight: chosen ? 700 : 500, align: "center"});
-      }
+      if (!(show.names || chosen) || !(link.pins?.length > 1 || chosen)) return;
+      const at = this.labelPlace(link, k, document, painter, motions, taken);
+      if (at) painter.text(link.name ?? "", at.place, painter.colour(k), {size: LABEL, weight: chosen ? 700 : 500, align: at.align});
     });
     for (const section of ["motor", "spring", "damper", "load", "gear", "cam"]) {
       list(document, section).forEach((entry, k) => {
@@ -155,6 +156,20 @@ export class DrawingCanvas {
         if (outline) painter.text(nameOf(document, section, k), [outline.points[0][0] + 14, outline.points[0][1] - 18], theme.accent, {size: LABEL, weight: 700});
       });
     }
+  }
+
+  /** Where the name of a link stands: within a plate, or beside a bar, away from pins and other names, whose places are `taken`. */
+  labelPlace(link, k, document, painter, motions, taken) {
+    const pixel = place => toPixels(painter.view, carry(motions, k, place)), shape = linkShape(document, link), centre = middle(link, document);
+    if (!shape || !centre) return null;
+    if (shape.kind !== "line") return {place: pixel(centre).map((x, i) => x + (i && shape.kind === "disc" ? 17 : 0)), align: "center"};
+    const [a, b] = [shape.points[0], shape.points.at(-1)].map(pixel), length = Math.hypot(b[0] - a[0], b[1] - a[1]) || 1;
+    let [nx, ny] = [(a[1] - b[1]) / length, (b[0] - a[0]) / length];
+    if (ny < 0) [nx, ny] = [-nx, -ny];  // below it
+    const along = s => [0, 1].map(i => a[i] + s * (b[i] - a[i])), isFree = ([x, y]) => taken.every(p => Math.hypot(p[0] - x, p[1] - y) > ROOM);
+    const [x, y] = [0.5, 0.3, 0.7].map(along).find(isFree) ?? along(0.5);
+    taken.push([x, y]);
+    return {place: [x + BESIDE * nx, y + (BESIDE + 2) * ny], align: Math.abs(nx) < 0.4 ? "center" : nx > 0 ? "left" : "right"};
   }
 
   preview({preview, document, view, hand}, painter, theme) {

@@ -37,9 +37,8 @@ export class FindingsPanel {
     this.structure = this.travel = null;
     this.mark([]);
     this.replace(
-      make("p", {class: "lead"}, "Draw a mechanism"),
-      make("p", {}, "Press L and drag links from pin to pin; G fixes a pin to the ground; M puts a motor on one."),
-      make("div", {class: "group"}, make("button", {type: "button", onclick: () => this.studio.files.showOpen()}, "Open a file or a template")));
+      make("p", {class: "lead"}, "Nothing is drawn yet"),
+      make("p", {}, "Freedoms, redundant constraints and what moves the mechanism are said here while you draw."));
   }
 
   /** Mistakes, as the reader of files names them; each leads to its element. */
@@ -64,6 +63,7 @@ export class FindingsPanel {
   showTravel(found) {
     this.travel = found.travel ?? [];
     this.show();
+    this.studio.redraw();
   }
 
   show() {
@@ -86,6 +86,12 @@ export class FindingsPanel {
     this.mark(s.sets.flatMap(set => set.constraints.map(pinOf(pins)).filter(Boolean).map(pin => [pin, {sign: "R", strong: false}])));
   }
 
+  /** How far motors turn, in words; nothing while it is not known of this drawing. */
+  travelWords() {
+    if (!this.travel || this.element.classList.contains("stale")) return "";
+    return this.travel.map(({motor, unit, ends}) => travelWords(motor, unit, ends)).join(" ");
+  }
+
   /** A button that makes a fix, where the drawing has something for it. */
   freeing(fix) {
     const {studio} = this, {mover} = studio.motion, changed = () => applyFix(studio.document, fix, mover.bodies());
@@ -102,11 +108,16 @@ export class FindingsPanel {
       make("ul", {}, ...fixes.map(fix => make("li", {}, make("button", {type: "button", class: "link",
         onclick: () => this.studio.select([itemNamed(this.studio.document, fix.constraint)].filter(Boolean)),
         onmouseenter: () => this.mark([...constraints.map(toPin).filter(Boolean).map(pin => [pin, {sign: "R", strong: pin === toPin(fix.constraint)}])]),
-      }, make("b", {}, fix.constraint), `: ${fix.change}`), ...this.freeing(fix)))));
+      }, make("b", {}, fix.constraint), `: ${changeWords(fix)}`), ...this.freeing(fix)))));
   }
 }
 
 const pinOf = pins => name => (Object.hasOwn(pins, name) ? name : Object.keys(pins).find(pin => name.startsWith(`${pin}-`)));
+
+function changeWords({change, drawn}) {
+  const of = name => (name === "ground" ? "the ground" : name);
+  return drawn?.kind === "slot" ? `make it a slot of ${of(drawn.on)} that guides the pin of ${of(drawn.link)}` : change;
+}
 
 function travelWords(motor, unit, ends) {
   const value = x => (unit === "rad" ? `${(x * 180 / Math.PI).toFixed(1)}°` : `${+(1e3 * x).toPrecision(4)} mm`).replace("-", "−");

@@ -59,7 +59,13 @@ export function buildPage(studio, root) {
   const narrow = matchMedia("(max-width: 760px)"), unfold = () => { options.open = !narrow.matches; };
   narrow.addEventListener("change", unfold);
   unfold();
-  const stage = make("main", {}, parts.canvas, options, parts.status);
+  parts.welcome = make("div", {class: "welcome"}, make("h2", {}, "Draw a mechanism"),
+    make("ol", {}, ...[["link", "Drag links from pin to pin"], ["ground", "Fix pins to the ground"], ["motor", "Put a motor on one, and press play"]].map(([name, words]) => {
+      const tool = TOOLS.find(one => one.name === name);
+      return make("li", {}, button(svgIcon(tool.icon, tool.stroke), `${tool.title} (${tool.key.toUpperCase()})`, () => studio.setTool(name), "icon"),
+        make("span", {}, words, " ", make("kbd", {}, tool.key.toUpperCase())));
+    })), button("Open a file or a template", "open a file or a template (Ctrl+O)", () => studio.files.showOpen()));
+  const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status);
   parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
   parts.home = button(svgIcon(ICONS.home), "as drawn (Home)", () => studio.rewind(), "icon");
   parts.scrub = make("input", {type: "range", min: 0, max: 10000, step: 1, "aria-label": "time", oninput: () => {
@@ -71,17 +77,13 @@ export function buildPage(studio, root) {
     ...[0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10].map(x => make("option", {value: x}, `${x} ×`)));
   parts.speed.value = 1;
   parts.loops = make("span", {class: "loops", role: "status"});
-  parts.curveSelect = make("select", {"aria-label": "curve"});
-  parts.curveCanvas = make("canvas", {"aria-hidden": "true"});
-  parts.forces = button("Forces", "compute forces at pins, powers and energies", () => studio.curves.askForces());
-  parts.statics = button("At rest", "find the position of rest next to the drawn one, and its frequencies", () => studio.curves.askStatics());
-  const strip = make("div", {class: "strip"}, parts.curveCanvas, make("div", {class: "group over-strip"}, parts.curveSelect, parts.forces, parts.statics));
+  parts.strip = make("section", {class: "strip", "aria-label": "curves"});
   const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.scrub, parts.speed, parts.loops);
   const side = make("aside", {}, section("Findings", "findings"), section("Selection", "properties"), section("Text (TOML)", "source"));
   parts.help = make("dialog", {class: "help", "aria-label": "keys"}, make("h2", {}, "Keys"),
     make("dl", {}, ...KEYS.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])),
     make("form", {method: "dialog"}, make("button", {class: "strong"}, "Close")));
   parts.dialog = make("dialog", {class: "sheet"});
-  root.replaceChildren(header, make("div", {class: "tools", role: "toolbar", "aria-label": "tools"}, ...parts.tools), stage, side, strip, transport, parts.help, parts.dialog);
+  root.replaceChildren(header, make("div", {class: "tools", role: "toolbar", "aria-label": "tools"}, ...parts.tools), stage, side, parts.strip, transport, parts.help, parts.dialog);
   return parts;
 }

@@ -6,6 +6,7 @@ import {list, placeOf} from "./document.js";
 const INSTANTS = 401;
 const PULLS = 12;  // closings of one frame, each nearer to the hand
 const LONGEST_PULL = 0.08;  // characteristic lengths in one closing, so that no branch is jumped to
+const STILL = 1e-9;  // characteristic lengths, or rad: a motion that is less is rounding
 const NEAR = 1e-4;  // characteristic lengths of the hand: near enough
 
 /** Turn frames x, y, angle of bodies and those that they are drawn in into motions of the ground: place p goes to t + R p. */
@@ -91,7 +92,15 @@ export class Mover {
     if (!state.closed) return {...still, words: "the loops do not close as drawn"};
     const times = Float64Array.from({length: INSTANTS}, (_, k) => this.duration * k / (INSTANTS - 1));
     const found = this.engine.run(this.parameters, state, times);
-    return found.count ? found : {...still, words: found.words};
+    if (!found.count) return {...still, words: found.words};
+    return this.moves(found) ? found : {...still, words: "nothing moves"};
+  }
+
+  /** Tell whether a run goes anywhere. */
+  moves({q, count}) {
+    const {size} = this, least = STILL * this.scene.length;
+    for (let k = size; k < count * size; k++) if (Math.abs(q[k] - q[k % size]) > (k % 3 === 2 ? STILL : least)) return true;
+    return false;
   }
 
   /** The state of a run at a time, closed: between its instants it is interpolated, which leaves loops open by a little. */

@@ -39,8 +39,8 @@ class Studio {
     this.parts = buildPage(this, root);
     this.canvas = new DrawingCanvas(this.parts.canvas);
     this.motion = new Motion(this);
-    this.curves = new CurvesPanel(this, this.parts);
     this.findings = new FindingsPanel(this, this.parts.findings);
+    this.curves = new CurvesPanel(this, this.parts.strip);
     this.properties = new PropertiesPanel(this, this.parts.properties);
     this.source = new SourcePanel(this, this.parts.source);
     this.files = new FileActions(this);
@@ -204,6 +204,7 @@ class Studio {
   shown() {
     for (const button of this.parts.tools) button.setAttribute("aria-pressed", button.dataset.tool === this.tool);
     this.parts.canvas.dataset.tool = this.tool;
+    this.parts.welcome.hidden = this.tool !== "select" || Object.keys(pinsOf(this.document)).length > 0 || Boolean(this.picture);
     this.parts.undo.disabled = !this.history.canUndo;
     this.parts.redo.disabled = !this.history.canRedo;
     this.properties.show();
