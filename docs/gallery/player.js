@@ -380,9 +380,14 @@ class SymbolPainter extends Painter {
 // The strip below the scene: curves of a measure over time.
 
 
+const LEFT = 12, RIGHT = 68;  // px beside the curves; at the right stand the least and the largest value
+
+/** The part of the timeline at x (px) in a strip of some width, from 0 to 1. */
+const stripPart = (x, width) => clamp((x - LEFT) / (width - LEFT - RIGHT), 0, 1);
+
 /** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
 function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
-  const left = 12, right = width - 12, top = 34, bottom = height - 10;
+  const left = LEFT, right = width - RIGHT, top = 40, bottom = height - 10;
   const found = runs.map(run => run.measures.find(m => m.name === name));
   const log = found.some(m => m?.log);
   const scaled = y => (log ? Math.log10(Math.max(Math.abs(y), 1e-300)) : y);
@@ -412,9 +417,9 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
     context.stroke();
   });
   painter.line([[x(t), top - 4], [x(t), bottom]], 1.2, theme.ink);
-  const ends = {back: theme.panel, align: "right", size: 11}, back = value => (log ? 10 ** value : value);
-  painter.text(short(back(high)), [right, top + 3], theme.soft, ends);
-  painter.text(short(back(low)), [right, bottom - 7], theme.soft, ends);
+  const ends = {size: 11, halo: false}, back = value => (log ? 10 ** value : value);
+  painter.text(short(back(high)), [right + 7, top], theme.soft, ends);
+  painter.text(short(back(low)), [right + 7, bottom - 1], theme.soft, ends);
   // Values at this time, from the right: one for each run, in its colour; without the runs' names where there is no room.
   const now = runs.map((run, k) => {
     const [i, j, , s] = run.find(t), value = found[k]?.values[s < 0.5 ? i : j];
@@ -423,7 +428,7 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
   context.font = "600 12px system-ui";
   const whole = now.map(({words}, k) => `${runs[k].label}  ${words}`);
   const room = whole.reduce((sum, words) => sum + context.measureText(words).width + 18, taken) < width;
-  let edge = right;
+  let edge = width - LEFT;
   for (let k = runs.length - 1; k >= 0; k--) {
     const colour = theme.bodies[k % theme.bodies.length], {value} = now[k], words = room && runs.length > 1 ? whole[k] : now[k].words;
     if (!now[k].words) continue;
@@ -525,11 +530,20 @@ function icon(name) {
   return svg;
 }
 
+/** Let a click on a button leave the keys to what is shown: else the space bar would press the button again. */
+function keepKeys(root, focused) {
+  root.addEventListener("mousedown", event => {
+    if (!event.target.closest("button") || event.target.closest("dialog")) return;
+    event.preventDefault();
+    focused.focus({preventScroll: true});
+  });
+}
+
 // Fingers, mouse and wheel on a canvas.
 
-/** Drag moves the view, or of a live page pulls at the body that is there;
+/** Drag moves the view, or pulls at the body that is there, where the canvas shows the run of a live page;
  *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
-function followPointers(player, canvas) {
+function followPointers(player, canvas, liveRun) {
   const down = new Map();
   let moved = 0, hand = null;  // the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
@@ -537,11 +551,11 @@ function followPointers(player, canvas) {
     canvas.setPointerCapture(event.pointerId);
     down.set(event.pointerId, point(event));
     moved = 0;
-    if (down.size === 1 && event.button === 0 && player.live?.bodyAt(canvas, point(event), event.pointerType)) hand = event.pointerId;
+    if (down.size === 1 && event.button === 0 && liveRun()?.bodyAt(canvas, point(event), event.pointerType)) hand = event.pointerId;
   });
   canvas.addEventListener("pointermove", event => {
     if (!down.has(event.pointerId)) {
-      if (player.live) canvas.classList.toggle("holds", Boolean(player.live.bodyAt(canvas, point(event), event.pointerType)));
+      if (liveRun()) canvas.classList.toggle("holds", Boolean(liveRun().bodyAt(canvas, point(event), event.pointerType)));
       return;
     }
     const before = [...down.values()], old = down.get(event.pointerId), now = point(event);
@@ -549,8 +563,8 @@ function followPointers(player, canvas) {
     moved += Math.hypot(now[0] - old[0], now[1] - old[1]);
     if (moved < 4) return;
     if (hand === event.pointerId) {
-      if (player.live.hand) player.live.move(canvas, now);
-      else if (!player.live.grasp(canvas, old, event.pointerType)) hand = null;
+      if (liveRun().hand) liveRun().move(canvas, now);
+      else if (!liveRun().grasp(canvas, old, event.pointerType)) hand = null;
       return;
     }
     const after = [...down.values()], centre = list => [0, 1].map(k => list.reduce((sum, p) => sum + p[k], 0) / list.length);
@@ -564,7 +578,7 @@ function followPointers(player, canvas) {
     player.draw();
   });
   const up = event => {
-    if (hand === event.pointerId) { hand = null; player.live.release(); }
+    if (hand === event.pointerId) { hand = null; liveRun().release(); }
     if (down.delete(event.pointerId) && event.type === "pointerup" && moved < 4) player.toggle("playing");
   };
   canvas.addEventListener("pointerup", up);
@@ -584,6 +598,7 @@ function followPointers(player, canvas) {
 //   engine.parameters                          a list of {name, unit, value}
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
+//   engine.mark(parameters, state)             -> a number for each row of Psi, one where it is independent near a state; or null
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
 //   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
@@ -677,11 +692,13 @@ class Engine {
 
   breaks(numbers) { return numbers.slice(this.data.count).sort(); }
 
-  /** The numbers of the equations as a module takes them: with two thresholds, and with the samples that hold at a time. */
-  dressed(numbers, thresholds, t) {
-    const found = new Float64Array(this.data.count + 2);
-    found.set(numbers.subarray(0, this.data.count));
-    found.set(thresholds, this.data.count);
+  /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
+   *  that hold at a time. */
+  dressed(numbers, thresholds, t, marks = null) {
+    const {count} = this.data, found = new Float64Array(count + (marks?.length ?? 0) + 2);
+    found.set(numbers.subarray(0, count));
+    if (marks) found.set(marks, count);
+    found.set(thresholds, found.length - 2);
     const passed = this.breaks(numbers).filter(b => b <= t).length;
     this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
     return found;
@@ -712,13 +729,23 @@ class Engine {
     return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
   }
 
-  /** Integrate the motion from a closed state {q, v} at times[0].
+  /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
+  mark(parameters, {t, q, v}) {
+    const {data} = this;
+    if (!data.marks) return null;
+    const given = this.dressed(this.numbers(parameters), data.closing.thresholds, t);
+    const settings = [data.scales.length, Math.max(data.scales.rate, largest(v, this.unit))];
+    const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
+    return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
+  }
+
+  /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
    *
    *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
    *  that of the ground (m), stiffness (N/m) and damping (N s/m).
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
-   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; and the `last` state.
+   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; and its `marks`.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
@@ -727,7 +754,8 @@ class Engine {
     const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
     const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
     const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega, max_steps: limit});
-    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0]), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
+    const marks = state.marks ?? this.mark(parameters, {t: times[0], ...state});
+    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0], marks), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
       samples: this.samples};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
@@ -735,27 +763,29 @@ class Engine {
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
     const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
     if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
-    const limited = ended.code === 2, last = {t: ended.t, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
+    const limited = ended.code === 2, last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
     return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
-      steps: ended.accepted, tried: ended.tried, limited, last};
+      steps: ended.accepted, tried: ended.tried, limited, last, marks};
   }
 
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
-   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other. */
-  measure(parameters, {ts, q, v, count}, efforts = false, forces = false) {
-    const {data, size} = this, module = this.instances.evaluate, {places} = module.module, wanted = efforts ? data.efforts : [];
+   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
+   *  whose shares would be a choice. */
+  measure(parameters, {ts, q, v, count, marks = null}, efforts = false, forces = false) {
+    const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
+    const wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
-    const given = module.reserve(8 * (data.count + 2)), work = module.reserve(8 * module.module.size);
+    const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
     module.view(work, module.module.size).fill(0);
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
-      efforts: Object.fromEntries(wanted.map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
-      forces: new Float64Array(forces ? 2 * data.forces.length * count : 0)};
+      efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
+      forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // until then the constants hold: samples change them
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
-        module.view(given, data.count + 2).set(this.dressed(numbers, data.thresholds, ts[i]));
+        module.view(given, data.count + data.marks + 2).set(this.dressed(numbers, data.thresholds, ts[i], marks));
         module.exports.prologue(given, work);
         next = breaks.find(b => b > ts[i]) ?? Infinity;
       }
@@ -766,7 +796,7 @@ class Engine {
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
       if (!wanted.length && !found.forces.length) continue;
       module.exports.accelerations(work, work);
-      for (const {driver, place} of wanted) if (place !== null) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
+      for (const {driver, place} of wanted) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
       if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
     }
     return found;
@@ -823,7 +853,7 @@ const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second
 const DAMPING = 0.7;  // of the critical one
 const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
 
-/** Pulls while it is held; `live` gives the engine, and shows what comes of it. */
+/** Pulls while it is held; `live` is the run, which has the engine and shows what comes of it. */
 class Hand {
   constructor(live, held, target) {
     const {engine, values} = live, numbers = engine.numbers(values), {speed} = live.player;
@@ -832,7 +862,7 @@ class Hand {
     this.spring = {stiffness: mass * rate ** 2, damping: 2 * DAMPING * mass * rate};
     this.before = null;
     this.state = live.stateNow();
-    live.begin(this.state);
+    live.record(this.state);
     this.request = requestAnimationFrame(now => this.frame(now));
   }
 
@@ -847,8 +877,8 @@ class Hand {
     const {live, state, held, spring, target} = this, t = state.t + step;
     const pull = {body: held.body, point: held.point, target, ...spring};
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
-    if (!run.done) return live.say(`the pull is too much: ${run.words}`, true);
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n)};
+    if (!run.done) return live.live.say(`the pull is too much: ${run.words}`, true);
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks};
     live.append(this.state, run.violation[1]);
     return null;
   }
@@ -857,7 +887,7 @@ class Hand {
 
   release() {
     cancelAnimationFrame(this.request);
-    this.live.goOn(this.state);
+    this.live.letGo(this.state);
   }
 }
 
@@ -909,12 +939,18 @@ class SliderPanel {
       range.setAttribute("aria-valuetext", `${number.value} ${unit}`);
     };
     range.addEventListener("input", () => { set(+range.value); changed(+range.value); });
-    number.addEventListener("change", () => {
+    let taken = null;  // what was typed last
+    const take = () => {
       if (!Number.isFinite(number.valueAsNumber)) return set(+range.value);
+      if (number.value === taken) return undefined;
       const value = number.valueAsNumber;
       set(value);
-      changed(value);
-    });
+      taken = number.value;
+      return changed(value);
+    };
+    number.addEventListener("focus", () => { taken = number.value; });
+    number.addEventListener("change", take);
+    number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // which a notebook keeps to itself
     range.addEventListener("dblclick", () => { set(slider.value); changed(slider.value); });
     const shown = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
     const element = make("div", {class: "slider", title: slider.name},
@@ -950,7 +986,7 @@ const LIVE_STYLE = `
 .live { width: 300px; flex: none; display: flex; flex-direction: column; min-height: 0; background: var(--panel);
   border-left: 1px solid var(--line); font-size: 13px; }
 .live .actions { display: flex; gap: 4px; flex-wrap: wrap; padding: 6px 10px; border-bottom: 1px solid var(--line); }
-.live .note { margin: 0; padding: 7px 14px; color: var(--soft); min-height: 34px; border-bottom: 1px solid var(--line); }
+.live .note { margin: 0; padding: 7px 14px; color: var(--soft); min-height: 34px; white-space: pre-line; border-bottom: 1px solid var(--line); }
 .live .note.bad { color: var(--force); font-weight: 600; }
 .live .rows { overflow: auto; flex: 1; min-height: 0; padding: 4px 14px 14px; }
 .live summary { cursor: pointer; font-weight: 600; padding: 8px 0 4px; }
@@ -1008,132 +1044,80 @@ class Address {
   }
 }
 
-// A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motion is closed and solved anew.
+// One run of a live page: its first motion, and the motion of other numbers, which its engine solves a part at a time.
 
 
 const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
 const GHOST = 0.28;  // how much one sees of the first motion
 const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
-// Of code times steps that a processor of today runs in 8 ms, half of the time of a picture: the same on each machine, so that the
+// Of code times steps that a processor of today runs in 5 ms, a third of the time of a picture: the same on each machine, so that the
 // same numbers give the same motion.
-const STEP_BYTES = 6e7;
+const STEP_BYTES = 4e7;
 const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
-const SETTLED = 150;  // ms without a change until the address says the numbers
 
-class Live {
-  constructor(player, data) {
-    this.player = player;
-    this.data = data.live;
-    this.run = player.runs[0];
-    this.ghost = new Run(data.runs[0]);
-    this.first = {ts: this.run.ts, q: this.run.q, v: this.run.v, measures: this.run.measures, end: data.end, frame: this.run.frame,
-      reactions: this.run.reactions, forces: this.run.forces};
-    this.times = this.data.times ? Float64Array.from(this.data.times) : this.run.ts;  // all of them, where the first motion failed
-    this.follower = new Follower(this.run, this.data.follow);
-    this.values = Float64Array.from(this.data.sliders, s => s.value);
-    this.changed = this.dirty = false;
-    this.hand = this.job = null;
-    this.steps = Math.round(STEP_BYTES / this.data.engine.modules.run.bytes);  // of one picture
-    this.solving = 0;  // ms, of the last motion
-    this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
-      ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
-      reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
-      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.address.copy()},
-    });
-    player.show.ghost = true;
-    player.buttons.ghost = this.panel.buttons.ghost;
-    this.address = new Address(this);
-    this.panel.enable(false);
-    this.ready = this.load();
+class LiveRun {
+  /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
+  constructor(live, run, record, data) {
+    const {ts, q, v, measures, frame, reactions, forces} = run;
+    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces}});
+    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed
+    this.follower = new Follower(run, data.follow);
+    Object.assign(this, {changed: false, hand: null, job: null, marks: null});
   }
 
-  async load() {
-    try {
-      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
-      this.engine = await loadEngine(this.data.engine);
-    } catch (error) {
-      this.say(`This browser cannot simulate (${error.message}): the page plays what was recorded.`, true);
-      return false;
-    }
-    this.panel.enable(true);
-    this.greet();
-    this.address.read();
-    return true;
+  use(engine) {
+    this.engine = engine;
+    this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // of one picture
+    this.usual = this.freedoms(this.close(null), null);
   }
 
-  keys() {
-    return {g: () => this.player.toggle("ghost"), Backspace: () => this.engine && this.reset()};
+  /** The numbers of this run's sliders; those that nobody has moved are its own. */
+  get values() {
+    const {values, data: {sliders}} = this.live;
+    return Float64Array.from(this.data.sliders, ([k, own]) => (values[k] === sliders[k].value ? own : values[k]));
   }
 
-  greet() { this.say("Move a slider, or pull at a body: the motion is solved anew."); }
+  get end() { return this.run.ts[this.run.ts.length - 1]; }
 
-  say(words, bad = false) { this.panel.say(words, bad); }
+  close(values) { return this.engine.close(values, {t: this.times[0], ...this.data.start}); }
 
-  // Numbers
-
-  set(k, value) {
-    this.values[k] = value;
-    this.solveSoon();
-    clearTimeout(this.settling);
-    this.settling = setTimeout(() => this.address.write(), SETTLED);
+  /** The degrees of freedom near a closed state, whose marks are found; null where branches of the motion meet. */
+  freedoms(state, values) {
+    this.marks = state.marks = this.engine.mark(values, state);
+    const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
+    return this.marks && state.rank < rank && rank === this.marks.length ? null : this.engine.size - rank;
   }
 
-  /** Change numbers by the names of their parameters, and solve at once. */
-  change(numbers) {
-    this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
-    this.panel.show(this.values);
-    this.solve();
-  }
-
-  /** Solve before the next picture, once for all changes until then. */
-  solveSoon() {
-    if (this.dirty) return;
-    this.dirty = true;
-    requestAnimationFrame(() => { if (this.dirty) this.solve(); });
-  }
+  lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
 
   reset() {
+    const {ts, q, v, measures, frame, reactions, forces} = this.first;
     this.drop();
-    this.values = Float64Array.from(this.data.sliders, s => s.value);
-    this.panel.show(this.values);
-    const {ts, q, v, measures, end, frame} = this.first;
     this.run.replace(ts, q, v, measures, frame);
-    this.showReactions(this.first.reactions, this.first.forces);
+    this.showReactions(reactions, forces);
     this.follower.follow(this.engine.numbers(null));
-    this.player.setEnd(end);
-    this.changed = this.dirty = false;
-    this.address.write();
-    this.greet();
-    this.player.draw();
+    this.changed = false;
   }
 
-  // Motion
+  // Solving
 
-  solve() {
-    const {engine, times, values} = this;
-    this.dirty = false;
+  /** Begin to solve the motion of the numbers as they are; returns words where its loops do not close. */
+  begin() {
     this.drop();
-    const start = performance.now(), state = engine.close(values, {t: times[0], ...this.data.start});
-    if (state.closed) {
-      const T = times.length, n = engine.size;
-      const run = {ts: times, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
-      this.job = {run, state, rank: state.rank, from: 0, steps: 0, tried: 0, start};
-      this.follower.follow(engine.numbers(values));
-      this.player.setEnd(times[T - 1]);
-      this.goAhead();
-    } else {
-      const gap = this.lengthOf(state.violation);
-      this.say(`The loops do not close with these numbers: they stay open by ${gap}. The last motion that does is shown.`, true);
-    }
-    this.player.draw();
+    const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
+    if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
+    const run = {ts: times, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+    this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
+    this.follower.follow(engine.numbers(values));
+    return "";
   }
 
-  /** Solve on for as many steps as fit into one picture, and so on until the end: the first motion that is whole stays. */
-  goAhead() {
-    const {engine, job} = this, {run, from} = job, n = engine.size;
+  /** Solve on for as many steps as fit into one picture; returns what is said, and whether it ended too early. */
+  goOn() {
+    const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
     const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
-    const part = engine.run(this.values, job.state, times, null, Math.min(this.steps, this.data.engine.settings.max_steps - job.tried));
-    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0);
+    const part = engine.run(values, job.state, times, null, Math.min(this.steps, most - job.tried));
+    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = run.ts[run.ts.length - 1] - run.ts[0];
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
@@ -1142,25 +1126,26 @@ class Live {
     job.tried += part.tried;
     job.state = part.last;
     this.show(run);
-    const span = run.ts[run.ts.length - 1] - run.ts[0];
-    if (part.limited && job.tried < this.data.engine.settings.max_steps) {
-      this.say(`Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`);
-      this.request = requestAnimationFrame(() => { this.goAhead(); this.player.draw(); });
-      return;
-    }
-    this.solving = performance.now() - job.start;
-    const freedoms = n - job.rank, usual = n - this.data.engine.rank;
-    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${this.solving.toFixed(1)} ms, ${job.steps} steps.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
-    this.say(freedoms === usual ? ended : `${ended} ${freedoms} degrees of freedom here, ${usual} at first.`, !part.done);
+    if (part.limited && job.tried < most) return {words: `Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
     this.job = null;
+    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps.`
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
+    return {words, bad: !part.done};
   }
 
-  lengthOf(violation) { return `${(violation * this.data.engine.scales.length).toPrecision(2)} m`; }
+  drop() {
+    this.job = null;
+    const {hand} = this;
+    this.hand = null;
+    if (hand) cancelAnimationFrame(hand.request);
+  }
+
+  // What is shown
 
   show(run) {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
-    const part = {...run, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
+    const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
     this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1);
     this.showReactions(this.reactions(found.forces), found.forces);
@@ -1182,12 +1167,12 @@ class Live {
   showReactions(reactions, forces) {
     Object.assign(this.run, {reactions, forces});
     const button = this.player.buttons.reactions;
-    if (button) button.disabled = !reactions;
+    if (button) button.disabled = !this.player.runs.some(run => run.reactions);
   }
 
   /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
   measures(run, found) {
-    const {length} = this.data.engine.scales;
+    const {length} = this.engine.data.scales;
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
     const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
@@ -1214,22 +1199,13 @@ class Live {
   grasp(canvas, point, pointer) {
     const held = this.bodyAt(canvas, point, pointer);
     if (!held) return false;
-    if (this.dirty) this.solve();
-    while (this.job) this.goAhead();
+    this.live.finish();
     this.player.pause();
     this.hand = new Hand(this, held, this.metres(canvas, point));
     return true;
   }
 
   move(canvas, point) { this.hand?.move(this.metres(canvas, point)); }
-
-  drop() {
-    cancelAnimationFrame(this.request);
-    this.job = null;
-    const {hand} = this;
-    this.hand = null;
-    if (hand) cancelAnimationFrame(hand.request);
-  }
 
   release() {
     const {hand} = this;
@@ -1243,45 +1219,46 @@ class Live {
   }
 
   /** Begin a record that a hand goes on with: of what was until now. */
-  begin(state) {
+  record(state) {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
-    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.data.engine.scales;
-    this.record = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
+    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
+    this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
       violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+    this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation);
   }
 
   /** Add one state to the record, and show it. */
   append({t, q, v}, violation) {
-    const {record} = this;
-    record.ts.push(t);
-    record.q.push(...q);
-    record.v.push(...v);
-    record.violation.push(violation);
-    this.showRecord();
+    const {past} = this;
+    past.ts.push(t);
+    past.q.push(...q);
+    past.v.push(...v);
+    past.violation.push(violation);
+    this.showPast();
     this.player.setEnd(Math.max(t, this.player.data.end));
     this.player.t = t;
     this.player.draw();
   }
 
-  showRecord() {
-    const run = Object.fromEntries(Object.entries(this.record).map(([name, x]) => [name, Float64Array.from(x)]));
+  showPast() {
+    const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
     this.show({...run, count: run.ts.length});
   }
 
   /** Solve on from where the hand lets go, for as long as the first motion is. */
-  goOn(state) {
-    const {engine, record} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
+  letGo(state) {
+    const {engine, past} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
     const run = engine.run(this.values, state, times);
     for (let k = 1; k < run.count; k++) {
-      record.ts.push(run.ts[k]);
-      record.q.push(...run.q.subarray(k * n, (k + 1) * n));
-      record.v.push(...run.v.subarray(k * n, (k + 1) * n));
-      record.violation.push(run.violation[k]);
+      past.ts.push(run.ts[k]);
+      past.q.push(...run.q.subarray(k * n, (k + 1) * n));
+      past.v.push(...run.v.subarray(k * n, (k + 1) * n));
+      past.violation.push(run.violation[k]);
     }
-    this.showRecord();
-    this.player.setEnd(record.ts[record.ts.length - 1]);
-    this.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
+    this.showPast();
+    this.player.setEnd(this.live.end);
+    this.live.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
     this.player.play();
   }
 
@@ -1289,7 +1266,7 @@ class Live {
 
   paintGhost(painter, context, t) {
     if (!this.changed || !this.player.show.ghost) return;
-    painter.pose = this.ghost.pose(Math.min(t, this.first.end));
+    painter.pose = this.ghost.pose(Math.min(t, this.first.ts[this.first.ts.length - 1]));
     context.globalAlpha = GHOST;
     painter.draw(this.ghost.symbols);
     context.globalAlpha = 1;
@@ -1304,11 +1281,128 @@ class Live {
     painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
   }
 
-  /** What the whole view shows: all that is drawn of the motion as it is now. */
+  /** Left, bottom, right, top (m) of all that is drawn of the motion as it is now. */
+  bounds() { return boundsOf(this.run, 0.1 * this.engine.data.scales.length); }
+}
+
+// A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motions are closed and solved anew.
+
+
+const SETTLED = 150;  // ms without a change until the address says the numbers
+
+class Live {
+  constructor(player, data) {
+    Object.assign(this, {player, data: data.live, firstEnd: data.end, dirty: false});
+    this.values = Float64Array.from(this.data.sliders, s => s.value);
+    this.runs = player.runs.map((run, k) => new LiveRun(this, run, data.runs[k], this.data.runs[k]));
+    this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
+      ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
+      reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
+      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.address.copy()},
+    });
+    player.show.ghost = true;
+    player.buttons.ghost = this.panel.buttons.ghost;
+    this.address = new Address(this);
+    this.panel.enable(false);
+    this.ready = this.load();
+  }
+
+  async load() {
+    try {
+      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
+      const engines = await Promise.all(this.data.engines.map(loadEngine));
+      for (const run of this.runs) run.use(engines[run.data.engine]);
+    } catch (error) {
+      this.say(`This browser cannot simulate (${error.message}): the page plays what was recorded.`, true);
+      return false;
+    }
+    this.isReady = true;
+    this.panel.enable(true);
+    this.greet();
+    this.address.read();
+    return true;
+  }
+
+  get changed() { return this.runs.some(run => run.changed); }
+  get isSolving() { return this.runs.some(run => run.job); }
+  get end() { return Math.max(...this.runs.map(run => run.end)); }
+
+  keys() {
+    return {g: () => this.player.toggle("ghost"), Backspace: () => this.isReady && this.reset()};
+  }
+
+  greet() { this.say(`Move a slider, or pull at a body: the ${this.runs.length > 1 ? "motions are" : "motion is"} solved anew.`); }
+
+  say(words, bad = false) { this.panel.say(words, bad); }
+
+  // Numbers
+
+  set(k, value) {
+    this.values[k] = value;
+    this.solveSoon();
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => this.address.write(), SETTLED);
+  }
+
+  /** Change numbers by the names of their parameters, and solve at once. */
+  change(numbers) {
+    this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
+    this.panel.show(this.values);
+    this.solve();
+  }
+
+  reset() {
+    cancelAnimationFrame(this.request);
+    this.dirty = false;
+    this.values = Float64Array.from(this.data.sliders, s => s.value);
+    this.panel.show(this.values);
+    for (const run of this.runs) run.reset();
+    this.player.setEnd(this.firstEnd);
+    this.address.write();
+    this.greet();
+    this.player.draw();
+  }
+
+  // Motion
+
+  /** Solve before the next picture, once for all changes until then. */
+  solveSoon() {
+    if (this.dirty) return;
+    this.dirty = true;
+    cancelAnimationFrame(this.request);  // what was being solved is of other numbers
+    this.request = requestAnimationFrame(() => this.solve());
+  }
+
+  solve() {
+    cancelAnimationFrame(this.request);
+    this.dirty = false;
+    this.said = this.runs.map(run => ({words: run.begin(), bad: true}));
+    if (this.isSolving) this.player.setEnd(Math.max(...this.runs.map(run => (run.job ? run.times[run.times.length - 1] : run.end))));
+    this.goOn();
+  }
+
+  /** Solve on until the time of one picture is over, and so on until the end. */
+  goOn() {
+    this.runs.forEach((run, k) => { if (run.job) this.said[k] = run.goOn(); });
+    const several = this.said.length > 1, words = this.said.map((said, k) => (several ? `${this.player.runs[k].label}: ` : "") + said.words);
+    this.say(words.join("\n"), this.said.some(said => said.bad));
+    if (this.isSolving) this.request = requestAnimationFrame(() => this.goOn());
+    this.player.draw();
+  }
+
+  /** Solve all that is still to be solved. */
+  finish() {
+    if (this.dirty) this.solve();
+    cancelAnimationFrame(this.request);
+    while (this.isSolving) this.goOn();
+    cancelAnimationFrame(this.request);
+  }
+
+  /** What the whole view shows: all that is drawn of the motions as they are now. */
   fit() {
-    const {bounds} = this.player.data;
-    this.first.bounds ??= bounds.slice();
-    bounds.splice(0, 4, ...(this.changed ? boundsOf(this.run, 0.1 * this.data.engine.scales.length) : this.first.bounds));
+    const {bounds} = this.player.data, all = this.runs.map(run => run.bounds());
+    this.firstBounds ??= bounds.slice();
+    bounds.splice(0, 4, ...(this.changed ? [0, 1, 2, 3].map(k => Math[k < 2 ? "min" : "max"](...all.map(one => one[k]))) : this.firstBounds));
   }
 }
 
@@ -1378,6 +1472,7 @@ class Player {
         this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
         this.button("?", "keys", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+    keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
     shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);
@@ -1394,7 +1489,7 @@ class Player {
     if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
     if (run.note) caption.append(" ", run.note);
     const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
-    followPointers(this, canvas);
+    followPointers(this, canvas, () => this.live?.runs[k]);
     return panel;
   }
 
@@ -1404,7 +1499,7 @@ class Player {
     for (const name of this.measures) select.append(make("option", {value: name}, name));
     const seek = event => {
       const box = this.stripCanvas.getBoundingClientRect();
-      this.seek(this.data.start + (this.data.end - this.data.start) * clamp((event.clientX - box.left - 12) / (box.width - 24), 0, 1));
+      this.seek(this.data.start + (this.data.end - this.data.start) * stripPart(event.clientX - box.left, box.width));
     };
     this.stripCanvas.addEventListener("pointerdown", event => { this.stripCanvas.setPointerCapture(event.pointerId); seek(event); });
     this.stripCanvas.addEventListener("pointermove", event => { if (event.buttons) seek(event); });
@@ -1586,19 +1681,20 @@ class Player {
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
-    for (const {run, canvas} of this.panels) {
+    this.panels.forEach(({run, canvas}, k) => {
+      const live = this.live?.runs[k];
       const {context, width, height} = this.context(canvas);
-      if (!width || !height) continue;
+      if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
-      this.live?.paintGhost(painter, context, t);
+      live?.paintGhost(painter, context, t);
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
-      this.live?.paintHand(painter);
+      live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);
       painter.bar(step, height);
-    }
+    });
     if (this.stripCanvas) {
       const {context, width, height} = this.context(this.stripCanvas);
       drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);
@@ -1653,6 +1749,7 @@ function mount(element, data, options = {}) {
     destroy: () => player.destroy(),
   };
   element.player = handle;
+  element.dataset.lmSuppressShortcuts = "true";  // of JupyterLab, which would take keys away from it
   return handle;
 }
 

@@ -22,7 +22,7 @@ class StudioPage:
         page.on("pageerror", lambda error: self.problems.append(f"{error} {error.stack}"))
         page.on("console", lambda m: self.problems.append(m.text) if m.type in ("error", "warning") else None)
         page.on("request", lambda request: self.requests.append(request.url))
-        page.goto(address)
+        page.goto(address, timeout=1e3 * PATIENCE)
         self.until("window.studio !== undefined")
         self.settle()
 

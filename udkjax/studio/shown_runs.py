@@ -51,10 +51,12 @@ def recorded_motion(mechanism: Mechanism) -> Json:
 
 
 def force_curves(mechanism: Mechanism) -> Json:
-    """Return curves of the run that need forces: efforts and powers of motors, forces at pins, energies, violation of the constraints."""
+    """Return curves of the run that need forces: efforts and powers of motors, forces at pins; and energies and violation."""
     run = shown_run(mechanism)
     ts, found = np.asarray(run.ts), _efforts(mechanism, run)
-    powers = [_curve(f"{n}: power", "W", np.asarray(x) * _rate(mechanism.drivers[n], ts)) for n, x in efforts(mechanism, run).items()]
+    powers = [
+        _curve(f"{n}: power", "W", np.asarray(x) * _rate(mechanism.drivers[n], ts)) for n, x in efforts(mechanism, run).items()
+    ]
     measures = [_curve(m.name, m.unit, m.values) for m in measures_of(mechanism, run, ("energy", "violation"), "")]
     return {"times": ts.tolist(), "curves": [*found, *powers, *_pin_forces(mechanism, run), *measures], "cause": run.cause}
 

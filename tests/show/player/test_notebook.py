@@ -54,6 +54,7 @@ def lab(tmp_path_factory):
         "--no-browser",
         "--allow-root",
         "--IdentityProvider.token=",
+        "--ServerApp.disable_check_xsrf=True",
         f"--ServerApp.port={port}",
         "--ServerApp.ip=127.0.0.1",
     ]

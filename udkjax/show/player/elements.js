@@ -35,3 +35,12 @@ export function icon(name) {
   svg.append(path);
   return svg;
 }
+
+/** Let a click on a button leave the keys to what is shown: else the space bar would press the button again. */
+export function keepKeys(root, focused) {
+  root.addEventListener("mousedown", event => {
+    if (!event.target.closest("button") || event.target.closest("dialog")) return;
+    event.preventDefault();
+    focused.focus({preventScroll: true});
+  });
+}

@@ -33,6 +33,7 @@ export function mount(element, data, options = {}) {
     destroy: () => player.destroy(),
   };
   element.player = handle;
+  element.dataset.lmSuppressShortcuts = "true";  // of JupyterLab, which would take keys away from it
   return handle;
 }
 

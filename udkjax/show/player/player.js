@@ -1,6 +1,6 @@
 // The player's elements, what they do, and how they look.
 
-import {HELP, LIVE_HELP, SPEEDS, icon, make} from "./elements.js";
+import {HELP, LIVE_HELP, SPEEDS, icon, keepKeys, make} from "./elements.js";
 import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES} from "./painter.js";
@@ -73,6 +73,7 @@ export class Player {
         this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
         this.button("?", "keys", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+    keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
     shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);

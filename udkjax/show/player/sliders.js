@@ -35,12 +35,18 @@ export class SliderPanel {
       range.setAttribute("aria-valuetext", `${number.value} ${unit}`);
     };
     range.addEventListener("input", () => { set(+range.value); changed(+range.value); });
-    number.addEventListener("change", () => {
+    let taken = null;  // what was typed last
+    const take = () => {
       if (!Number.isFinite(number.valueAsNumber)) return set(+range.value);
+      if (number.value === taken) return undefined;
       const value = number.valueAsNumber;
       set(value);
-      changed(value);
-    });
+      taken = number.value;
+      return changed(value);
+    };
+    number.addEventListener("focus", () => { taken = number.value; });
+    number.addEventListener("change", take);
+    number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // which a notebook keeps to itself
     range.addEventListener("dblclick", () => { set(slider.value); changed(slider.value); });
     const shown = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
     const element = make("div", {class: "slider", title: slider.name},

@@ -2,6 +2,7 @@
 
 import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {middle, symbolsOf} from "./drawn_symbols.js";
+import {Labels, aroundPin, besideBar, within} from "./labels.js";
 import {carry} from "./mover.js";
 import {linkShape} from "./shapes.js";
 import {THEMES} from "./player/painter.js";
@@ -11,11 +12,11 @@ import {toPixels} from "./view.js";
 
 const HALO = 7;  // px around what is selected
 const LABEL = 12;  // px
-const BESIDE = 14, ROOM = 26;  // px from a bar to its name, and between that and a pin
+const signPlace = ([x, y]) => [x + 13, y + 11];  // px, of what a mark says
 
 export class DrawingCanvas {
   constructor(element) {
-    Object.assign(this, {element, places: new Map(), outlines: [], symbols: [], drawn: []});
+    Object.assign(this, {element, places: new Map(), outlines: [], symbols: [], drawn: [], names: new Labels()});
   }
 
   get width() { return this.element.clientWidth; }
@@ -129,7 +130,7 @@ export class DrawingCanvas {
       const place = this.places.get(name);
       if (!place) continue;
       painter.circle(place, 10, {stroke: theme.force, width: strong ? 2.6 : 1.3});
-      painter.text(sign, [place[0] + 13, place[1] + 11], theme.force, {size: 12, weight: 700});
+      painter.text(sign, signPlace(place), theme.force, {size: 12, weight: 700});
     }
     if (preview?.onto) {
       const place = this.places.get(preview.onto);
@@ -137,39 +138,31 @@ export class DrawingCanvas {
     }
   }
 
-  labels({document, show, selection, motions}, painter, theme) {
-    for (const [name, [x, y]] of this.places) {
-      const chosen = selection.some(item => item.kind === "pin" && item.name === name);
-      if (show.names || chosen) painter.text(name, [x + 9, y - 12], theme.ink, {size: LABEL, weight: chosen ? 700 : 400});
+  labels({document, show, selection, motions, marked}, painter, theme) {
+    const isChosen = (kind, name, index) => selection.some(item => item.kind === kind && item.name === name && item.index === index);
+    const {names} = this, signs = [...marked.keys()].flatMap(name => (this.places.has(name) ? [signPlace(this.places.get(name))] : []));
+    names.begin(painter, this.places.values(), signs);
+    for (const [name, place] of this.places) {
+      const chosen = isChosen("pin", name, undefined);
+      if (show.names || chosen) names.put(`pin ${name}`, name, aroundPin(place), theme.ink, chosen ? 700 : 400);
     }
-    const taken = [...this.places.values()];
     list(document, "link").forEach((link, k) => {
-      const chosen = selection.some(item => item.kind === "link" && item.index === k);
-      if (!(show.names || chosen) || !(link.pins?.length > 1 || chosen)) return;
-      const at = this.labelPlace(link, k, document, painter, motions, taken);
-      if (at) painter.text(link.name ?? "", at.place, painter.colour(k), {size: LABEL, weight: chosen ? 700 : 500, align: at.align});
+      const chosen = isChosen("link", undefined, k), places = this.placesOfName(link, k, document, painter, motions);
+      if (places && (chosen || (show.names && link.pins?.length > 1))) names.put(`link ${k}`, link.name ?? "", places, painter.colour(k), chosen ? 700 : 500);
     });
     for (const section of ["motor", "spring", "damper", "load", "gear", "cam"]) {
       list(document, section).forEach((entry, k) => {
-        if (!selection.some(item => item.kind === section && item.index === k)) return;
-        const outline = this.outlines.find(({of}) => of.kind === section && of.index === k);
-        if (outline) painter.text(nameOf(document, section, k), [outline.points[0][0] + 14, outline.points[0][1] - 18], theme.accent, {size: LABEL, weight: 700});
+        const outline = isChosen(section, undefined, k) && this.outlines.find(({of}) => of.kind === section && of.index === k);
+        if (outline) names.put(`${section} ${k}`, nameOf(document, section, k), aroundPin([outline.points[0][0] + 5, outline.points[0][1] - 6]), theme.accent, 700);
       });
     }
   }
 
-  /** Where the name of a link stands: within a plate, or beside a bar, away from pins and other names, whose places are `taken`. */
-  labelPlace(link, k, document, painter, motions, taken) {
+  /** Where the name of a link may stand: within a plate, or beside a bar. */
+  placesOfName(link, k, document, painter, motions) {
     const pixel = place => toPixels(painter.view, carry(motions, k, place)), shape = linkShape(document, link), centre = middle(link, document);
     if (!shape || !centre) return null;
-    if (shape.kind !== "line") return {place: pixel(centre).map((x, i) => x + (i && shape.kind === "disc" ? 17 : 0)), align: "center"};
-    const [a, b] = [shape.points[0], shape.points.at(-1)].map(pixel), length = Math.hypot(b[0] - a[0], b[1] - a[1]) || 1;
-    let [nx, ny] = [(a[1] - b[1]) / length, (b[0] - a[0]) / length];
-    if (ny < 0) [nx, ny] = [-nx, -ny];  // below it
-    const along = s => [0, 1].map(i => a[i] + s * (b[i] - a[i])), isFree = ([x, y]) => taken.every(p => Math.hypot(p[0] - x, p[1] - y) > ROOM);
-    const [x, y] = [0.5, 0.3, 0.7].map(along).find(isFree) ?? along(0.5);
-    taken.push([x, y]);
-    return {place: [x + BESIDE * nx, y + (BESIDE + 2) * ny], align: Math.abs(nx) < 0.4 ? "center" : nx > 0 ? "left" : "right"};
+    return shape.kind === "line" ? besideBar(pixel(shape.points[0]), pixel(shape.points.at(-1))) : within(pixel(centre), shape.kind === "disc");
   }
 
   preview({preview, document, view, hand}, painter, theme) {

@@ -1,7 +1,7 @@
 // The page: its bars, the drawing, and the panels beside it.
 
 import {KEYS, TOOLS} from "./tools.js";
-import {make, icon} from "./player/elements.js";
+import {icon, keepKeys, make} from "./player/elements.js";
 
 export function svgIcon(path, stroke = false) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), line = document.createElementNS(svg.namespaceURI, "path");
@@ -85,5 +85,6 @@ export function buildPage(studio, root) {
     make("form", {method: "dialog"}, make("button", {class: "strong"}, "Close")));
   parts.dialog = make("dialog", {class: "sheet"});
   root.replaceChildren(header, make("div", {class: "tools", role: "toolbar", "aria-label": "tools"}, ...parts.tools), stage, side, parts.strip, transport, parts.help, parts.dialog);
+  keepKeys(root, parts.canvas);
   return parts;
 }
