@@ -72,12 +72,12 @@ def holding_curves(mechanism: Mechanism) -> Json:
     run = shown_run(mechanism)
     still = {name: replace(driver, motion=Polynomial((driver.motion(0.0),))) for name, driver in mechanism.drivers.items()}
     held = Mechanism(mechanism.bodies, mechanism.joints, still, mechanism.forces, gravity=mechanism.gravity)
-    rest = Positions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
+    rest = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
     curves = [*_efforts(held, rest), *_pin_forces(held, rest)]
     return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
 
 
-class Positions(NamedTuple):
+class RestingPositions(NamedTuple):
     """Positions over time, at rest: q and v (T, bodies, 3)."""
 
     ts: Any

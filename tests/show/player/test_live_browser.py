@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from tests.show.player.conftest import Motion
 from tests.show.player.test_browser import HOST, PLAYER, on_screen, picture, plain, ring_centre, until
+from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.measure_curves import reaction_arrows
 from udkjax.show.player.page import as_json, module
 from udkjax.show.player.sketch import THEMES
@@ -245,7 +246,7 @@ def test_where_the_first_motion_failed_other_numbers_may_come_to_its_end(opened)
     mechanism = drawing.mechanism()
     run = udk.simulate(mechanism, TS, throw=False)
     assert not run.result.is_success
-    with pytest.warns(udk.show.player.animation.FailedRunWarning):
+    with pytest.warns(FailedRunWarning):
         animation = udk.animate(mechanism, run, live=["pin.B"])
     with opened(animation) as page:
         assert len(shown_q(page)) < len(TS)
