@@ -47,6 +47,7 @@ from udkjax.pinv import Elimination as Elimination
 from udkjax.pinv import GramSchmidt as GramSchmidt
 from udkjax.pinv import Greville as Greville
 from udkjax.pinv import Householder as Householder
+from udkjax.pinv import OneOf as OneOf
 from udkjax.pinv import Varga as Varga
 from udkjax.scene import GROUND as GROUND
 from udkjax.scene import Angle as Angle

@@ -21,7 +21,7 @@ from udkjax.equations.textbook import prepare
 from udkjax.integrate import Projection, Result, simulate
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.solvers import solver_named
-from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
+from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, OneOf, Pseudoinverse, Varga
 from udkjax.scene import Mechanism
 from udkjax.scene.library import parallelogram
 from udkjax.study.exact import exact_coordinates
@@ -34,13 +34,7 @@ from .record import dataset
 INSTANTS = 401  # at which each run is looked at
 START = -45.0  # degrees. Inferred: the paper does not print its initial state, and -45 fits its tables best, then -50
 NUDGE = 1e-16  # m, rad: what the starts of the group "start" differ by, the rounding of a coordinate
-DENSE: dict[str, type[Pseudoinverse]] = {
-    "SVD": SVD,
-    "Varga": Varga,
-    "Greville": Greville,
-    "Householder": Householder,
-    "GramSchmidt": GramSchmidt,
-}
+DENSE = {"SVD": SVD(), "Varga": Varga(), "Greville": Greville(), "Householder": Householder(), "GramSchmidt": GramSchmidt()}
 
 Tell = Callable[[str, float], None]  # what is being done, and which part of all of it is done
 
@@ -85,11 +79,11 @@ def study(
 
 def _compiled(mech: Mechanism, state: State, cases: list[Case], max_steps: int, tell: Tell) -> dict[Program, Callable]:
     """All programs, compiled on as many threads as there are cores: XLA does it without Python's lock."""
-    numbers = (jnp.linspace(0.0, 1.0, INSTANTS), state, *(jnp.asarray(x) for x in (1e-6, 1e-6, 0.0, 0.0)))
+    numbers = (jnp.linspace(0.0, 1.0, INSTANTS), state, *(jnp.asarray(x) for x in (1e-6, 1e-6, 0.0, 0.0, 0.0)))
 
     def build(program: Program) -> Callable:
         if program.solver == vode.NAME:
-            return vode.program(mech, partial(pseudoinverse, program.method), FIRST_STEP, max_steps, numbers)
+            return partial(vode.run, mech, partial(pseudoinverse, program.method), FIRST_STEP, max_steps)
         return jax.jit(partial(_run, mech, program, max_steps)).lower(*numbers).compile()
 
     programs = sorted({case.program for case in cases})
@@ -102,14 +96,14 @@ def _compiled(mech: Mechanism, state: State, cases: list[Case], max_steps: int, 
     return {program: future.result() for future, program in made.items()}
 
 
-def _run(mech: Mechanism, program: Program, max_steps: int, ts, state, tol, rank_tol, alpha, beta) -> Any:
+def _run(mech: Mechanism, program: Program, max_steps: int, ts, state, tol, rank_tol, number, alpha, beta) -> Any:
     return simulate(
         mech,
         ts,
         state,
         rtol=tol,
         atol=tol,
-        method=pseudoinverse(program.method, rank_tol),
+        method=pseudoinverse(program.method, rank_tol, number),
         stabilization=Projection() if program.projected else Baumgarte(alpha, beta),
         solver=solver_named(program.solver),
         dt0=None if program.projected else FIRST_STEP,
@@ -119,10 +113,10 @@ def _run(mech: Mechanism, program: Program, max_steps: int, ts, state, tol, rank
     )
 
 
-def pseudoinverse(name: str, rank_tol: Any) -> Pseudoinverse:
+def pseudoinverse(name: str, rank_tol: Any, number: Any) -> Pseudoinverse:
     """Return the paper's methods with their threshold in the units of D; of the others, which have their own, the default."""
     if name in DENSE:
-        return DENSE[name].absolute(rank_tol)
+        return OneOf.absolute(rank_tol, methods=tuple(DENSE.values()), number=number)
     return {"Auto": Auto, "Elimination": Elimination}[name]()
 
 
@@ -132,8 +126,13 @@ def _inputs(case: Case, state: State, sigma: float, seed: int) -> tuple:
         nudge = np.random.default_rng((seed, case.start)).normal(scale=NUDGE, size=state.q.shape)
         state = State(state.q + nudge, state.v)
     rank_tol = RANK_HELD * sigma if case.rank_tol is None else case.rank_tol
-    numbers = (jnp.asarray(x, float) for x in (case.tol, rank_tol, case.alpha, case.beta))
+    numbers = (jnp.asarray(x, float) for x in (case.tol, rank_tol, number_of(case.method), case.alpha, case.beta))
     return (jnp.linspace(0.0, case.end, INSTANTS), state, *numbers)
+
+
+def number_of(method: str) -> int:
+    """Return the number of one of the paper's methods; zero of others, whose programs do not ask for it."""
+    return list(DENSE).index(method) if method in DENSE else 0
 
 
 def _timed(run: Callable, repeats: int, patience: float) -> tuple[Any, list[float]]:
@@ -155,7 +154,7 @@ def _row(mech: Mechanism, case: Case, inputs: tuple, sol: Any, seconds: list[flo
     sigma, rank = np.full((len(ts), min(D.shape[1:])), np.nan), np.full(len(ts), np.nan)
     sigma[alive] = np.linalg.svd(D[alive], compute_uv=False)
     if case.method in DENSE:
-        rank = np.where(alive, np.asarray(_ranks(pseudoinverse(case.method, rank_tol), D)), np.nan)
+        rank = np.where(alive, np.asarray(_ranks(pseudoinverse(case.method, rank_tol, number_of(case.method)), D)), np.nan)
     exact = exact_coordinates(mech, ts, state.q, state.v)
     assert exact is not None
     total = np.asarray(energy(mech, sol).total)

@@ -9,15 +9,12 @@ import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import ode
 
 from udkjax.equations import Baumgarte
-from udkjax.equations.quantities import equations_of
 from udkjax.integrate import Result
-from udkjax.integrate.diffrax_engine import derivative
+from udkjax.integrate.native_equations import KnownRates
 from udkjax.scene import Mechanism
 
 NAME = "VODE"
@@ -37,29 +34,21 @@ class Run(NamedTuple):
     stats: dict[str, int]
 
 
-def program(mech: Mechanism, method: Callable, first_step: float, max_steps: int, numbers: tuple) -> Callable:
-    """Compile the right-hand side for inputs like `numbers`: ts, state, tol, rank_tol, alpha, beta. Return what runs it."""
+def run(
+    mech: Mechanism, method: Callable, first_step: float, max_steps: int, ts, state, tol, rank_tol, number, alpha, beta
+) -> Run:
+    """Integrate with the right-hand side by machine code; `method` is a function of `rank_tol` and of the method's `number`."""
+    rates, calls = KnownRates(mech, method(rank_tol, number), Baumgarte(alpha, beta)), 0
 
-    def rates(t, y, rank_tol, alpha, beta):
-        return derivative(t, y, equations_of(mech, method(rank_tol), Baumgarte(alpha, beta)))
+    def right_hand_side(t: float, y: np.ndarray) -> np.ndarray:
+        nonlocal calls
+        calls += 1
+        return rates(t, y)
 
-    ts, state, _, *rest = numbers
-    compiled = jax.jit(rates).lower(ts[0], _flat(state), *rest).compile()
-
-    def run(ts, state, tol, *rest) -> Run:
-        calls = 0
-
-        def right_hand_side(t: float, y: np.ndarray) -> np.ndarray:
-            nonlocal calls
-            calls += 1
-            return np.asarray(compiled(jnp.asarray(t, float), jnp.asarray(y), *rest))
-
-        limits = {"first_step": first_step, "nsteps": max(max_steps // GIVE_UP, 1)}
-        solver = ode(right_hand_side).set_integrator("vode", method="adams", rtol=float(tol), atol=float(tol), **limits)
-        solver.set_initial_value(np.asarray(_flat(state)), float(ts[0]))
-        return _along(solver, np.asarray(ts), lambda: calls)
-
-    return run
+    limits = {"first_step": first_step, "nsteps": max(max_steps // GIVE_UP, 1)}
+    solver = ode(right_hand_side).set_integrator("vode", method="adams", rtol=float(tol), atol=float(tol), **limits)
+    solver.set_initial_value(np.concatenate([np.ravel(state.q), np.ravel(state.v)]), float(ts[0]))
+    return _along(solver, np.asarray(ts), lambda: calls)
 
 
 def _along(solver: Any, ts: np.ndarray, calls: Callable[[], int]) -> Run:
@@ -80,7 +69,3 @@ def _along(solver: Any, ts: np.ndarray, calls: Callable[[], int]) -> Run:
     end = float(ts[reached] if finished else np.clip(solver.t, ts[reached], ts[reached + 1]))
     unknown = {"steps": -1, "rejected": -1, "projections": 0}
     return Run(ts, q, v, end, int(cause), {"accepted": steps, "right_hand_sides": calls(), **unknown})
-
-
-def _flat(state: Any) -> Any:
-    return jnp.concatenate([state.q.ravel(), state.v.ravel()])

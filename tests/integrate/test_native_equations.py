@@ -14,7 +14,7 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.formulations import Formulation
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
-from udkjax.integrate.native_equations import NativeEquations
+from udkjax.integrate.native_equations import native_equations
 from udkjax.integrate.projection import Projection
 from udkjax.native.primitive import FEW
 
@@ -31,7 +31,7 @@ def both(mechanism, chosen, stabilization=Projection()):
     q, v, scales = mechanism.q0.ravel(), mechanism.v0.ravel(), analysis.scales
     marks = mark_rows(compiled, jnp.zeros(()), q, v, scales.length, jnp.maximum(scales.rate, 1.0))
     assert compiled.plan.evaluation is not None
-    return NativeEquations(compiled.textbook, marks, compiled.equations, compiled.plan.evaluation), compiled.textbook
+    return native_equations(compiled.textbook, marks, compiled.equations, compiled.plan.evaluation), compiled.textbook
 
 
 @eqx.filter_jit

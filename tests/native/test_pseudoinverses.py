@@ -1,6 +1,7 @@
 """The pseudoinverses in machine code are those of `udkjax.pinv`: the same ranks, and D^+ b to rounding, in every lane."""
 
 import ctypes
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -40,6 +41,7 @@ class Solver(Memory):
         self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
         self.places.add("fallback_tol")
         self.begins = []
+        self.places.add("method")
         layout = DenseLayout(self, code.matrices(m, n), (m, n))
         functions = []
         names = ["index", "factor", "solve", *(["solve_transposed"] if isinstance(method, pinv.SVD) else [])]
@@ -62,13 +64,14 @@ class Solver(Memory):
         stride = self._layout.registers[name] * self.plan.vector
         return memory[start : start + rows * stride].reshape(rows, -1, width)[:, :columns]
 
-    def __call__(self, matrices, right, tols, solve="solve"):
+    def __call__(self, matrices, right, tols, numbers: Any = 0.0, solve="solve"):
         """x and the ranks, of as many matrices as there are lanes."""
         given, to = ("b", "x") if solve == "solve" else ("x", "b")
         size = self.places.size * self.plan.width
         memory = np.zeros(size + 8)
         memory = memory[(-memory.ctypes.data // 8) % 8 :][:size]
         memory[: self.plan.width] = tols
+        memory[self.places["method"] * self.plan.width :][: self.plan.width] = numbers
         self._view(memory, "D")[:] = np.moveaxis(matrices, 0, -1)
         self._view(memory, given)[0] = np.moveaxis(right, 0, -1)
         for name in ("index", "factor", solve):
@@ -76,14 +79,15 @@ class Solver(Memory):
         return np.moveaxis(self._view(memory, to)[0], -1, 0), self._view(memory, "rank")[0, 0]
 
 
-def solved(make, matrices, right, tols, width, relative=True):
+def solved(make, matrices, right, tols, width, relative=True, numbers: Any = 0.0):
     """By machine code, in groups of lanes; the last one is filled up."""
     method = make(1.0, relative=relative)
     m, n = matrices.shape[1:]
     solver, found, ranks = Solver(method, m, n, width), [], []
     for k in range(0, len(matrices), width):
         chosen = np.minimum(np.arange(k, k + width), len(matrices) - 1)
-        x, rank = solver(matrices[chosen], right[chosen], np.broadcast_to(tols, len(matrices))[chosen])
+        tol, number = (np.broadcast_to(y, len(matrices))[chosen] for y in (tols, numbers))
+        x, rank = solver(matrices[chosen], right[chosen], tol, number)
         found.append(x)
         ranks.append(rank)
     return np.concatenate(found)[: len(matrices)], np.concatenate(ranks)[: len(matrices)]
@@ -120,7 +124,7 @@ def one(matrix, right, tol, solve="solve"):
     D = np.array(matrix, float)
     m, n = D.shape
     solver = Solver(pinv.SVD(1.0), m, n, 1)
-    return solver(D[None], np.array(right, float)[None], tol, solve)[0][0]
+    return solver(D[None], np.array(right, float)[None], tol, solve=solve)[0][0]
 
 
 @pytest.mark.parametrize("m, n", [(1, 6), (12, 12), (9, 5), (7, 11)])
@@ -182,3 +186,17 @@ def test_thresholds_meet_the_same_scale(name, relative):
     assert len(set(expected)) > 4
     assert_array_equal(rank, expected)
     assert_allclose(x, reference, rtol=1e-12)
+
+
+@pytest.mark.parametrize("width", [1, machine.lanes()])
+def test_each_lane_has_chosen_a_method_of_its_own(width):
+    """Mixed in lanes, in any order, each finds to the bit what the code of its method alone finds."""
+    numbers = np.array([3, 0, 4, 1, 1, 2, 0, 4, 2, 3, 0, 2, 4])
+    ranks = [12 - k % 3 for k in range(len(numbers))]
+    matrices, right = random_matrices(12, 12, ranks)
+    makers = [METHODS[name] for name in ("SVD", "Varga", "Householder", "GramSchmidt", "Greville")]
+    alone = [solved(make, matrices, right, 1e-6, width) for make in makers]
+    several = partial(pinv.OneOf, methods=[make() for make in makers])
+    x, found = solved(several, matrices, right, 1e-6, width, numbers=numbers)
+    assert_array_equal(found, ranks)
+    assert_array_equal(x, [alone[number][0][k] for k, number in enumerate(numbers)])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
+from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, OneOf, Pseudoinverse, Varga
 
 
 class Entry(NamedTuple):
@@ -25,6 +25,7 @@ METHODS = [
     Entry("Greville", Greville, power=2, own_threshold=True),
     Entry("Elimination", Elimination, power=2, own_threshold=True),
     Entry("Auto", Auto),
+    Entry("OneOf", partial(OneOf, number=3)),
 ]
 
 

@@ -42,7 +42,7 @@ def report(
 
     Args:
         out: page to write (.html), or folder for report.html; the data goes beside it.
-        quick: cut the stiff runs short and compare fewer integrators: a minute and a half instead of eight, on two cores.
+        quick: cut the stiff runs short and compare fewer integrators: half a minute on two cores.
         start: angle of the links (degrees) from which they are released at rest.
         seed: of the starts that differ by rounding errors.
         from_file: draw the page from this file instead of running anything.

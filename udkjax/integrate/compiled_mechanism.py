@@ -101,7 +101,7 @@ def compile_mechanism(
         missing = unsupported(operation.code)
         why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
     elif engine == "auto":
-        evaluation = _evaluation(equations)
+        evaluation = evaluation_of(equations)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
     plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows)
@@ -139,8 +139,13 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
         equations = equations.equations
     if type(equations) is not TextbookEquations:
         return f"it knows the equations of a mechanism, not {type(equations).__name__}"
-    if not eliminates(equations.method) and dense_method(equations.method) is None:
-        return f"it does not know the pseudoinverse {type(equations.method).__name__}"
+    return reason_for_plain(equations.method)
+
+
+def reason_for_plain(method: Pseudoinverse) -> str:
+    """Return why machine code cannot evaluate equations by a method, whatever the scene is; empty where it can."""
+    if not eliminates(method) and dense_method(method) is None:
+        return f"it does not know the pseudoinverse {type(method).__name__}"
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
@@ -180,7 +185,7 @@ def _formulation(equations: AbstractSystem) -> FormulationCode | None:
     return formulation_code(equations.formulation) if isinstance(equations, FormulatedSystem) else None
 
 
-def _evaluation(equations: AbstractSystem) -> Accelerate | None:
+def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
     """Return the operation that evaluates equations at single states; None where machine code cannot."""
     if not equations.constrained or _reason_for_equations(equations):
         return None

@@ -25,7 +25,7 @@ from udkjax.native.operations import MarkRows, RunStates
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
-from udkjax.pinv import Auto
+from udkjax.pinv import Auto, OneOf, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.identity_cache import cached_by_identity
 
@@ -136,6 +136,7 @@ def _inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> lis
         "fallback_tol": scene.fallback_tol,
         "max_steps": problem.max_steps,
         **formulation_settings(compiled.equations),
+        "method": method_number(compiled.textbook.method, xp),
     }
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
     return pack(operation, numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
@@ -193,6 +194,11 @@ def thresholds(equations: TextbookEquations, policy: RankPolicy) -> Thresholds:
     safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
     return Thresholds(fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol, safe_tol, fallback_tol)
+
+
+def method_number(method: Pseudoinverse, xp: ModuleType = jnp) -> Any:
+    """Return the number of the method that is chosen of several; zero where there is one alone."""
+    return xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
 
 
 def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:

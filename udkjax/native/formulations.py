@@ -20,6 +20,7 @@ from udkjax.native.module import Module
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.lu import LUCode
+from udkjax.native.pseudoinverses.one_of import OneOfCode
 from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.weighted_rows import RowEntries
@@ -240,7 +241,7 @@ def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
     if not isinstance(formulation, Augmented):
         return None
     method = LUCode(relative=True) if formulation.method is None else dense_method(formulation.method)
-    return None if method is None else AugmentedCode(method)
+    return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one number
 
 
 def formulation_tol(formulation: Any) -> Any:

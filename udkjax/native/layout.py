@@ -28,7 +28,7 @@ FORMULATION_SETTINGS = (
     "formulation_tol",
     "mass",
 )  # besides, for formulations: the threshold of the rank, the scale of masses (kg)
-SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps")
+SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps", "method")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
 INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the last q and v

@@ -4,11 +4,11 @@ import ctypes
 import math
 import os
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +69,10 @@ class LoadedCode:
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Outputs of these shapes, on as many threads as there are cores."""
+        return self.prepare(inputs, shapes)()
+
+    def prepare(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> "PreparedCall":
+        """Return a call, which may be repeated with other numbers in its inputs: those given, where they are float64."""
         names, fields = self._module, {}
         inputs = [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Of the two passes of reverse mode each leaves out what the other finds: zeros, since NaN would alarm jax.debug_nans.
@@ -85,12 +89,28 @@ class LoadedCode:
         fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
         call = (ctypes.c_int64 * len(self._fields))(*[fields[name] for name in self._fields])
         threads = min(members, os.cpu_count() or 1) if members > 1 else 1
-        if threads == 1:
-            self._run(ctypes.addressof(call))
+        return PreparedCall(self._run, call, following, threads, inputs, found)
+
+
+class PreparedCall(NamedTuple):
+    """A call of machine code: its record, with the arrays that it points to."""
+
+    run: Callable[[int], Any]
+    record: ctypes.Array
+    next_member: ctypes.c_int64
+    threads: int
+    inputs: list[np.ndarray]  # float64, one behind the other in memory
+    outputs: list[np.ndarray]
+
+    def __call__(self) -> list[np.ndarray]:
+        """Return the outputs, which the next call overwrites."""
+        self.next_member.value, address = 0, ctypes.addressof(self.record)
+        if self.threads == 1:
+            self.run(address)
         else:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(lambda _: self._run(ctypes.addressof(call)), range(threads)))
-        return found
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(lambda _: self.run(address), range(self.threads)))
+        return self.outputs
 
 
 _LOADED: dict[str, tuple[machine.Library, Any]] = {}

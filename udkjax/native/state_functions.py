@@ -24,7 +24,7 @@ from udkjax.native.trajectory import Trajectory
 class StateFunction(Trajectory):
     """The text of a module whose `run` evaluates members at their states q and v at the time ts[0]."""
 
-    settings = ("length", "fallback_tol")
+    settings = ("length", "fallback_tol", "method")
     results = ("found",)
     found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, one behind another
 

@@ -5,6 +5,7 @@ from udkjax.pinv.elimination import Elimination as Elimination
 from udkjax.pinv.gram_schmidt import GramSchmidt as GramSchmidt
 from udkjax.pinv.greville import Greville as Greville
 from udkjax.pinv.householder import Householder as Householder
+from udkjax.pinv.one_of import OneOf as OneOf
 from udkjax.pinv.rule import Dense as Dense
 from udkjax.pinv.rule import LeastSquaresSolution as LeastSquaresSolution
 from udkjax.pinv.rule import Plus as Plus

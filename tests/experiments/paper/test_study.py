@@ -50,7 +50,7 @@ def test_thresholds_and_starts_are_those_of_the_case():
             Case("start", "SVD", "Adams", 1e-8, start=2),
         )
     )
-    assert [float(x) for x in tied[2:]] == [1e-8, 1e-8, 1000.0, 100.0]
+    assert [float(x) for x in tied[2:]] == [1e-8, 1e-8, 0.0, 1000.0, 100.0]
     assert (float(tied[0][0]), float(tied[0][-1])) == (0.0, 2.0)
     assert float(held[3]) == 4.0 * RANK_HELD
     assert 0 < np.abs(nudged[1].q - state.q).max() < 1e-15
@@ -60,8 +60,8 @@ def test_thresholds_and_starts_are_those_of_the_case():
 
 @pytest.mark.parametrize("name", METHODS)
 def test_the_papers_methods_have_their_threshold_in_the_units_of_the_matrix(name):
-    method = paper.pseudoinverse(name, 0.5)
-    assert type(method).__name__ == name and not method.relative
+    method = paper.pseudoinverse(name, 0.5, paper.number_of(name))
+    assert type(method.methods[int(method.number)]).__name__ == name and not method.relative
     matrix = np.diag([30.0, 3.0, 0.4])
     assert int(method.rank(matrix)) == 2  # 0.4 is beyond 1 % of 30, but not beyond 0.5
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -205,3 +206,26 @@ def test_mechanisms_with_other_bodies_states_and_formulations_beside_each_other(
     for k, state in enumerate(states):
         for found in data.q_end[k]:
             assert_allclose(found, udk.simulate(one, [0.0, 1.0], state).q[-1], rtol=0, atol=1e-10)
+
+
+def test_methods_gains_tolerances_and_thresholds_are_one_program(compilations):
+    """Five pseudoinverses, by a number of one program, with all that else differs: each member as by itself."""
+    linkage, ts = udk.library.parallelogram(), np.linspace(0.0, 0.5, 3)
+    methods = [udk.SVD(1e-3), udk.Varga(1e-3), udk.Greville(1e-3), udk.Householder(1e-3), udk.GramSchmidt(1e-3)]
+    axes = {
+        "method": methods,
+        "gain": udk.Axis([2.0, 5.0], of=["alpha", "beta"]),
+        "tol": udk.Axis([1e-6, 1e-9], of=["rtol", "atol"]),
+        "threshold": udk.Axis([1e-4, 1e-2], of="rank_tol"),
+    }
+    found = []
+    count = compilations(lambda: found.append(udk.sweep(linkage, axes, ts, progress=False)))
+    assert len(count) <= 4, count  # XLA's program and ours; closing the linkage has one of each
+    data = found[0]
+    assert data.method.values.tolist() == ["SVD", "Varga", "Greville", "Householder", "GramSchmidt"]
+    assert np.all(data.result == 0)
+    for k, method in enumerate(methods):
+        alone = udk.simulate(linkage, ts, None, 1e-9, 1e-9, replace(method, rank_tol=1e-2), udk.Baumgarte(5.0, 5.0))
+        member = data.isel({"method": k, "gain": 1, "tol": 1, "threshold": 1})
+        assert_allclose(member.q_end, alone.q[-1], rtol=0, atol=1e-9)
+        assert int(member.steps) == int(alone.stats["steps"])

@@ -10,6 +10,7 @@ from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.pseudoinverses.gram_schmidt import GramSchmidtCode
 from udkjax.native.pseudoinverses.greville import GrevilleCode
 from udkjax.native.pseudoinverses.householder import HouseholderCode
+from udkjax.native.pseudoinverses.one_of import OneOfCode
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.pseudoinverses.varga import VargaCode
 
@@ -24,6 +25,10 @@ METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
 
 def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
     """Return the machine code of a pseudoinverse; None where there is none."""
+    if isinstance(method, pinv.OneOf):
+        found = [dense_method(choice) for choice in method.choices]
+        known = tuple(code for code in found if code is not None)
+        return OneOfCode(method.relative, known) if len(known) == len(found) else None
     kind = METHODS.get(type(method))
     if kind is None:
         return None

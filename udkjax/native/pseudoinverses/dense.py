@@ -137,8 +137,8 @@ class MatrixRow:
 class DenseMatrices:
     """The matrices of a method in one function, which has the arguments `work`."""
 
-    def __init__(self, layout: DenseLayout, f: Function):
-        self.layout, self.f, self.module = layout, f, layout.module
+    def __init__(self, layout: DenseLayout, f: Function, part: str = ""):
+        self.layout, self.f, self.module, self._part = layout, f, layout.module, part
         (self.m, self.n), self.vector = layout.shape, self.module.plan.vector
         self.steps = min(self.m, self.n)
 
@@ -178,10 +178,31 @@ class DenseMatrices:
         tol = self.tol
         return tol * tol * square_of_scale if method.relative else tol * tol
 
+    @property
+    def method_number(self) -> Value:
+        """The number of the method that each lane has chosen of several."""
+        return self.f.load(self.f.given["work"], self.module.places["method"] * self.f.width, self.f.width)
+
+    def part(self, prefix: str) -> "DenseMatrices":
+        """Return the same with the matrices whose names have a prefix, in place of those without."""
+        return DenseMatrices(self.layout, self.f, prefix)
+
+    def _name(self, name: str) -> str:
+        return self._part + name if self._part + name in self.layout.registers else name
+
     # --- rows
+
+    def copy(self, x: MatrixRow, y: MatrixRow):
+        """Copy the row x to the row y."""
+
+        def copy(r: Operand):
+            y[r] = x[r]
+
+        self.over_registers(y.registers, copy)
 
     def row(self, name: str, i: Operand = 0) -> MatrixRow:
         """Return row i of a matrix."""
+        name = self._name(name)
         f, registers = self.f, self.layout.registers[name]
         start = self.module.places[f"{self.layout.prefix} {name}"] * self.module.plan.width
         stride = registers * self.vector
@@ -190,14 +211,9 @@ class DenseMatrices:
 
     def gather(self, name: str, places: Value, to: MatrixRow):
         """Copy a row of a matrix that differs from lane to lane."""
-        f, registers = self.f, self.layout.registers[name]
+        f, registers = self.f, self.layout.registers[self._name(name)]
         if f.width == 1:
-            source = self.row(name, places)
-
-            def copy(r: Operand):
-                to[r] = source[r]
-
-            self.over_registers(registers, copy)
+            self.copy(self.row(name, places), to)
             return
         sources = [self.row(name, f.lane(places, f.const(k, INT))).address for k in range(f.width)]
         with f.each(registers * self.vector // f.width) as j:

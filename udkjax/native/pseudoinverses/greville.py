@@ -22,11 +22,7 @@ class GrevilleCode(DenseMethod):
         threshold, rank = f.variable(d.threshold(self, scale.value)), f.variable(0.0)
         with f.each(d.m) as i:
             row, found = d.row("D", i), d.row("plus", i)
-
-            def copy(r: Operand):
-                c[r] = row[r]
-
-            d.over_registers(c.registers, copy)
+            d.copy(row, c)
             length = f.variable(0.0)
             with f.each(i) as j:
                 part = d.dot(row, d.row("plus", j))

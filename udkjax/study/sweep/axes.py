@@ -2,13 +2,15 @@
 
 An axis of numbers (parameters, tolerances, gains) is batched in one compiled program. An axis of choices (methods, solvers,
 mechanisms, initial states) divides the members into groups by the structure of what they chose, one program each: no member
-executes a branch that it did not choose, and choices that differ by numbers alone share a program.
+executes a branch that it did not choose, and choices that differ by numbers alone share a program. So do dense pseudoinverses, of
+which machine code takes one of several by its number.
 """
 
 import abc
 import warnings
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, Protocol, TypeAlias, cast
 
 import equinox as eqx
@@ -18,6 +20,8 @@ from jaxtyping import Float, PyTree
 
 from udkjax.annotations import Numbers
 from udkjax.integrate.assembly import State
+from udkjax.integrate.compiled_mechanism import reason_for_plain
+from udkjax.pinv import Auto, Dense, Elimination, OneOf
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice
 from udkjax.study.quantities import Setter
@@ -108,6 +112,11 @@ class AxisColumn:
         assert isinstance(self.values, tuple)
         return self.values
 
+    @cached_property
+    def computed(self) -> tuple[AxisChoice, ...]:
+        """The choices as programs take them: dense methods that machine code has as one of several, by its number."""
+        return one_of_several(self.choices) if self.setting == "method" else self.choices
+
     @property
     def setting(self) -> str:
         """The setting that its choices are of."""
@@ -157,6 +166,23 @@ def structure_of(choice: PyTree) -> Hashable:
     arrays, rest = eqx.partition(choice, eqx.is_array)
     leaves, tree = jax.tree.flatten(rest)
     return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), tree, tuple(leaves)
+
+
+def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:
+    """Return methods with dense ones of machine code replaced by a `OneOf` of all their kinds, so that they share a structure."""
+    dense: dict[int, Dense] = {}
+    for k, method in enumerate(methods):
+        if isinstance(method, Dense) and not isinstance(method, Auto | Elimination | OneOf) and not reason_for_plain(method):
+            dense[k] = method
+    kinds = {k: replace(method, rank_tol=None, relative=True) for k, method in dense.items()}
+    distinct = {structure_of(kind): kind for kind in kinds.values()}
+    if len(distinct) < 2:
+        return tuple(methods)
+    found, structures = list(methods), list(distinct)
+    for k, method in dense.items():
+        number = structures.index(structure_of(kinds[k]))
+        found[k] = OneOf(method.rank_tol, method.relative, tuple(distinct.values()), np.asarray(number))
+    return tuple(found)
 
 
 # --- designs: members spread over ranges, instead of all combinations of values

@@ -16,6 +16,7 @@ from jaxtyping import Array, Int, PyTree
 
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.assembly import Closure, State, close
+from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import is_explicit
 from udkjax.pinv import Auto, Elimination
@@ -32,7 +33,7 @@ LANE_WIDTH = 8  # members: a piece has a multiple, of what the widest vector uni
 DEVICE_PIECE = 4096  # members of a piece where a device takes them all at once
 LARGEST_PIECE = 8  # times `PIECE_MEMBERS` in a piece, at most: to call a program takes what ten of its members take
 LEAST_PIECES = 16  # pieces that a group has at least, before they get larger: so that all devices have something to do
-STRAIGHT_METHODS = (type(None), Auto, Elimination)  # methods by straight-line code, which vector instructions suit
+STRAIGHT_METHODS = (type(None), Auto, Elimination)  # that vector instructions suit also where there is no machine code
 
 
 class Shared(NamedTuple):
@@ -73,9 +74,9 @@ class GroupRun:
         for column in plan.columns:
             if column.is_choice:
                 setting, places = column.setting, group.choices[column.name]
-                fixed[setting] = column.choices[places[0]]
+                fixed[setting] = column.computed[places[0]]
                 if len(places) > 1 and jax.tree.leaves(eqx.filter(fixed[setting], eqx.is_array)):
-                    arrays, static = stack_choices([column.choices[k] for k in places])
+                    arrays, static = stack_choices([column.computed[k] for k in places])
                     self._own[setting] = GroupChoices(column.name, arrays, static, np.array(places))
         analysis = analyse(fixed["mechanism"])
         self.redundant = analysis.redundant_rows if redundant is None else redundant
@@ -96,13 +97,18 @@ class GroupRun:
         self.shared = jax.tree.map(np.asarray, Shared(arrays, closure))
         in_lanes = (
             is_explicit(fixed.get("solver"))
-            and isinstance(fixed.get("method"), STRAIGHT_METHODS)
+            and (isinstance(method := fixed.get("method"), STRAIGHT_METHODS) or not reason_for_plain(method))
             and self.redundant is not None
             and fixed.get("formulation") is None
         )
         self._placed: Shared | None = None
         devices = jax.local_devices()
-        self.program = Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform), devices)
+        first = plan.first_alike[index]
+        self.program = (
+            Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform), devices)
+            if first == index
+            else _group_run(plan, first, redundant).program
+        )
 
     def own(self, members: Int[np.ndarray, "n"]) -> Own:
         """Return the numbers of members, (n, ...) each."""
@@ -210,7 +216,11 @@ def _piece(members: int, in_lanes: bool, platform: str) -> int:
     return min(PIECE_MEMBERS * max(1, min(LARGEST_PIECE, members // (PIECE_MEMBERS * LEAST_PIECES))), full) if in_lanes else 1
 
 
-@lru_cache(maxsize=MOST_PROGRAMS)
 def group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
     """Return how the members of a group are computed: compiled once for each process."""
-    return GroupRun(plan, group, redundant)
+    return _group_run(plan, group, redundant)
+
+
+@lru_cache(maxsize=MOST_PROGRAMS)
+def _group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None) -> GroupRun:
+    return GroupRun(plan, group, redundant)  # the same one, in whatever way it is asked for

@@ -1,7 +1,7 @@
 """Measures: what is stored of each member, and nothing else is computed."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import jax
@@ -205,7 +205,7 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
     if method.rank_tol is None:
-        method = type(method)(rank_tolerance(run.mechanism))
+        method = replace(method, rank_tol=rank_tolerance(run.mechanism))
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
     reached = jnp.all(jnp.isfinite(q), axis=1)
     ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))

@@ -38,7 +38,7 @@ class StoredVariable:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Members whose choices have one structure, and so one compiled program."""
+    """Members whose choices have one structure: one compiled program, which groups of other methods may share, serves them."""
 
     index: int
     choices: Mapping[str, tuple[int, ...]]  # for each axis of choices, the places of those that occur
@@ -101,7 +101,7 @@ class SweepPlan:
         chosen = [column for column in self.columns if column.is_choice]
         places = self.places(np.arange(self.size))
         kinds = np.stack(
-            [_number_structures(column)[places[column.name]] for column in chosen] or [np.zeros(self.size, int)], axis=1
+            [_number_structures(column.choices)[places[column.name]] for column in chosen] or [np.zeros(self.size, int)], axis=1
         )
         _, number = np.unique(kinds, axis=0, return_inverse=True)
         number = number.ravel()
@@ -111,6 +111,17 @@ class SweepPlan:
             labels = {column.name: " | ".join(column.labels[k] for k in at[column.name]) for column in chosen}
             found.append(Group(len(found), at, labels, members))
         return tuple(found)
+
+    @cached_property
+    def first_alike(self) -> tuple[int, ...]:
+        """For each group the first that the same compiled program serves: their methods are one of several by a number."""
+        numbers = {column.name: _number_structures(column.computed) for column in self.columns if column.is_choice}
+
+        def key(group: Group) -> tuple:
+            return tuple((numbers[name][places[0]], len(places) > 1) for name, places in group.choices.items())
+
+        keys = [key(group) for group in self.groups]
+        return tuple(keys.index(one) for one in keys)
 
     @cached_property
     def _numbers(self) -> np.ndarray:
@@ -186,10 +197,10 @@ def make_plan(
     return SweepPlan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design)
 
 
-def _number_structures(column: AxisColumn) -> np.ndarray:
+def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:
     """Return for each of the choices of an axis the number of its structure."""
     structures = [
-        (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in column.choices
+        (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in values
     ]
     return np.array([structures.index(structure) for structure in structures])
 
