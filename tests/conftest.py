@@ -30,6 +30,7 @@ gc.freeze()
 gc.set_threshold(20_000, 20, 20)
 
 DATA = Path(__file__).parent / "data"
+CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
 MAPS = 20_000  # pieces of memory; Linux lets a process have 65,530
 
 
@@ -95,3 +96,16 @@ def placed():
 def linkage():
     """The paper's."""
     return udk.library.parallelogram()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium, which a module closes again: while it is there, its thread can run no other event loop."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")
+    path = next((path for path in CHROMIUM if Path(path).exists()), None)
+    if path is None:
+        pytest.skip("there is no Chromium: apt-get install chromium")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()

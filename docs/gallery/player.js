@@ -35,6 +35,28 @@ function nice(x) {
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
 
+/** The interval of times that holds t: its ends, its length, and where in it t is, from 0 to 1. */
+function interval(ts, t, count = ts.length) {
+  let low = 0, high = count - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (ts[middle] <= t) low = middle; else high = middle;
+  }
+  const h = ts[high] - ts[low];
+  return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
+}
+
+/** The state {t, q, v} of a run of n coordinates at a time: cubic between its instants, whose rates are known. */
+function stateAt({ts, q, v, count, frame = 1}, t, n) {
+  const [i, j, h, s] = interval(ts, t, count), r = 1 - s, found = {t, q: new Float64Array(n), v: new Float64Array(n)};
+  for (let k = 0; k < n; k++) {
+    const a = q[i * n + k], b = q[j * n + k], u = v[i * n + k] / frame, w = v[j * n + k] / frame;
+    found.q[k] = a * r * r * (1 + 2 * s) + b * s * s * (3 - 2 * s) + h * s * r * (u * r - w * s);
+    found.v[k] = h > 0 ? 6 * s * r * (b - a) / h + r * (1 - 3 * s) * u + s * (3 * s - 2) * w : u;
+  }
+  return found;
+}
+
 /** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
 class Run {
   constructor(record) {
@@ -58,26 +80,9 @@ class Run {
   }
 
   /** The coordinates and their rates at any time between the first and the last instant. */
-  state(t) {
-    const [i, j, h, s] = this.find(t), n = this.size, {q, v, frame} = this, rates = new Float64Array(n), r = 1 - s;
-    for (let k = 0; k < n; k++) {
-      const a = q[i * n + k], b = q[j * n + k], u = v[i * n + k] / frame, w = v[j * n + k] / frame;
-      rates[k] = h > 0 ? 6 * s * r * (b - a) / h + r * (1 - 3 * s) * u + s * (3 * s - 2) * w : u;
-    }
-    return {q: this.pose(t).slice(), v: rates};
-  }
+  state(t) { return stateAt(this, t, this.size); }
 
-  /** The interval that holds t, and where in it t is, from 0 to 1. */
-  find(t) {
-    const ts = this.ts;
-    let low = 0, high = ts.length - 1;
-    while (high - low > 1) {
-      const middle = (low + high) >> 1;
-      if (ts[middle] <= t) low = middle; else high = middle;
-    }
-    const h = ts[high] - ts[low];
-    return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
-  }
+  find(t) { return interval(this.ts, t); }
 
   /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
   pose(t, amplitude = 1) {
@@ -319,6 +324,19 @@ class Painter {
 // Symbols (udkjax/show/player/symbols.py): lines and circles in frames that move with bodies.
 
 
+/** Tell whether a point is within a closed line, or nearer to a line than `reach`. */
+function isNear([x, y], corners, closed, reach) {
+  const ends = closed ? [...corners, corners[0]] : corners;
+  let inside = false;
+  for (let k = 1; k < ends.length; k++) {
+    const [[ax, ay], [bx, by]] = [ends[k - 1], ends[k]], dx = bx - ax, dy = by - ay;
+    const s = clamp(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0, 1);
+    if (Math.hypot(x - ax - s * dx, y - ay - s * dy) <= reach) return true;
+    if ((ay > y) !== (by > y) && x < ax + dx * (y - ay) / dy) inside = !inside;
+  }
+  return inside && Boolean(closed);
+}
+
 /** Draws symbols at a pose. */
 class SymbolPainter extends Painter {
   draw(symbols) {
@@ -347,15 +365,7 @@ class SymbolPainter extends Painter {
   holds(symbol, x, y, reach) {
     const {centre, size, corners} = this.outline(symbol);
     if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
-    const ends = symbol.closed ? [...corners, corners[0]] : corners, near = symbol.width * this.pt / 2 + reach;
-    let inside = false;
-    for (let k = 1; k < ends.length; k++) {
-      const [[ax, ay], [bx, by]] = [ends[k - 1], ends[k]], dx = bx - ax, dy = by - ay;
-      const s = Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0), 1);
-      if (Math.hypot(x - ax - s * dx, y - ay - s * dy) <= near) return true;
-      if ((ay > y) !== (by > y) && x < ax + dx * (y - ay) / dy) inside = !inside;
-    }
-    return inside && Boolean(symbol.closed);
+    return isNear([x, y], corners, symbol.closed, symbol.width * this.pt / 2 + reach);
   }
 
   /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */
@@ -521,11 +531,20 @@ function make(tag, properties = {}, ...children) {
   return element;
 }
 
-function icon(name) {
+function button(content, title, action, kind = "") {
+  return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
+}
+
+const icon = name => svgIcon(ICONS[name]);
+
+/** An icon of a path that is filled, or drawn as a line. */
+function svgIcon(shape, isLine = false) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(svg.namespaceURI, "path");
   svg.setAttribute("viewBox", "0 0 24 24");
   svg.setAttribute("aria-hidden", "true");
-  path.setAttribute("d", ICONS[name]);
+  if (isLine) svg.classList.add("stroke");
+  path.setAttribute("d", shape);
+  path.setAttribute("fill-rule", "evenodd");
   svg.append(path);
   return svg;
 }
@@ -1439,7 +1458,7 @@ class Player {
 
   build(element) {
     const {data} = this, shadow = element.shadowRoot ?? element.attachShadow({mode: "open"});
-    const toggle = (name, words, key) => this.button(words, `${words} (${key})`, () => this.toggle(name));
+    const toggle = (name, words, key) => button(words, `${words} (${key})`, () => this.toggle(name));
     this.playButton = make("button", {class: "icon primary", type: "button", onclick: () => this.toggle("playing")});
     this.timeLabel = make("span", {class: "time"});
     this.scrub = make("input", {class: "scrub", type: "range", min: 0, max: 10000, step: 1, "aria-label": "time",
@@ -1450,7 +1469,7 @@ class Player {
       this.speedSelect.append(make("option", {value: s}, `${s} ×`));
     }
     this.speedSelect.value = this.speed;
-    this.buttons = {loop: this.button(icon("loop"), "repeat (L)", () => this.toggle("loop"), "icon")};
+    this.buttons = {loop: button(icon("loop"), "repeat (L)", () => this.toggle("loop"), "icon")};
     if (this.runs.some(run => run.traces.length)) this.buttons.traces = toggle("traces", "Traces", "T");
     if (this.runs.some(run => run.reactions)) this.buttons.reactions = toggle("reactions", "Reactions", "R");
     this.buttons.names = toggle("names", "Names", "N");
@@ -1469,18 +1488,14 @@ class Player {
     }
     this.root = make("div", {class: "player", tabindex: -1, onkeydown: event => this.key(event)},
       make("header", {}, make("h1", {title: data.title}, data.title),
-        this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
-        this.button("?", "keys", () => this.toggleHelp(), "icon")),
+        button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
+        button("?", "keys", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
     keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
     shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);
     this.setPlaying(false);
-  }
-
-  button(content, title, action, kind = "") {
-    return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
   }
 
   panel(run, k) {

@@ -8,8 +8,6 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
 COMMAND = "from udkjax.cli import main; main()"
 PATIENCE = 120.0  # s for the server to compile and diagnose, on a machine that others use as well
 
@@ -124,8 +122,3 @@ def studio_page(browser, address, folder, width=1280, height=800, **options):
         assert all(url.startswith((origin, "data:", "blob:")) for url in found.requests)
     finally:
         context.close()
-
-
-def chromium():
-    """Return Playwright's way to the system's Chromium, or skip."""
-    return pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")

@@ -3,11 +3,11 @@
 import assert from "node:assert/strict";
 import {test} from "node:test";
 
-const page = name => import(new URL(`../../udkjax/studio/page/${name}.js`, import.meta.url));
+const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
 const {applyFix} = await page("fixes");
-const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry, stateAt} = await page("mover"), {TOOLS} = await page("tools");
+const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("mover"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
 const at = (x, y, pin = null, link = null) => ({place: [x, y], pin, link, pixel: [1000 * x, -1000 * y]});

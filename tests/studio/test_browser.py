@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from tests.studio.browsing import PATIENCE, chromium, served, studio_page
+from tests.studio.browsing import PATIENCE, served, studio_page
 from udkjax.studio.templates import TEMPLATES
 
-CHROMIUM = "/usr/bin/chromium"
 TOLERANCE = 1e-8  # of the page's runs
 STEPS = 600  # of a mouse that pulls: ten seconds at 60 pictures a second
 RECORD_FRAMES = """(() => {
@@ -17,19 +16,6 @@ RECORD_FRAMES = """(() => {
     window.frames = [];
     motion.pullTo = hand => { pull(hand); frames.push([motion.posed.violation, parts.status.textContent]); };
 })()"""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from pathlib import Path
-
-    sync_api = chromium()
-    if not Path(CHROMIUM).exists():
-        pytest.skip("there is no Chromium: apt-get install chromium")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -508,6 +494,8 @@ def test_curves_scrub_and_forces_and_rest_are_computed_when_asked_for(studio):
     studio.until("studio.curves.fact.textContent.startsWith('motors do not hold')")
     studio.page.keyboard.press("Home")
     assert studio.js("studio.motion.posed") is None
+    studio.page.keyboard.press(" ")  # plays, and does not press the last button again
+    studio.until("studio.motion.t > 0")
 
 
 @pytest.mark.slow

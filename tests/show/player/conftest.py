@@ -8,7 +8,6 @@ import udkjax as udk
 
 OMEGA = 4.0  # rad/s: the crank of the slider-crank turns by OMEGA t
 CRANK, ROD = 0.5, 1.5
-CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
 
 
 class Motion(NamedTuple):
@@ -73,18 +72,3 @@ def hostile():
     joint = udk.Revolute(("ground", names[1]), [(0.0, 0.0), (-0.5, 0.0)])
     mechanism = udk.Mechanism({names[1]: body}, {names[2]: joint, names[3]: joint}, name=names[0])
     return SimpleNamespace(mechanism=mechanism, names=names)
-
-
-@pytest.fixture(scope="session")
-def browser():
-    """Headless Chromium."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")
-    from pathlib import Path
-
-    path = next((path for path in CHROMIUM if Path(path).exists()), None)
-    if path is None:
-        pytest.skip("there is no Chromium: apt-get install chromium")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield browser
-        browser.close()

@@ -27,11 +27,20 @@ export function make(tag, properties = {}, ...children) {
   return element;
 }
 
-export function icon(name) {
+export function button(content, title, action, kind = "") {
+  return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
+}
+
+export const icon = name => svgIcon(ICONS[name]);
+
+/** An icon of a path that is filled, or drawn as a line. */
+export function svgIcon(shape, isLine = false) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(svg.namespaceURI, "path");
   svg.setAttribute("viewBox", "0 0 24 24");
   svg.setAttribute("aria-hidden", "true");
-  path.setAttribute("d", ICONS[name]);
+  if (isLine) svg.classList.add("stroke");
+  path.setAttribute("d", shape);
+  path.setAttribute("fill-rule", "evenodd");
   svg.append(path);
   return svg;
 }

@@ -33,6 +33,28 @@ export function nice(x) {
 export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 export const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
 
+/** The interval of times that holds t: its ends, its length, and where in it t is, from 0 to 1. */
+export function interval(ts, t, count = ts.length) {
+  let low = 0, high = count - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (ts[middle] <= t) low = middle; else high = middle;
+  }
+  const h = ts[high] - ts[low];
+  return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
+}
+
+/** The state {t, q, v} of a run of n coordinates at a time: cubic between its instants, whose rates are known. */
+export function stateAt({ts, q, v, count, frame = 1}, t, n) {
+  const [i, j, h, s] = interval(ts, t, count), r = 1 - s, found = {t, q: new Float64Array(n), v: new Float64Array(n)};
+  for (let k = 0; k < n; k++) {
+    const a = q[i * n + k], b = q[j * n + k], u = v[i * n + k] / frame, w = v[j * n + k] / frame;
+    found.q[k] = a * r * r * (1 + 2 * s) + b * s * s * (3 - 2 * s) + h * s * r * (u * r - w * s);
+    found.v[k] = h > 0 ? 6 * s * r * (b - a) / h + r * (1 - 3 * s) * u + s * (3 * s - 2) * w : u;
+  }
+  return found;
+}
+
 /** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
 export class Run {
   constructor(record) {
@@ -56,26 +78,9 @@ export class Run {
   }
 
   /** The coordinates and their rates at any time between the first and the last instant. */
-  state(t) {
-    const [i, j, h, s] = this.find(t), n = this.size, {q, v, frame} = this, rates = new Float64Array(n), r = 1 - s;
-    for (let k = 0; k < n; k++) {
-      const a = q[i * n + k], b = q[j * n + k], u = v[i * n + k] / frame, w = v[j * n + k] / frame;
-      rates[k] = h > 0 ? 6 * s * r * (b - a) / h + r * (1 - 3 * s) * u + s * (3 * s - 2) * w : u;
-    }
-    return {q: this.pose(t).slice(), v: rates};
-  }
+  state(t) { return stateAt(this, t, this.size); }
 
-  /** The interval that holds t, and where in it t is, from 0 to 1. */
-  find(t) {
-    const ts = this.ts;
-    let low = 0, high = ts.length - 1;
-    while (high - low > 1) {
-      const middle = (low + high) >> 1;
-      if (ts[middle] <= t) low = middle; else high = middle;
-    }
-    const h = ts[high] - ts[low];
-    return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
-  }
+  find(t) { return interval(this.ts, t); }
 
   /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
   pose(t, amplitude = 1) {

@@ -1,6 +1,6 @@
 // The player's elements, what they do, and how they look.
 
-import {HELP, LIVE_HELP, SPEEDS, icon, keepKeys, make} from "./elements.js";
+import {HELP, LIVE_HELP, SPEEDS, button, icon, keepKeys, make} from "./elements.js";
 import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES} from "./painter.js";
@@ -40,7 +40,7 @@ export class Player {
 
   build(element) {
     const {data} = this, shadow = element.shadowRoot ?? element.attachShadow({mode: "open"});
-    const toggle = (name, words, key) => this.button(words, `${words} (${key})`, () => this.toggle(name));
+    const toggle = (name, words, key) => button(words, `${words} (${key})`, () => this.toggle(name));
     this.playButton = make("button", {class: "icon primary", type: "button", onclick: () => this.toggle("playing")});
     this.timeLabel = make("span", {class: "time"});
     this.scrub = make("input", {class: "scrub", type: "range", min: 0, max: 10000, step: 1, "aria-label": "time",
@@ -51,7 +51,7 @@ export class Player {
       this.speedSelect.append(make("option", {value: s}, `${s} ×`));
     }
     this.speedSelect.value = this.speed;
-    this.buttons = {loop: this.button(icon("loop"), "repeat (L)", () => this.toggle("loop"), "icon")};
+    this.buttons = {loop: button(icon("loop"), "repeat (L)", () => this.toggle("loop"), "icon")};
     if (this.runs.some(run => run.traces.length)) this.buttons.traces = toggle("traces", "Traces", "T");
     if (this.runs.some(run => run.reactions)) this.buttons.reactions = toggle("reactions", "Reactions", "R");
     this.buttons.names = toggle("names", "Names", "N");
@@ -70,18 +70,14 @@ export class Player {
     }
     this.root = make("div", {class: "player", tabindex: -1, onkeydown: event => this.key(event)},
       make("header", {}, make("h1", {title: data.title}, data.title),
-        this.button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
-        this.button("?", "keys", () => this.toggleHelp(), "icon")),
+        button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
+        button("?", "keys", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
     keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
     shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);
     this.setPlaying(false);
-  }
-
-  button(content, title, action, kind = "") {
-    return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
   }
 
   panel(run, k) {

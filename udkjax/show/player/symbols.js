@@ -1,7 +1,20 @@
 // Symbols (udkjax/show/player/symbols.py): lines and circles in frames that move with bodies.
 
-import {angleOf} from "./motion.js";
+import {angleOf, clamp} from "./motion.js";
 import {Painter, mix} from "./painter.js";
+
+/** Tell whether a point is within a closed line, or nearer to a line than `reach`. */
+export function isNear([x, y], corners, closed, reach) {
+  const ends = closed ? [...corners, corners[0]] : corners;
+  let inside = false;
+  for (let k = 1; k < ends.length; k++) {
+    const [[ax, ay], [bx, by]] = [ends[k - 1], ends[k]], dx = bx - ax, dy = by - ay;
+    const s = clamp(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0, 1);
+    if (Math.hypot(x - ax - s * dx, y - ay - s * dy) <= reach) return true;
+    if ((ay > y) !== (by > y) && x < ax + dx * (y - ay) / dy) inside = !inside;
+  }
+  return inside && Boolean(closed);
+}
 
 /** Draws symbols at a pose. */
 export class SymbolPainter extends Painter {
@@ -31,15 +44,7 @@ export class SymbolPainter extends Painter {
   holds(symbol, x, y, reach) {
     const {centre, size, corners} = this.outline(symbol);
     if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
-    const ends = symbol.closed ? [...corners, corners[0]] : corners, near = symbol.width * this.pt / 2 + reach;
-    let inside = false;
-    for (let k = 1; k < ends.length; k++) {
-      const [[ax, ay], [bx, by]] = [ends[k - 1], ends[k]], dx = bx - ax, dy = by - ay;
-      const s = Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0), 1);
-      if (Math.hypot(x - ax - s * dx, y - ay - s * dy) <= near) return true;
-      if ((ay > y) !== (by > y) && x < ax + dx * (y - ay) / dy) inside = !inside;
-    }
-    return inside && Boolean(symbol.closed);
+    return isNear([x, y], corners, symbol.closed, symbol.width * this.pt / 2 + reach);
   }
 
   /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */

@@ -85,13 +85,9 @@ export class DrawingCanvas {
   }
 
   /** A symbol in pixels, to be picked. */
-  outline({of, frame, radius, points, closed, width}, painter) {
-    const [[x0, y0], c, s, scale] = painter.axes(frame);
-    if (radius) return {of, points: [[x0, y0]], radius: Math.max(painter.view.scale * radius[0] + radius[1], radius[2]), width};
-    return {of, closed, width, points: points.map(([x, y, px = 0, py = 0]) => {
-      const along = scale * x + px, up = scale * y + py;
-      return [x0 + c * along - s * up, y0 - s * along - c * up];
-    })};
+  outline(symbol, painter) {
+    const {centre, size, corners} = painter.outline(symbol), {of, closed, width} = symbol;
+    return {of, closed, width, points: corners ?? [centre], radius: size};
   }
 
   paths({paths, show}, painter) {

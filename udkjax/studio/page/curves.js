@@ -5,7 +5,8 @@ import {ask} from "./api.js";
 import {list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {carry} from "./mover.js";
 import {lengthName, lengthUnit} from "./units.js";
-import {make} from "./player/elements.js";
+import {button, make} from "./player/elements.js";
+import {interval} from "./player/motion.js";
 import {Painter, THEMES} from "./player/painter.js";
 import {drawStrip, stripPart} from "./player/strip.js";
 
@@ -22,7 +23,6 @@ const PANELS = {
 export class CurvesPanel {
   constructor(studio, element) {
     Object.assign(this, {studio, panel: "kinematics", chosen: {}, served: {}, facts: {}, busy: ""});
-    const button = (words, title, action) => make("button", {type: "button", title, "aria-label": title, onclick: action}, words);
     this.tabs = Object.entries(PANELS).map(([name, {title, words}]) => [name, make("button", {type: "button", role: "tab", title: words, onclick: () => this.open(name)}, title)]);
     this.actions = Object.entries(PANELS).flatMap(([panel, {actions}]) => actions.map(([name, words, title]) => ({panel, name, button: button(words, title, () => this.ask(name))})));
     this.select = make("select", {"aria-label": "curve", onchange: () => { this.chosen[this.panel] = this.select.value; studio.redraw(); }});
@@ -194,7 +194,7 @@ export class CurvesPanel {
     const key = [this.name, this.panel, motion.run, this.served[this.panel]];
     if (!this.cache || key.some((x, k) => x !== this.cache.key[k])) this.cache = {key, curve: this.values(this.name)};
     const {curve} = this.cache, ts = curve.ts ?? motion.run.ts;
-    const run = {label: "", ts: Array.from(ts).slice(0, Math.min(motion.run.count, curve.values.length)), measures: [{name: this.name, ...curve}], find: t => find(ts, t)};
+    const run = {label: "", ts: Array.from(ts).slice(0, Math.min(motion.run.count, curve.values.length)), measures: [{name: this.name, ...curve}], find: t => interval(ts, t)};
     return drawStrip(context, width, height, [run], this.name, 0, motion.end, motion.t, theme, width);
   }
 
@@ -211,11 +211,4 @@ const shownName = curve => `${curve.name}${curve.unique ? "" : " (not unique)"}`
 function withoutRounding(values, scale) {
   const spread = values.reduce((most, x) => Math.max(most, Math.abs(x - values[0])), 0);
   return spread <= ROUNDING * scale ? values.map(() => values[0]) : values;
-}
-
-function find(ts, t) {
-  let low = 0, high = ts.length - 1;
-  while (high - low > 1) { const middle = (low + high) >> 1; if (ts[middle] <= t) low = middle; else high = middle; }
-  const h = ts[high] - ts[low];
-  return [low, high, h, h > 0 ? (t - ts[low]) / h : 0];
 }

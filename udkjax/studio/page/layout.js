@@ -1,18 +1,7 @@
 // The page: its bars, the drawing, and the panels beside it.
 
 import {KEYS, TOOLS} from "./tools.js";
-import {icon, keepKeys, make} from "./player/elements.js";
-
-export function svgIcon(path, stroke = false) {
-  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), line = document.createElementNS(svg.namespaceURI, "path");
-  svg.setAttribute("viewBox", "0 0 24 24");
-  svg.setAttribute("aria-hidden", "true");
-  if (stroke) svg.classList.add("stroke");
-  line.setAttribute("d", path);
-  line.setAttribute("fill-rule", "evenodd");
-  svg.append(line);
-  return svg;
-}
+import {button, icon, keepKeys, make, svgIcon} from "./player/elements.js";
 
 const ICONS = {
   undo: "M9 5L4 10l5 5v-3.5h5a3.5 3.5 0 0 1 0 7H9v2h5a5.5 5.5 0 0 0 0-11H9z", redo: "M15 5l5 5-5 5v-3.5h-5a3.5 3.5 0 0 0 0 7h5v2h-5a5.5 5.5 0 0 1 0-11h5z",
@@ -22,7 +11,6 @@ const ICONS = {
 /** Build the page in an element; returns its parts by name. */
 export function buildPage(studio, root) {
   const parts = {};
-  const button = (content, title, action, kind = "") => make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
   const section = (title, part, open = true) => {
     const found = make("details", {class: `panel ${part}`}, make("summary", {}, title), parts[part] = make("div", {class: "body"}));
     found.open = open;

@@ -2,6 +2,7 @@
 // its bodies are matched to the links of the document, whose frames are that of the ground while they stand as drawn.
 
 import {list, placeOf} from "./document.js";
+import {stateAt} from "./player/motion.js";
 
 const INSTANTS = 401;
 const PULLS = 12;  // closings of one frame, each nearer to the hand
@@ -26,23 +27,6 @@ export function carry(motions, k, [x, y]) {
   if (k < 0) return [x, y];
   const c = Math.cos(motions[3 * k + 2]), s = Math.sin(motions[3 * k + 2]);
   return [motions[3 * k] + c * x - s * y, motions[3 * k + 1] + s * x + c * y];
-}
-
-/** The state of a run at a time: cubic between its instants, whose rates are known. */
-export function stateAt({ts, q, v, count}, t, size) {
-  let low = 0, high = count - 1;
-  while (high - low > 1) {
-    const middle = (low + high) >> 1;
-    if (ts[middle] <= t) low = middle; else high = middle;
-  }
-  const h = ts[high] - ts[low], s = h > 0 ? Math.min(Math.max((t - ts[low]) / h, 0), 1) : 0, r = 1 - s;
-  const found = {t, q: new Float64Array(size), v: new Float64Array(size)};
-  for (let k = 0; k < size; k++) {
-    const i = low * size + k, j = high * size + k;
-    found.q[k] = q[i] * r * r * (1 + 2 * s) + q[j] * s * s * (3 - 2 * s) + h * s * r * (v[i] * r - v[j] * s);
-    found.v[k] = h > 0 ? 6 * s * r * (q[j] - q[i]) / h + v[i] * r * (1 - 3 * s) + v[j] * s * (3 * s - 2) : v[i];
-  }
-  return found;
 }
 
 export class Mover {

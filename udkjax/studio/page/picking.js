@@ -1,25 +1,9 @@
 // What is under the cursor: the nearest pin, else the topmost symbol that the cursor is near.
 
 import {list} from "./document.js";
+import {isNear} from "./player/symbols.js";
 
 const PIN_REACH = 11, SYMBOL_REACH = 7, TOUCH = 1.8;  // px; fingers reach farther
-
-/** The distance of a point from the segment from a to b. */
-export function distance([x, y], [ax, ay], [bx, by]) {
-  const dx = bx - ax, dy = by - ay, square = dx * dx + dy * dy;
-  const s = square > 0 ? Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / square, 0), 1) : 0;
-  return Math.hypot(x - ax - s * dx, y - ay - s * dy);
-}
-
-/** Tell whether a point is inside a polygon. */
-export function inside([x, y], points) {
-  let found = false;
-  points.forEach(([ax, ay], k) => {
-    const [bx, by] = points[(k + 1) % points.length];
-    if ((ay > y) !== (by > y) && x < ax + (bx - ax) * (y - ay) / (by - ay)) found = !found;
-  });
-  return found;
-}
 
 /** The pin nearest to a pixel, within reach, or null. `places` are the pixels of the pins. */
 export function pinAt(places, pixel, touch = false, except = null) {
@@ -43,10 +27,7 @@ export function itemAt(outlines, places, pixel, touch = false, kinds = null) {
       if (Math.hypot(points[0][0] - pixel[0], points[0][1] - pixel[1]) <= Math.max(radius, reach)) return of;
       continue;
     }
-    const near = Math.max(reach, width / 2 + 2);
-    if (closed && inside(pixel, points)) return of;
-    const last = closed ? points.length : points.length - 1;
-    for (let i = 0; i < last; i++) if (distance(pixel, points[i], points[(i + 1) % points.length]) <= near) return of;
+    if (isNear(pixel, points, closed, Math.max(reach, width / 2 + 2))) return of;
   }
   return null;
 }

@@ -1,7 +1,7 @@
 // A picture behind the drawing, brought to scale by two of its points and their distance. It stays in the page: it is no part of the file.
 
 import {length, lengthName, tidy, lengthUnit} from "./units.js";
-import {make} from "./player/elements.js";
+import {button, make} from "./player/elements.js";
 
 const SHARE = 0.7;  // of the view that a new picture takes
 const OPACITY = 0.5;
@@ -15,7 +15,7 @@ export class Pictures {
   }
 
   show() {
-    const button = (words, title, action) => make("button", {type: "button", title, onclick: action}, words), has = Boolean(this.studio.picture);
+    const has = Boolean(this.studio.picture);
     this.element.replaceChildren(this.input, ...(has ? [
       button("scale", "bring the picture to scale: drag between two of its points", () => this.studio.setTool("scale")),
       button("no picture", "take the picture away", () => this.remove())] : [button("picture", "a picture behind the drawing", () => this.input.click())]));
