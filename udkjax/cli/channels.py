@@ -29,14 +29,14 @@ def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
 
 def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Sequence[Channel]") -> "Columns":
     """Return the values of channels over a motion."""
-    import jax
     import numpy as np
 
+    from udkjax.expressions.deferred import deferred
     from udkjax.study.channel_values import measure
 
     if not channels:
         return {}
-    values = np.asarray(jax.jit(lambda mech, motion: measure(mech, motion, channels))(mech, motion))
+    values = np.asarray(deferred(lambda mech, motion: measure(mech, motion, channels))(mech, motion))
     return {channel.name: (values[:, k], channel.units) for k, channel in enumerate(channels)}
 
 

@@ -8,10 +8,10 @@ from functools import wraps
 from inspect import signature
 from typing import ParamSpec, TypeVar
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.expressions.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
@@ -30,7 +30,7 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     Returns:
         A function with the same arguments and the same result.
     """
-    program, parameters = eqx.filter_jit(function), signature(function)
+    program, parameters = deferred(function), signature(function)
 
     @wraps(function)
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeVar, overload
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -15,6 +14,7 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
@@ -182,14 +182,14 @@ def efforts(
 # Functions of their own: what is compiled for one call serves the next.
 
 
-@eqx.filter_jit
+@deferred
 def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation, multipliers):
     equations, flat = equations_of(mechanism, method, baumgarte, formulation, analysis), (q.ravel(), v.ravel())
     a = equations.accelerations(t, *flat).reshape(q.shape)
     return (a, equations.multipliers(t, *flat)) if multipliers else a
 
 
-@eqx.filter_jit
+@deferred
 def _multipliers(mechanism, analysis, ts, q, v, method, baumgarte):
     equations, finite = equations_of(mechanism, method, baumgarte, analysis=analysis), jnp.isfinite(q) & jnp.isfinite(v)
     reached = jnp.all(finite, axis=(1, 2))
@@ -213,7 +213,7 @@ def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: StateHis
     return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity)
 
 
-@eqx.filter_jit
+@deferred
 def _evaluate(mechanism, analysis, ts, q, v, quantity):
     equations = equations_of(mechanism, SVD(), analysis=analysis)
     ts, q, v = jnp.asarray(ts), jnp.asarray(q).reshape(len(ts), -1), jnp.asarray(v).reshape(len(ts), -1)

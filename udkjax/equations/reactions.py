@@ -14,7 +14,6 @@ the others leave; what is still open among these alone is shared by the least no
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +28,7 @@ from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
@@ -220,7 +220,7 @@ def split_by_compliance(
     return w * (mu - P @ z)
 
 
-@eqx.filter_jit
+@deferred
 def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about):
     """-Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
     equations = prepare(mechanism, method, baumgarte, analysis)
@@ -236,7 +236,7 @@ def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about)
     return [list(loads.values()) for loads in found.values()]
 
 
-@eqx.filter_jit
+@deferred
 def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
     """Return whether equilibrium determines each component of `_loads`, by Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
 

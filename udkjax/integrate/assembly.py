@@ -13,7 +13,6 @@ one that all pseudoinverses share: gradients of the assembled state are right wh
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +27,7 @@ from udkjax.equations.position_closure import is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate import native_closing
 from udkjax.integrate.assembly_moves import moves_of_assembly
 from udkjax.integrate.causes.open_rows import explain_open
@@ -116,7 +116,7 @@ def close(
 
     Where all numbers are known the closure is, too, also while something else is traced.
     """
-    if is_traced((mechanism, t, state)):
+    if not mechanism.is_concrete or is_traced((t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
         close = _close if is_within_jit() else _close_compiled  # in which known numbers are traced, too
         return close(mechanism.without_origin.at(t), analysis, t, state)
@@ -159,7 +159,7 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | N
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales, closed)
 
 
-_close_compiled = eqx.filter_jit(_close)
+_close_compiled = deferred(_close)
 
 
 def require_closed(mechanism: Mechanism, closure: Closure, t: Scalar = 0.0, guess: State | None = None) -> None:

@@ -22,7 +22,7 @@ from udkjax.integrate.projection import Projection
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.checks import traced_numbers_hold
-from udkjax.scene.fields import number
+from udkjax.scene.fields import make_module, number
 
 if TYPE_CHECKING:
     import diffrax
@@ -128,7 +128,8 @@ def prepare_run(
     if scales is not None and xp is np:
         scales = compiled.textbook.scales  # as arrays of NumPy
     length, rate = _units(scales, ts, v, xp)
-    problem = Problem(
+    problem = make_module(
+        Problem,
         compiled=compiled,
         ts=ts,
         q=q,
@@ -136,11 +137,12 @@ def prepare_run(
         rtol=xp.where(runs, rtol, LOOSE_TOL),
         atol=xp.where(runs, xp.maximum(atol, LEAST_ATOL), LOOSE_TOL),
         smallest=SMALLEST_STEP * np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1])),
-        h=choices.dt0,  # pyright: ignore[reportArgumentType]
+        h=choices.dt0,
         length=length,
         rate=rate,
         max_steps=choices.max_steps,
         marks=mark_rows(compiled, ts[0], q, v, length, rate, xp),
+        points=None,
     )
     missed = xp.asarray(False)
     if closure is not None and compiled.plan.is_native:

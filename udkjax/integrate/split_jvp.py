@@ -18,6 +18,8 @@ from jax.extend.core import Literal, Primitive, new_jaxpr_eqn, no_effects, set_c
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array, PyTree
 
+from udkjax.expressions.numpy_program import expand_as
+
 Shapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its change
 Parts = Callable[..., tuple[list[Array], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
 
@@ -175,3 +177,4 @@ ad.primitive_jvps[along_p] = _derivative
 partial_eval.custom_partial_eval_rules[along_p] = _part
 partial_eval.partial_eval_jaxpr_custom_rules[along_p] = _checkpointed
 mlir.register_lowering(along_p, lambda ctx, *values, both: mlir.lower_fun(both.run)(ctx, *values))
+expand_as(along_p, lambda both: both.run)

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -21,7 +22,7 @@ from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import number
+from udkjax.scene.fields import is_within_jit, make_module, number
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -70,19 +71,20 @@ def step(
     values = dict(inputs or {})
     numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, state, values, numbers, analysis))):
-        return _advance(mechanism, analysis or analyse(mechanism), state, values, numbers, max_steps, engine)
+        analysis = analysis or analyse(mechanism)
+        if is_within_jit():
+            return _advance(mechanism, analysis, state, values, numbers, max_steps, engine)
+        values, numbers = ({name: number(x) for name, x in given.items()} for given in (values, numbers))
+        return _advance_at_once(mechanism.without_origin, analysis, state, values, numbers, max_steps, engine)
     parts = _parts(mechanism, analysis)
     run = _program(parts.form, max_steps, engine)
-    found = State.__new__(State)
     q, v = run(parts.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
-    object.__setattr__(found, "q", q)
-    object.__setattr__(found, "v", v)
     if not np.isfinite(np.asarray(q)).all():
         ts = np.asarray(t, float) + np.array([0.0, 1.0]) * np.asarray(dt, float)
         tolerances: Any = {"rtol": rtol, "atol": atol, "dt0": dt, "max_steps": max_steps}
         run = simulate(mechanism.with_parameters(values), ts, state, **tolerances, engine=engine)  # raises, with the cause
         return State(run.q[-1], run.v[-1])
-    return found
+    return make_module(State, q=q, v=v)
 
 
 def _advance(
@@ -105,6 +107,9 @@ def _advance(
     good = stop_gradients(run.is_usable & raw.reached[-1] & (jnp.max(raw.violation) <= DRIFT_PROJECTED))
     failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
+
+
+_advance_at_once = deferred(_advance)
 
 
 class MechanismParts(NamedTuple):

@@ -19,6 +19,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
 from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.expressions.numpy_program import evaluate_as
 from udkjax.native import machine
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INPUTS, OUTPUTS
@@ -154,8 +155,11 @@ def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
-    found = _select_code(inputs, operation)([np.asarray(x) for x in inputs], operation.shapes(inputs, times))
-    return [jnp.asarray(x) for x in found]
+    return jax.device_put(_evaluate(*map(np.asarray, inputs), operation=operation, times=times))
+
+
+def _evaluate(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
+    return _select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
 
 
 def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
@@ -210,3 +214,4 @@ native_p.def_impl(_call)
 native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
 mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
+evaluate_as(native_p, _evaluate)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from types import ModuleType
-from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict
+from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from udkjax.annotations import Numbers as Numbers
 # Of the largest of its kind: what a number that is zero in theory may be as it is computed, some hundred units of rounding.
 ROUNDING = 256 * float(np.finfo(float).eps)
 
+Module = TypeVar("Module")
 Table: TypeAlias = Mapping[str, object]  # {key: value} of one element, as in a scene file
 
 
@@ -48,6 +49,14 @@ def library_for(tree: Any) -> ModuleType:
 def stored(x: Any) -> Any:
     """Return an array of NumPy as one of JAX, which takes no program; any other as it is."""
     return jax.device_put(x) if isinstance(x, np.ndarray | np.generic) else x
+
+
+def make_module(cls: type[Module], **fields: Any) -> Module:
+    """Return an object of a class of data with all its fields, without what its constructor checks and converts."""
+    made = object.__new__(cls)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 def number(value: Numbers) -> Float[Array, "..."]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
 from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import NOT_EMPTY, POSITIVE, Number, given_number
+from udkjax.scene.fields import NOT_EMPTY, POSITIVE, Number, given_number, make_module
 from udkjax.scene.splines import spline_pieces
 
 
@@ -119,17 +119,10 @@ def rows_of(x: Sampled, xp: ModuleType) -> Any:
 def with_row(x: Sampled, row: Any) -> Any:
     """Return what stands for one interval, of a row of numbers; or of what stands for one: a mark, or None."""
     if isinstance(x, Spline):
-        return _make(SplinePiece, row=row)
-    return _make(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)
+        return make_module(SplinePiece, row=row)
+    return make_module(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)
 
 
 def row_at(x: Sampled, t: Any, xp: ModuleType) -> Any:
     """Return the row that holds at time t (s)."""
     return rows_of(x, xp)[xp.searchsorted(xp.asarray(x.breakpoints, float), t, side="right")]
-
-
-def _make(cls: type, **fields: Any) -> Any:
-    made = object.__new__(cls)
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made

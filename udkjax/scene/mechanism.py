@@ -18,10 +18,11 @@ from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, is_traced, number
+from udkjax.scene.fields import Numbers, is_traced, make_module, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.given_elements import attached_bodies, check_elements, complete, completion_mistakes, name_elements
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.number_fields import (
     groups_of,
@@ -237,7 +238,7 @@ class Mechanism(PrintsTable):
     @property
     def is_concrete(self) -> bool:
         """True if no number is traced."""
-        return not is_traced(self)
+        return _is_concrete(self)
 
     @property
     def numbers(self) -> list[Array]:
@@ -306,10 +307,7 @@ def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Ar
 
 def _copy(module: Module, changes: dict[str, object]) -> Module:
     """Return a module with other values in some fields, without checking anything."""
-    copy = object.__new__(type(module))
-    for field, value in (vars(module) | changes).items():
-        object.__setattr__(copy, field, value)
-    return copy
+    return make_module(type(module), **vars(module) | changes)
 
 
 def _unzip(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:
@@ -318,3 +316,8 @@ def _unzip(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple
 
 def _by_name(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[str, Element]:
     return MappingProxyType(dict(zip(names, elements, strict=True)))
+
+
+@cached_by_identity
+def _is_concrete(mechanism: Mechanism) -> bool:
+    return not is_traced(mechanism)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import State, close
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
@@ -53,7 +53,7 @@ def branches(
     return jnp.asarray(found[order])
 
 
-@eqx.filter_jit
+@deferred
 def _close(
     mechanism: Mechanism, analysis: Analysis, s: Float[Array, ""], guesses: Float[Array, "count bodies 3"]
 ) -> tuple[Array, Array]:

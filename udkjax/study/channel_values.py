@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.textbook import prepare
+from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame, Point, between
@@ -77,7 +78,7 @@ def path(
     return _path(mechanism.without_origin, analysis, *motion, given if derivative == 2 else None, local, body, derivative)
 
 
-@eqx.filter_jit
+@deferred
 def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
     motion, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), analysis)
     return jnp.where(reached[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from udkjax.equations.structure import ArrayLibrary
+from udkjax.expressions.deferred import deferred
 from udkjax.scene.fields import is_traced, is_within_jit
 
 State = TypeVar("State")
@@ -77,7 +78,7 @@ def _at(array: jax.Array, index: Any, value: Any) -> jax.Array:
     return array.at[index].set(value)
 
 
-@eqx.filter_jit
+@deferred
 def _compiled(function: Callable[..., Result], *given: Any) -> Result:
     return function(*given)
 

@@ -4,7 +4,6 @@ Everything comes from the textbook's functions (equations/constraints.py, loads.
 claim is checked beside it: the equations of motion, the constraints, Penrose's four conditions, and Gauss's principle.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
@@ -15,9 +14,11 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import left_null_space, uniqueness
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import State, assemble
 from udkjax.pinv import SVD
 from udkjax.scene.arguments import checked
+from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.explanation import Explanation, Gauss
 
@@ -51,7 +52,7 @@ def explain(
     state = assemble(mechanism, t, state)
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)
-    symbols = _symbols(mechanism.without_origin, analysis, float(t), q, v, stabilization, rank_tolerance(mechanism))
+    symbols = _symbols(mechanism.without_origin, analysis, number(t), q, v, stabilization, rank_tolerance(mechanism))
     s = {name: np.asarray(value) for name, value in symbols.items()}
     rank, null_rows = int(s.pop("rank")), s.pop("null_rows")
     return Explanation(
@@ -69,7 +70,7 @@ def explain(
     )
 
 
-@jax.jit
+@deferred
 def _symbols(
     mechanism: Mechanism, analysis: Analysis, t: Array, q: Array, v: Array, baumgarte: Baumgarte | None, tol: ArrayLike
 ) -> dict[str, Array]:

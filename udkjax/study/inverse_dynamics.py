@@ -27,6 +27,7 @@ from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.load_scale import load_sizes
 from udkjax.equations.scales import RANK_TOL
+from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.scene.arguments import checked
@@ -187,7 +188,7 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     return without_drivers(mechanism, forces)
 
 
-@eqx.filter_jit
+@deferred
 def _efforts(
     mechanism: Mechanism, analysis: Analysis, values: Sequence[Coordinate], w: Array, ts: Array, q: States, v: States, a: States
 ) -> tuple[Array, Array, Array]:

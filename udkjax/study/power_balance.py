@@ -10,7 +10,6 @@ The left side is the derivative of the energies along (v, a); the right one know
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from udkjax.equations.constraints import bodies
 from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import PrintedTable, format_number, prints_table, units
 from udkjax.scene.arguments import checked
@@ -114,7 +114,7 @@ def power_balance(
     )
 
 
-@eqx.filter_jit
+@deferred
 def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
     equations = prepare(mechanism, method, baumgarte, analysis)
 

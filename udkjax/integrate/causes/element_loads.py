@@ -1,7 +1,7 @@
 """Loads of single force elements at a state: one that is not a number, grows without bound, jumps, or is stiff."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from udkjax.equations.constraints import vector
 from udkjax.equations.structure import evaluate_by_kind
+from udkjax.expressions.deferred import deferred
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
@@ -57,7 +58,8 @@ def _evaluate(mechanism: Mechanism, ts: np.ndarray, qs: np.ndarray, vs: np.ndarr
         kinds[:] = [kind for kind, _ in found]
         return [x for _, x in found]
 
-    results = jax.jit(jax.vmap(at))(ts, qs.reshape(len(ts), -1, 3), vs.reshape(len(ts), -1, 3))
+    states: Any = ts, qs.reshape(len(ts), -1, 3), vs.reshape(len(ts), -1, 3)
+    results = deferred(jax.vmap(at))(*states)
     return list(zip(kinds, results, strict=True))
 
 

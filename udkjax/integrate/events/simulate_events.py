@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import Closure, State
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events
@@ -70,7 +70,7 @@ def simulate_events(
     """
     listed, phases = _prepare(mechanism, events, analysis)
     given = Given(phases, listed, ts, state, closure, choices, max_events)
-    found, reasons = _run(*eqx.partition(given, eqx.is_array))
+    found, reasons = _run(given)
     names = tuple(e.name for e in listed)
     if is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
@@ -104,10 +104,10 @@ def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents], analysis: A
     return found, phases_of(mechanism, found, analysis)
 
 
-@eqx.filter_jit
-def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
+@deferred
+def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     """Run, and return with the result why machine code does not serve each phase."""
-    phases, events, ts, state, closure, choices, max_events = eqx.combine(arrays, static)
+    phases, events, ts, state, closure, choices, max_events = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)
     problem, stabilization = run.problem, choices.stabilization
@@ -133,8 +133,8 @@ def _run(arrays: Given, static: Given) -> tuple[EventRun, tuple[str, ...]]:
         code = jnp.where(is_open, Result.initial_state_open, code)
     code = jnp.where(run.has_missed_rows, Result.drift, code)
     code = jnp.where(run.is_usable & stop_gradients(hybrid.has_usable_numbers), code, Result.invalid_argument)
-    given = RunInput(problem.ts, problem.q, problem.v, code, choices.drift_tol)
-    return run_events(hybrid, given, max_events), tuple(x.plan.why_not_native for x in compiled)
+    start = RunInput(problem.ts, problem.q, problem.v, code, choices.drift_tol)
+    return run_events(hybrid, start, max_events), tuple(x.plan.why_not_native for x in compiled)
 
 
 def _solution(
@@ -196,4 +196,4 @@ def _solution(
     )
 
 
-_compiled_solution = eqx.filter_jit(_solution)
+_compiled_solution = deferred(_solution)

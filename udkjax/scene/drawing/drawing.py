@@ -17,7 +17,7 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, Pin
 from udkjax.scene.drawing.mistakes import joint_names, where
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import Numbers, make_module, number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.given_elements import name_elements
 from udkjax.scene.joints import Joint, Revolute
@@ -164,10 +164,7 @@ class Drawing(AbstractDrawing):
 
     def _in(self, units: Mapping[str, str]) -> "Drawing":
         """Return the same drawing, to be written in other units."""
-        found = object.__new__(Drawing)
-        for field, value in (vars(self) | {"units": tuple(units.items())}).items():
-            object.__setattr__(found, field, value)
-        return found
+        return make_module(Drawing, **vars(self) | {"units": tuple(units.items())})
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""

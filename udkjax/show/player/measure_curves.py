@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.equations import Analysis, analyse, efforts, energy, reactions, singular_values, unique_reactions, violation
 from udkjax.equations.determinacy import STATIC_RANK_TOL
+from udkjax.expressions.deferred import deferred
 from udkjax.scene import GROUND, Mechanism
 from udkjax.study.accuracy import conserves_energy
 
@@ -87,7 +87,7 @@ def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
     return np.where(np.isfinite(values[:, 0]), count, np.nan)
 
 
-@eqx.filter_jit
+@deferred
 def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Float[Array, "T k"]:
     return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 

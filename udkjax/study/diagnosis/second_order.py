@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import constraints
+from udkjax.expressions.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
@@ -50,10 +51,10 @@ def quadratic_forms(mechanism: Mechanism, positions: RankedPositions, at: Config
     if not N.shape[1] or not V.shape[1]:
         return np.zeros((N.shape[1], V.shape[1], V.shape[1]))
     unit, weights = positions.unit[:, None] * V, N / positions.row_unit[:, None]
-    return np.asarray(_hessian(mechanism.without_origin, at.t, at.q, unit, weights))
+    return np.asarray(_hessian(mechanism.without_origin, np.asarray(at.t), at.q, unit, weights))
 
 
-@jax.jit
+@deferred
 def _hessian(mechanism, t, q, unit, weights):
     return jax.hessian(lambda x: weights.T @ constraints.psi(mechanism, t, q + unit @ x))(jnp.zeros(unit.shape[1]))
 

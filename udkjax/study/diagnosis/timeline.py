@@ -8,7 +8,6 @@ integrated anew from the output before, then of a quintic through q, v and a.
 from itertools import pairwise
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import singular_values
 from udkjax.equations.quantities import equations_of
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate import State, simulate
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD
@@ -162,12 +162,12 @@ def _quintic(s: np.ndarray, h: np.ndarray, one: list[np.ndarray], two: list[np.n
     return q + s * (h * v + s * (h**2 * a / 2 + s * (third + s * (fourth + s * fifth))))
 
 
-@eqx.filter_jit
+@deferred
 def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Array:
     return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
-@eqx.filter_jit
+@deferred
 def _accelerations(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike, v: ArrayLike) -> Array:
     equations = equations_of(mechanism, SVD(), analysis=analysis)
     return jax.vmap(equations.accelerations)(jnp.asarray(ts), jnp.asarray(q), jnp.asarray(v))

@@ -1,0 +1,123 @@
+"""Programs that are compiled when they have been called often: before that NumPy evaluates them (numpy_program.py).
+
+XLA takes some two milliseconds to compile an operation, NumPy two microseconds to evaluate it, and who asks for one derivative
+waits for the first alone. So a program is evaluated by NumPy until that has taken as many operations as compiling is worth; from
+then on XLA's program serves. Both agree to rounding.
+
+To JAX such a program is one operation, whose derivatives and batches are such programs again.
+"""
+
+from collections.abc import Callable, Hashable
+from functools import lru_cache, wraps
+from typing import Any, ParamSpec, TypeVar
+from weakref import WeakKeyDictionary
+
+import equinox as eqx
+import jax
+import jax.extend.core
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from udkjax.expressions.numpy_program import Meter, TooLongError, count_operations, numpy_program
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+WORTH = 700  # evaluations by NumPy, 2 to 3 us an operation, that take as long as compiling it, 2 ms
+MOST = 400_000  # operations that NumPy takes before any program is compiled: about a second
+_SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # of those, by program
+
+
+def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a function of trees of arrays and of static values, traced once for each structure as by `equinox.filter_jit`.
+
+    Where it is not within a program that is compiled as a whole, NumPy evaluates it and its derivatives and batches at first.
+    """
+    by_jit = eqx.filter_jit(function)
+    if deferred_p is None:
+        return by_jit
+
+    @wraps(function)
+    def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if jax.config.jax_disable_jit:
+            return function(*args, **kwargs)
+        dynamic, static = eqx.partition((args, kwargs), _is_array)
+        leaves, tree = jax.tree.flatten(dynamic)
+        fixed, fixed_tree = jax.tree.flatten(static)
+        types = tuple(jax.typeof(x) for x in leaves)
+        try:
+            program, out = _trace(function, tree, tuple(fixed), fixed_tree, types, jax.config.jax_enable_x64)
+        except _ClosesOverError:
+            return by_jit(*args, **kwargs)
+        found = deferred_p.bind(*leaves, call_jaxpr=program)
+        return eqx.combine(jax.tree.unflatten(out.tree, found), out.static)
+
+    return run
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array | np.ndarray | np.generic)
+
+
+class _ClosesOverError(Exception):
+    """A function among the arguments knows numbers that are traced: what is found for it serves no other call."""
+
+
+class _Out:
+    """The form of a result: the tree of its arrays, and all else."""
+
+    tree: Any
+    static: Any
+
+
+@lru_cache(maxsize=128)
+def _trace(
+    function: Callable[..., Any], tree: Any, fixed: tuple[Hashable, ...], fixed_tree: Any, types: tuple[Any, ...], x64: bool
+) -> tuple[Any, _Out]:
+    del x64  # a trace is of it
+    out = _Out()
+
+    def flat(*leaves: Array) -> list[Array]:
+        static = jax.tree.unflatten(fixed_tree, fixed)
+        args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
+        dynamic, out.static = eqx.partition(function(*args, **kwargs), _is_array)
+        found, out.tree = jax.tree.flatten(dynamic)
+        return found
+
+    shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types]
+    program = jax.jit(flat).trace(*shapes).jaxpr
+    if any(isinstance(x, Tracer) for x in program.consts):
+        raise _ClosesOverError
+    return program, out
+
+
+def _evaluate(*xs: Any, call_jaxpr: Any) -> list[Array]:
+    spent, limit = _SPENT.get(call_jaxpr, 0), _limit(call_jaxpr)
+    if spent < limit and not jax.config.jax_debug_nans:
+        meter = Meter(limit - spent)
+        try:
+            with np.errstate(all="ignore"):
+                found = numpy_program(call_jaxpr)(meter, [np.asarray(x) for x in xs])
+            return jax.device_put([np.asarray(x, a.dtype) for x, a in zip(found, call_jaxpr.out_avals, strict=True)])
+        except TooLongError:
+            pass
+        finally:
+            _SPENT[call_jaxpr] = spent + meter.count
+    return _compiled(call_jaxpr)(*xs)
+
+
+@lru_cache(maxsize=512)
+def _limit(program: Any) -> int:
+    return min(WORTH * count_operations(program), MOST)
+
+
+@lru_cache(maxsize=512)
+def _compiled(program: Any) -> Callable[..., list[Array]]:
+    return jax.jit(jax.extend.core.jaxpr_as_fun(program))
+
+
+_make = getattr(jax.extend.core, "create_call_primitive", None)  # of JAX 0.12 on
+deferred_p: Any = None if _make is None else _make("deferred_program")
+if deferred_p is not None:
+    deferred_p.def_impl(_evaluate)

@@ -1,0 +1,122 @@
+"""Indexing operations of JAX's programs by NumPy: slices, gathers and scatters."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.lax import GatherScatterMode
+
+
+def dynamic_slice(x: np.ndarray, *starts: Any, slice_sizes: Sequence[int]) -> np.ndarray:
+    """Return a slice of a known size, moved into the array where it would leave it."""
+    return x[_window(np.shape(x), starts, slice_sizes)]
+
+
+def dynamic_update_slice(x: np.ndarray, update: np.ndarray, *starts: Any) -> np.ndarray:
+    """Return an array with a slice replaced."""
+    found = np.array(x)
+    found[_window(found.shape, starts, np.shape(update))] = update
+    return found
+
+
+def _window(shape: Sequence[int], starts: Sequence[Any], sizes: Sequence[int]) -> tuple[slice, ...]:
+    clipped = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
+    return tuple(slice(s, s + size) for s, size in zip(clipped, sizes, strict=True))
+
+
+def gather(
+    x: np.ndarray,
+    indices: np.ndarray,
+    dimension_numbers: Any,
+    slice_sizes: Sequence[int],
+    mode: GatherScatterMode,
+    fill_value: Any = None,
+    **_: Any,
+) -> np.ndarray:
+    """Return slices of an array that begin at the given indices (XLA's operation Gather)."""
+    d = dimension_numbers
+    whole = (*d.collapsed_slice_dims, *d.operand_batching_dims)
+    batch, inside, places = _places(
+        np.shape(x), indices, d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims, whole, slice_sizes, mode
+    )
+    found = np.asarray(x)[places]
+    if inside is not None:
+        missing = np.nan if np.issubdtype(found.dtype, np.inexact) else np.iinfo(found.dtype).min if found.dtype != bool else True
+        if fill_value is not None:
+            missing = fill_value
+        found = np.where(inside.reshape(*inside.shape, *[1] * (found.ndim - inside.ndim)), found, missing).astype(found.dtype)
+    offsets = list(d.offset_dims)
+    return np.moveaxis(found, range(batch, found.ndim), offsets) if offsets else found
+
+
+def scatter(combine: Callable[[np.ndarray, Any, np.ndarray], None]) -> Callable[..., np.ndarray]:
+    """Return XLA's operation Scatter, which changes slices of an array; `combine(array, places, updates)` changes entries."""
+
+    def apply(
+        x: np.ndarray, indices: np.ndarray, updates: np.ndarray, dimension_numbers: Any, mode: GatherScatterMode, **_: Any
+    ) -> np.ndarray:
+        d, found, updates = dimension_numbers, np.array(x), np.asarray(updates)
+        whole = (*d.inserted_window_dims, *d.operand_batching_dims)
+        window = [size for k, size in enumerate(updates.shape) if k in d.update_window_dims]
+        rest = iter(window)
+        sizes = [1 if k in whole else next(rest) for k in range(found.ndim)]
+        batch, inside, places = _places(
+            found.shape,
+            indices,
+            d.scatter_dims_to_operand_dims,
+            d.operand_batching_dims,
+            d.scatter_indices_batching_dims,
+            whole,
+            sizes,
+            mode,
+        )
+        updates = np.moveaxis(updates, d.update_window_dims, range(batch, updates.ndim))
+        if inside is not None:
+            shape = updates.shape
+            places = tuple(np.broadcast_to(p, shape)[inside] for p in places)
+            updates = updates[inside]
+        combine(found, places, updates)
+        return found
+
+    return apply
+
+
+def _places(
+    shape: Sequence[int],
+    indices: np.ndarray,
+    index_map: Sequence[int],
+    batching: Sequence[int],
+    index_batching: Sequence[int],
+    whole: Sequence[int],
+    sizes: Sequence[int],
+    mode: GatherScatterMode,
+) -> tuple[int, np.ndarray | None, tuple[np.ndarray, ...]]:
+    """Return the number of batch dimensions, which slices lie inside (None: all), and the index of each entry in each dimension.
+
+    Entries have the batch dimensions of `indices` first, then those of the slices.
+    """
+    indices = np.asarray(indices)
+    batch_shape, batch = indices.shape[:-1], indices.ndim - 1
+    kept = [k for k in range(len(shape)) if k not in whole]
+    inside, places = None, []
+    for k, n in enumerate(shape):
+        start = np.zeros((), int)
+        if k in index_map:
+            start = indices[..., list(index_map).index(k)].astype(int)
+            last = n - sizes[k]
+            if mode == GatherScatterMode.FILL_OR_DROP:
+                fits = (start >= 0) & (start <= last)
+                inside = fits if inside is None else inside & fits
+            start = np.clip(start, 0, max(last, 0))
+        elif k in batching:
+            axis = index_batching[list(batching).index(k)]
+            start = np.arange(n).reshape([-1 if j == axis else 1 for j in range(batch)])
+        start = start.reshape(*start.shape, *[1] * len(kept)) if start.ndim else start
+        if k in kept:
+            start = start + np.arange(sizes[k]).reshape([-1 if j == k else 1 for j in kept])
+        places.append(start)
+    full = (*batch_shape, *(sizes[k] for k in kept))
+    if not places:
+        return batch, None, ()
+    places[0] = np.broadcast_to(places[0], full)
+    return batch, None if inside is None or inside.all() else inside, tuple(places)
