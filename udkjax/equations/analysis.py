@@ -113,7 +113,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
     Returns:
         The `Analysis`; `rank` and `redundant_rows` are None where they are not known.
     """
-    if is_traced(mechanism):
+    if not mechanism.is_concrete:
         if mechanism.origin is not None:
             return analyse(mechanism.origin.mechanism)
         mechanism = mechanism.without_origin

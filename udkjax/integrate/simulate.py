@@ -141,7 +141,7 @@ def simulate(
         engine=engine,
     )
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
-    is_known = isinstance(mechanism, Mechanism) and not is_traced(mechanism)
+    is_known = isinstance(mechanism, Mechanism) and mechanism.is_concrete
     if isinstance(mechanism, Mechanism):
         start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
         if analysis is None:
@@ -179,7 +179,7 @@ def simulate(
 
 def _has_failed(solution: Solution) -> bool:
     """Return whether a single run, of known numbers, has not reached its end."""
-    return not isinstance(solution.code, Tracer) and bool(solution.result)
+    return not isinstance(solution.code, Tracer) and not solution.result.is_success
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
