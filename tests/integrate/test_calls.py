@@ -47,7 +47,7 @@ def test_few_functions_stand_between_a_call_and_machine_code():
     mechanism = udk.library.parallelogram()
     udk.simulate(mechanism, TS)
     seen = called(lambda: udk.simulate(mechanism, TS))
-    assert len(seen) <= 48
+    assert len(seen) <= 51
     assert len({file for file, _ in seen}) <= 19
 
 
@@ -93,7 +93,9 @@ def test_a_first_event_and_its_derivative_take_few_programs(compilations):
 
     def time(mass):
         changed = mechanism.with_parameters({"body.b0.mass": mass})
-        return udk.simulate(changed, ts, events=lowest, max_events=1).events.time[0]
+        events = udk.simulate(changed, ts, events=lowest, max_events=1).events
+        assert events is not None
+        return events.time[0]
 
     assert len([seconds for seconds in compilations(lambda: time(1.5)) if seconds]) <= 4
     assert len([seconds for seconds in compilations(lambda: jax.grad(time)(1.5)) if seconds]) <= 16
