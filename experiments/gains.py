@@ -15,14 +15,17 @@ stay below a hundred times the tolerance; at equal error gains of 1000, and the 
 times the right-hand sides.
 """
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 import xarray
 from matplotlib.figure import Figure
 
 import udkjax as udk
-from experiments.common import described, panels, tracked
+from experiments.common import described, panels
 from experiments.parts.drift_law import linkage, scalar_law
-from experiments.parts.linkage import OUTPUTS, errors, parallelogram, start
+from experiments.parts.linkage import OUTPUTS, exact, parallelogram, start
 from experiments.parts.tuning import ABSOLUTE_RANK_TOL
 from udkjax.show.style import COLOURS
 
@@ -41,14 +44,23 @@ def study(smoke: bool) -> xarray.Dataset:
     gains = ((0.0, 0.0), (REFERENCE, REFERENCE), PAPER) if smoke else (*((a, a) for a in EQUAL), PAPER)
     starts, tolerances = (STARTS[:1], TOLERANCES[:3:2]) if smoke else (STARTS, TOLERANCES)
     mech, ts = parallelogram(), np.linspace(0.0, END, OUTPUTS)
-    shape = (len(starts), len(tolerances), len(gains))
-    found = {name: np.full(shape, np.nan) for name in ("error", "drift", "right_hand_sides")}
-    for case in tracked(np.ndindex(shape), "gains"):
-        state, tol, pair = start(starts[case[0]]), tolerances[case[1]], gains[case[2]]
-        sol = udk.simulate(mech, ts, state, tol, tol, udk.SVD.absolute(ABSOLUTE_RANK_TOL), udk.Baumgarte(*pair), drift_tol=np.inf)
-        found["error"][case] = errors(ts, sol.q, state).max()
-        found["drift"][case] = np.abs(udk.violation(mech, sol)).max()
-        found["right_hand_sides"][case] = sol.stats["right_hand_sides"]
+    states = [start(degrees) for degrees in starts]
+    right = jnp.asarray(np.stack([exact(ts, state) for state in states]))
+
+    def run(mechanism: udk.Mechanism, solution: Any) -> dict[str, Any]:
+        own = right[jnp.argmin(jnp.abs(right[:, 0] - solution.q[0]).max((1, 2)))]
+        error = jnp.where(solution.code == udk.Result.successful, jnp.abs(solution.q - own).max(), jnp.inf)
+        return {"error": error, "drift": jnp.abs(udk.violation(mechanism, solution)).max()}
+
+    axes = {
+        "start": udk.Axis(states, of="state"),
+        "tol": udk.Axis(tolerances, of=("rtol", "atol")),
+        "gains": udk.Zipped({name: [pair[k] for pair in gains] for k, name in enumerate(("alpha", "beta"))}),
+    }
+    method = udk.SVD.absolute(ABSOLUTE_RANK_TOL)
+    runs = udk.sweep(mech, axes, ts, [run, "counts"], method=method, drift_tol=np.inf, progress=False)
+    names = {"error": "run_error", "drift": "run_drift", "right_hand_sides": "right_hand_sides"}
+    found = {name: runs[of].transpose("start", "tol", "gains").values for name, of in names.items()}
     exponents = [[exponent(degrees, *pair) for pair in gains] for degrees in starts]
     dims = ("start", "tol", "gains")
     data = xarray.Dataset(
