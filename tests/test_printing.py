@@ -58,7 +58,7 @@ def objects() -> dict[str, object]:
         *(free, mech, *mech.bodies.values(), *JOINTS.values(), *DRIVERS.values(), *FORCES.values()),
         *(run, run.events, udk.assemble(free), udk.check(free), udk.analyse(free), udk.energy(free, run)),
         *(motion, udk.travel(linkage, "joint.C.angle"), rest, udk.modes(free, rest.state), driven, udk.power_balance(free, run)),
-        *(udk.diagnose(free), udk.explain(free), _workspace()),
+        *(udk.diagnose(free), udk.explain(free), udk.Workspace(jnp.ones((2, 2, 2)), jnp.ones((2, 2), bool))),
         *(udk.Baumgarte(), udk.Projection(), udk.Coordinate(("ground", "a")), udk.Event(anything, udk.Stop())),
         *(udk.JointLimit("a", 0.1), udk.Contact("a"), udk.Impact(0.5), udk.Release("a"), udk.Lock("a")),
         *(udk.Attach(JOINTS["weld"], "a"), udk.Start(), udk.Parameter("body.a.mass"), udk.Quantity("x", anything)),
@@ -79,11 +79,6 @@ def objects() -> dict[str, object]:
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
     return {type(one).__name__: one for one in found}
-
-
-def _workspace() -> object:
-    mech = udk.library.double_pendulum()
-    return udk.workspace(mech, {f"body.{name}.angle": np.array([0.1, 0.2]) for name in mech.body_names}, mech.body_names[0])
 
 
 ELSEWHERE = {
