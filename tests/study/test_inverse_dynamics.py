@@ -79,18 +79,19 @@ def test_efforts_are_what_the_drivers_reactions_say(name):
 
 
 def test_derivatives_of_a_torque_are_those_of_its_closed_form():
-    """(I + m r^2) theta'' + m g r cos(theta) of a driven pendulum, by the mass and the arm."""
-    mech = udk.library.driven_pendulum()
+    """(I + m r^2) theta'' + m g r cos(theta) of a driven pendulum on its motion, by the mass and by gravity."""
+    mech, ts = udk.library.driven_pendulum(), np.array([0.2])
+    motion = udk.inverse_dynamics(mech, ts).motion
 
     def torque(x):
-        changed = mech.with_parameters({"body.rod.mass": x[0], "joint.pin.points[1][0]": -x[1]})
-        return udk.inverse_dynamics(changed, jnp.array([0.2])).efforts["motor"][0]
+        changed = mech.with_parameters({"body.rod.mass": x[0], "gravity": jnp.stack([0.0, -x[1]])})
+        return udk.inverse_dynamics(changed, ts, motion).efforts["motor"][0]
 
     def exact(x):
-        theta, curvature = 0.8 * jnp.sin(0.6), -0.8 * 9.0 * jnp.sin(0.6)
-        return (1.0 / 12.0 + x[0] * x[1] ** 2) * curvature + x[0] * 9.81 * x[1] * jnp.cos(theta)
+        theta, curvature, r = 0.8 * jnp.sin(0.6), -0.8 * 9.0 * jnp.sin(0.6), 0.5
+        return (1.0 / 12.0 + x[0] * r**2) * curvature + x[0] * x[1] * r * jnp.cos(theta)
 
-    x = jnp.array([1.0, 0.5])
+    x = jnp.array([1.0, 9.81])
     found, expected = (jax.jit(jax.value_and_grad(f))(x) for f in (torque, exact))
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10)

@@ -316,6 +316,7 @@ DIFFERENTIATED = {
 @pytest.mark.parametrize("name", fast(["hung rod"], DIFFERENTIATED))
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_derivatives_of_positions_by_numbers_of_the_scene(name, order):
+    """Those of a batch, against differences of its members."""
     make, number, driver, values, body = DIFFERENTIATED[name]
     mech = make()
 
@@ -323,15 +324,14 @@ def test_derivatives_of_positions_by_numbers_of_the_scene(name, order):
         found = udk.kinematics(mech.with_parameters({number: g}), driver, values)
         return jnp.stack([found.q[1, body, 2], found.v[1, body, 2], found.a[1, body, 2]])
 
-    def reverse_and_value(f):
-        return jax.jit(jax.jacrev(lambda g: (f(g),) * 2, has_aux=True))
-
-    evaluate, h = reverse_and_value(f if order == 1 else lambda g: jax.jvp(f, (g,), (1.0,))[1]), 1e-5
+    g, h = f if order == 1 else lambda g: jax.jvp(f, (g,), (1.0,))[1], 1e-5
+    members = jax.jit(jax.vmap(jax.jacrev(lambda x: (g(x),) * 2, has_aux=True)))
     with jax.debug_nans(True):
-        (slope, _), (_, ahead), (_, behind) = (evaluate(g) for g in (1.0, 1.0 + h, 1.0 - h))
+        (slope, *_), (_, ahead, behind) = members(jnp.array([1.0, 1.0 + h, 1.0 - h]))
     np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), atol=1e-8 if order == 1 else 1e-7)
 
 
+@pytest.mark.slow  # in the fast tests: derivatives of a batch, and codes of traced numbers
 def test_a_batch_has_a_code_for_each_member():
     a, b, c, g = STUCK
     mech = udk.library.four_bar(np.pi / 3, lengths=(a, b, c), ground=g)
