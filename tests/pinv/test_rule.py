@@ -1,7 +1,5 @@
 """The one derivative rule: against differences along directions of constant rank, in every mode, to second order and beyond."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,6 @@ import pytest
 from tests.pinv.methods import entries
 from udkjax.pinv import SVD, Plus, Pseudoinverse, Varga
 
-compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # each program runs a few times only
 rng = np.random.default_rng(7)
 SIZE = 12
 NAMES = ["fivebar_J_c3_5_s4_5", "fivebar_J_collinear", "proj12_rank11", "magic8", "redundant_rows"]
@@ -87,7 +84,7 @@ def derivatives(method):
         lambda a: jax.jacrev(jax.jacrev(x, 1), 1)(a, jnp.zeros(2)),
         jax.grad(lambda a: jnp.sum(WEIGHTS * method(a))),
     ]
-    return compiled(jax.vmap(lambda a: [f(a) for f in functions]))
+    return jax.jit(jax.vmap(lambda a: [f(a) for f in functions]))
 
 
 @pytest.fixture(scope="session")
@@ -100,7 +97,7 @@ CHOSEN = "SVD", "Varga", "Greville", "Elimination", "Auto"  # the others solve a
 
 @pytest.mark.parametrize("entry", entries(*CHOSEN), indirect=True)
 def test_derivatives(entry, matrices, reference):
-    value = compiled(jax.vmap(solution(make(entry)), (0, None)))
+    value = jax.jit(jax.vmap(solution(make(entry)), (0, None)))
     first, second = differences(lambda p: value(matrices, p), 2e-2)
     actual = derivatives(make(entry))(matrices)
     close(actual[0], first, 1e-6)
@@ -120,14 +117,14 @@ def test_forward_and_reverse_are_transposes(matrices):
         ct_a, ct_b = jax.vjp(f, a, B)[1](ct)
         return ct @ dx, jnp.sum(ct_a * da) + ct_b @ db
 
-    u, v = compiled(jax.vmap(product, (0, None, None, None)))(matrices, LEFT[0], DB[0], DB[1])
+    u, v = jax.jit(jax.vmap(product, (0, None, None, None)))(matrices, LEFT[0], DB[0], DB[1])
     np.testing.assert_allclose(u, v, rtol=1e-10)
 
 
 def test_second_derivatives_in_every_mode(matrices):
     x = solution(Varga(1e-9))
     modes = [(outer, inner) for outer in (jax.jacfwd, jax.jacrev) for inner in (jax.jacfwd, jax.jacrev)]
-    hessians = compiled(lambda a: [outer(inner(x, 1), 1)(a, jnp.zeros(2)) for outer, inner in modes])(matrices[0])
+    hessians = jax.jit(lambda a: [outer(inner(x, 1), 1)(a, jnp.zeros(2)) for outer, inner in modes])(matrices[0])
     for hessian in hessians[1:]:
         close(hessian[None], hessians[0][None], 1e-11)
 
@@ -143,7 +140,7 @@ def test_third_derivative():
 
     s = 0.3
     expected = v * (np.sin(s) - 2 * np.cos(s))
-    np.testing.assert_allclose(compiled(jax.jacrev(jax.jacfwd(jax.jacrev(f))))(s), expected, atol=1e-13)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(jax.jacfwd(jax.jacrev(f))))(s), expected, atol=1e-13)
 
 
 def test_no_factorization_is_differentiated_or_repeated():
@@ -177,7 +174,7 @@ def test_transforms_compose():
             carry, total = x.sum(), total + jnp.sum(x**2)
         return total
 
-    np.testing.assert_allclose(compiled(jax.grad(scanned))(a), compiled(jax.grad(looped))(a), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.grad(scanned))(a), jax.jit(jax.grad(looped))(a), rtol=1e-9, atol=1e-9)
 
 
 class Scaled(eqx.Module):
@@ -229,7 +226,7 @@ def test_the_rule_serves_any_operator():
         return SVD(1e-9).solve(jnp.zeros((3, 4)).at[jnp.arange(3), where].set(free * d), b).x
 
     for derivative in (jax.jacfwd, lambda f: jax.jacrev(jax.jacrev(f))):
-        np.testing.assert_allclose(compiled(derivative(sparse))(d, b), compiled(derivative(dense))(d, b), atol=1e-12)
+        np.testing.assert_allclose(jax.jit(derivative(sparse))(d, b), jax.jit(derivative(dense))(d, b), atol=1e-12)
     assert isinstance(ForScaled().plus(Scaled(d, where)), Plus)
     np.testing.assert_allclose(ForScaled()(Scaled(d, where)) @ b, sparse(d, b))
 
@@ -240,5 +237,5 @@ def test_a_vector_that_a_batch_shares():
     size = lambda a, b: jnp.sum(method.solve(a, b).x ** 2)  # noqa: E731
     total = lambda b: jnp.sum(jax.vmap(jax.vmap(size, (0, None)), (0, None))(many, b))  # noqa: E731
     each = jax.vmap(jax.grad(size, 1), (0, None))
-    found, slopes = compiled(lambda b: (jax.grad(total)(b), each(many.reshape(6, 4, 5), b)))(b)
+    found, slopes = jax.jit(lambda b: (jax.grad(total)(b), each(many.reshape(6, 4, 5), b)))(b)
     np.testing.assert_allclose(found, slopes.sum(0), rtol=1e-12)

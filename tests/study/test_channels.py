@@ -2,7 +2,6 @@
 
 import pickle
 import re
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +14,6 @@ import udkjax as udk
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import Quantity, channel_of, channels_of
 
-compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # each runs a few times only
 OMEGA, STEP = 4.0, 1e-3
 TIMES = 0.3 + STEP * np.arange(-6, 7)
 POINTS = ["body.rod(0.3, -0.2)." + q for q in ("x", "y", "vx", "vy", "ax", "ay")]
@@ -52,7 +50,7 @@ def crank():
     motion = Motion(jnp.asarray(TIMES), *jax.jit(jax.vmap(state))(TIMES))
     spin = Quantity("spin", lambda mech, solution: mech.bodies["rod"].inertia * solution.v[:, 1, 2], "N m s")
     channels = (*(channel_of(mech, text) for text in [*channels_of(mech), *POINTS, *LOADS, *DISTANCES]), spin)
-    program = compiled(lambda mech, motion: measure(mech, motion, channels))
+    program = jax.jit(lambda mech, motion: measure(mech, motion, channels))
     values = np.asarray(program(mech, motion)).T
     return Measured(mech, motion, channels, dict(zip([c.name for c in channels], values, strict=True)), program)
 
@@ -219,7 +217,7 @@ def linkage():
         y, forward = along(jnp.eye(5))
         return y[0], forward[0], forward[1]
 
-    return mech, channels, compiled(both)
+    return mech, channels, jax.jit(both)
 
 
 def test_derivatives_hold_where_constraints_are_redundant(linkage):

@@ -26,23 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 WRITTEN_OUT_OPERATIONS = 2800
 
 # The arrays that programs return; all others are scratch.
-RESULTS = (
-    "a",
-    "q1",
-    "v1",
-    "dq1",
-    "dv1",
-    "psi",
-    "psi_dot",
-    "terms",
-    "rank",
-    "distance",
-    "safe",
-    "pieces",
-    "root",
-    "energy",
-    "independent",
-)
+RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent".split())
 
 
 class ScenePrograms:

@@ -92,8 +92,7 @@ class Revolute(Joint):
     points: Float[Array, "2 2"] = eqx.field(converter=given_number)
 
     def residual(self, t, *frames):
-        one, two = frames
-        gap = between(self.points, one, two)
+        gap = between(self.points, *frames)
         return [gap.x, gap.y]
 
 
@@ -174,8 +173,7 @@ class Distance(Joint):
     length: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None, metadata=POSITIVE)
 
     def residual(self, t, *frames):
-        one, two = frames
-        d = between(self.points, one, two)
+        d = between(self.points, *frames)
         return [0.5 * (d.dot(d) / self.length - self.length)]
 
     def complete(self, *frames):
