@@ -57,7 +57,7 @@ class IdentifyOptions:
         return [record.with_start(Start(estimate=start)) for record in found]
 
     def profiled(self, groups: Groups) -> list[str]:
-        """The names of parameters, as the estimate has them, that are called by all of their names or one of them."""
+        """Return the names of parameters, as the estimate has them, that are called by all of their names or one of them."""
         known = {_plain(part): name for name in self.names for part in (name, *name.split("="))}
         given = [text for group in groups for text in group]
         if self.names:
@@ -69,7 +69,7 @@ class IdentifyOptions:
         return list(dict.fromkeys(known[_plain(text)] for text in given if _plain(text) in known))
 
     def _noise(self, groups: Groups) -> tuple[float | None, dict[str, float]]:
-        """The standard deviation of all channels, and of those that have one of their own."""
+        """Return the standard deviation of all channels, and of those that have one of their own."""
         everywhere, by_channel = None, {}
         for text in (text for group in groups for text in group):
             channel, _, number = text.rpartition("=")

@@ -108,7 +108,7 @@ def kinematics(
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:
-    """The value given; else the limit, a little within; else another."""
+    """Return the value given; else the limit, a little within; else another."""
     if given is not None:
         return given
     return limit if math.isfinite(limit) else otherwise

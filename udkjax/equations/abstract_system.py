@@ -64,20 +64,20 @@ class AbstractSystem(eqx.Module):
         """True if there are any constraints."""
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """The largest of a change of coordinates, in units of the system's own. By default these are one."""
+        """Return the largest of a change of coordinates, in units of the system's own. By default these are one."""
         return jnp.max(jnp.abs(dq), initial=0.0)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
-        """The largest violation of any row of Psi, in units of the system's own. By default these are one."""
+        """Return the largest violation of any row of Psi, in units of the system's own. By default these are one."""
         return jnp.max(jnp.abs(psi), initial=0.0)
 
     @abstractmethod
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
-        """The accelerations a."""
+        """Return the accelerations a."""
 
     @abstractmethod
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
-        """The multipliers lambda of all rows, of minimum norm."""
+        """Return the multipliers lambda of all rows, of minimum norm."""
 
     @abstractmethod
     def matrices(
@@ -90,7 +90,7 @@ class AbstractSystem(eqx.Module):
         """q and v returned to the constraint manifold."""
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """The part of small changes of q and v that a projection at q does not remove. By default all of it."""
+        """Return the part of small changes of q and v that a projection at q does not remove. By default all of it."""
         return TangentPart(dq, dv)
 
     @abstractmethod
@@ -104,11 +104,11 @@ class AbstractSystem(eqx.Module):
     # For formulations that integrate some coordinates alone. By default all of them are integrated.
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """The rates of q and of v that an integrator integrates."""
+        """Return the rates of q and of v that an integrator integrates."""
         return v, self.accelerations(t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> Self:
-        """The same system with the partition of this state, which is fixed until the end of a step."""
+        """Return the same system with the partition of this state, which is fixed until the end of a step."""
         return self
 
     @property
@@ -123,11 +123,11 @@ class MechanismSystem(AbstractSystem):
     scales: eqx.AbstractVar[Scales]
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """The largest of a change of coordinates: lengths over the characteristic length, angles in rad."""
+        """Return the largest of a change of coordinates: lengths over the characteristic length, angles in rad."""
         return self.scales.size(dq)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
-        """The largest violation of any row of Psi, each over the row's scale."""
+        """Return the largest violation of any row of Psi, each over the row's scale."""
         return self.scales.violation(psi)
 
     @property

@@ -165,7 +165,7 @@ def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
 
 
 def _rows_of_known_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """The redundant rows of a mechanism whose masses or loads are traced; None where its geometry is, too."""
+    """Return the redundant rows of a mechanism whose masses or loads are traced; None where its geometry is, too."""
     with jax.ensure_compile_time_eval():
         if is_traced(_geometry(mechanism)):
             return None

@@ -113,7 +113,7 @@ class BlockElimination:
         return self.terms.single_round("safe", write)
 
     def distance(self) -> KernelLoop:
-        """The distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
+        """Return the distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
 
         def write(w: KernelWriter):
             w.write(w.graph.constant(1.0) / w.graph.sqrt(w.read("nearness", None)), "distance", None)
@@ -176,7 +176,7 @@ class BlockElimination:
         return KernelLoop(self.terms.kernel(("diagonal", group), write), table)
 
     def _off_diagonal_blocks(self) -> list[KernelLoop]:
-        """The share of each body in the block of each pair of constraints that hold it, one loop for pairs that are alike."""
+        """Return the shares of bodies in the blocks of pairs of constraints that hold them, a loop for pairs that are alike."""
         holders: dict[int, list[tuple[int, int]]] = {}  # of each body: blocks, and which of their bodies it is
         for block, (group, i) in enumerate(self._elements):
             for slot, body in enumerate(group.bodies[:, i].tolist()):
@@ -205,7 +205,7 @@ class BlockElimination:
         return self.terms.kernel(key, write)
 
     def _front_table(self, e: Fronts) -> np.ndarray:
-        """The table of fronts of the same sizes.
+        """Return the table of fronts of the same sizes.
 
         Its columns: where the block's factors and its right-hand side begin; of each later block that it meets, the block of both
         and its right-hand side; then the lower triangle of the blocks of those, row by row.
@@ -222,7 +222,7 @@ class BlockElimination:
 
 
 def _scaled(w: KernelWriter, row: list[Scalar], base: Callable[[int], int]) -> list[Scalar]:
-    """A row of Psi_q times M^(-1); `base` is the column of the table for a body's constants."""
+    """Return a row of Psi_q times M^(-1); `base` is the column of the table for a body's constants."""
     return [s * compliance(w, k % 3, base(k // 3)) for k, s in enumerate(row)]
 
 

@@ -92,7 +92,7 @@ def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array
 
 
 def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
-    """The constraint that each row of Psi belongs to, and its number within it."""
+    """Return the constraint that each row of Psi belongs to, and its number within it."""
     names, constraints = list(mechanism.constraints), [*mechanism.constraints.values()]
     residual = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
     rows = jax.eval_shape(lambda: [rows for _, rows in evaluate_by_kind(residual, mechanism, constraints, bodies(mechanism.q0))])
@@ -120,7 +120,7 @@ def bodies(state: State) -> Float[Array, "bodies 3"]:
 
 
 def vector(values: ArrayLike | Sequence[Number]) -> Float[Array, "n"]:
-    """A number, a list of numbers or an array as a vector of floats."""
+    """Return a number, a list of numbers or an array as a vector of floats."""
     if isinstance(values, list | tuple):
         return jnp.asarray(numbers_as_vector(values), jnp.result_type(float))
     return jnp.ravel(jnp.asarray(values, jnp.result_type(float)))

@@ -139,7 +139,7 @@ class DensePosition(NamedTuple):
         return float(self.sigma[self.rank - 1] / self.sigma[0])
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
-        """The part of a displacement that the constraints allow."""
+        """Return the part of a displacement that the constraints allow."""
         free = self.vt[self.rank :]
         return free.T @ (free @ heading)
 

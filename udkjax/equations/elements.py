@@ -27,7 +27,7 @@ Reader = Callable[..., list[np.ndarray]]  # of a traced function into a graph (`
 
 
 def as_scalar(array: NumericArray) -> Scalar:
-    """The scalar that an array of shape () holds."""
+    """Return the scalar that an array of shape () holds."""
     return np.asarray(array, object).item()
 
 

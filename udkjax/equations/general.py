@@ -58,7 +58,7 @@ class GeneralEquations(AbstractSystem):
         return jnp.zeros(0) if plus is None else -(plus.T @ (plus @ b))
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Two Newton steps in position and two in velocity, where phi need not be linear."""
+        """Take two Newton steps in position and two in velocity, where phi need not be linear."""
         for _ in range(2 if self.system.constraint is not None else 0):
             plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
             q = q - weight(plus @ self._psi(t, q))
@@ -94,7 +94,7 @@ class GeneralEquations(AbstractSystem):
         return mass, force, *self._rows(t, q, v)
 
     def _rows(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
-        """A and c of A a = c."""
+        """Return A and c of A a = c."""
         rate = lambda t, q: self._psi_dot(t, q, v)  # noqa: E731
         gamma = -jax.jvp(rate, (t, q), (jnp.ones_like(t), v))[1]
         bend = jax.jvp(lambda t, q: self._phi(t, q, v), (t, q), (jnp.ones_like(t), v))[1]

@@ -20,7 +20,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 def mass(mechanism: Mechanism) -> Float[Array, "n"]:
-    """The diagonal of M. Origins are centres of mass, so M is diagonal and constant.
+    """Return the diagonal of M. Origins are centres of mass, so M is diagonal and constant.
 
     Args:
         mechanism: The scene.
@@ -80,7 +80,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> 
 
 @traced_once
 def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
-    """The sum of the loads that force elements return by their method `loads`, without those of potentials."""
+    """Return the sum of the loads that force elements return by their method `loads`, without those of potentials."""
 
     time = jnp.asarray(t, jnp.result_type(float))
 

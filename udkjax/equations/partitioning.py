@@ -84,7 +84,7 @@ class PartitionedSystem(WrappedSystem):
         return _solve_dependent(self.fix_partition(t, q, v), t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> "PartitionedSystem":
-        """The same equations with the partition that pivoting chooses at this state."""
+        """Return the same equations with the partition that pivoting chooses at this state."""
         if self.dependent is not None:
             return self
         D = self.equations.weighted_rows(t, q)[0]

@@ -63,7 +63,7 @@ def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: 
 
 
 def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """A Gauss-Newton step, shortened so that no coordinate changes by more than `LONGEST_STEP`."""
+    """Return a Gauss-Newton step, shortened so that no coordinate changes by more than `LONGEST_STEP`."""
     step = rows.correction(t, q)
     longest = rows.scales.size(step, xp)
     return step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
@@ -123,7 +123,7 @@ def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
 
 
 def driver_time_step(scales: Scales) -> float:
-    """The time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
+    """Return the time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
     return LONGEST_STEP / float(scales.rate) if scales.rate > 0.0 else 0.0
 
 

@@ -123,7 +123,7 @@ class PositionPrograms:
         return [x for value, slope in zip(values, slopes, strict=True) for x in (value, *slope)]
 
     def _slopes(self) -> list[list[Scalar]]:
-        """The derivatives of all measures by s and x: by as many solutions as there are measures, or as there are numbers."""
+        """Return the derivatives of measures by s and x: by as many solutions as there are measures, or as there are numbers."""
         graph, moved = self._graph, [self._s, *self._x]
         differential = Differential(graph, self._measures, [*moved, *self._q])
         zero = graph.constant(0.0)
@@ -140,7 +140,7 @@ class PositionPrograms:
         return [[a + b for a, b in zip(row, part, strict=False)] for row, part in zip(partial, along, strict=True)]
 
     def _column(self, variable: Scalar) -> list[Scalar]:
-        """The derivatives of Psi by one number."""
+        """Return the derivatives of Psi by one number."""
         zero = self._graph.constant(0.0)
         return [self._differential.row(r).get(variable.index, zero) for r in self._psi]
 
@@ -149,7 +149,7 @@ class PositionPrograms:
         return len(self._factors.block) == len(self._factors.open_columns)
 
     def _violation(self) -> Scalar:
-        """The sum of the squares of Psi, each row over its scale; zero where no row is redundant: then steps say it all."""
+        """Return the sum of squares of Psi, each row over its scale; zero where no row is redundant: then steps say it all."""
         zero = self._graph.constant(0.0)
         if self._is_square:
             return zero
@@ -157,7 +157,7 @@ class PositionPrograms:
         return _dot(rows, rows, zero)
 
     def _sign(self) -> Scalar:
-        """The determinant of B where it is square: what changes its sign where branches meet; one otherwise."""
+        """Return the determinant of B where it is square: what changes its sign where branches meet; one otherwise."""
         R, found = self._factors.triangle, self._graph.constant(1.0)
         if not self._is_square:
             return found

@@ -150,7 +150,7 @@ def _split_by_body(
 
 
 def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Number) -> Float[Array, "... 3"]:
-    """A load about a centre of mass, in ground axes, about another point and in axes at an `angle` (rad) to these."""
+    """Return a load about a centre of mass, in ground axes, about another point and in axes at an `angle` (rad) to these."""
     fx, fy, torque = load[..., 0], load[..., 1], load[..., 2]
     if point is not None:
         torque = torque - (point.x - body.x) * fy + (point.y - body.y) * fx
@@ -164,7 +164,7 @@ def _frame(q: Float[Array, "T n"], place: int) -> Frame:
 
 
 def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
-    """The angle (rad) of a joint's own axes to the ground."""
+    """Return the angle (rad) of a joint's own axes to the ground."""
     if isinstance(element, Prismatic | Slot | Rack):
         return frames[0].angle + element.axis
     if isinstance(element, Driver) and element.coordinate in ("x", "y"):

@@ -47,7 +47,7 @@ class ClosedPosition(Protocol):
         ...
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
-        """The part of a displacement that the constraints allow."""
+        """Return the part of a displacement that the constraints allow."""
         ...
 
 
@@ -126,7 +126,7 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
 
 
 def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position]) -> tuple[int, ...]:
-    """The rows to leave out, of positions of ordinary rank: those whose absence never makes the others dependent."""
+    """Return the rows to leave out, of positions of ordinary rank: those whose absence never makes the others dependent."""
     if positions[0].rank == rows.count:
         return ()
     chosen = []

@@ -55,23 +55,23 @@ class Scales(PrintsTable):
         return number(np.asarray(self.length) / np.asarray(self.rows))
 
     def coordinates(self, n: int) -> Float[Array, "n"]:
-        """The units of coordinates: L, L and one radian for each body."""
+        """Return the units of coordinates: L, L and one radian for each body."""
         if library_for(self.length) is np:
             return number(np.tile([float(self.length), float(self.length), 1.0], n // 3))
         return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)
 
     def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        """The largest of a change of coordinates (n,): lengths over L, angles in rad."""
+        """Return the largest of a change of coordinates (n,): lengths over L, angles in rad."""
         x = xp.abs(q.reshape(-1, 3))
         return xp.maximum(xp.max(x[:, :2], initial=0.0) / self.length, xp.max(x[:, 2], initial=0.0))
 
     def violation(self, psi: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        """The largest of a violation (m,) of the rows of Psi, each over its scale."""
+        """Return the largest of a violation (m,) of the rows of Psi, each over its scale."""
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
 
 def known_scales(mechanism: Mechanism) -> Scales:
-    """The scales of a mechanism whose numbers are known, by NumPy."""
+    """Return the scales of a mechanism whose numbers are known, by NumPy."""
     mechanism = jax.tree.map(np.asarray, mechanism.at(0.0))
     q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
     with np.errstate(all="ignore"):  # what is not finite is no scale
@@ -80,7 +80,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
 
 
 def traced_scales(mechanism: Mechanism) -> Scales:
-    """The same in a trace; without derivatives."""
+    """Return the same in a trace; without derivatives."""
     mechanism = jax.lax.stop_gradient(mechanism.at(0.0))
     q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
     return jax.lax.stop_gradient(_scales(mechanism, _guess_terms(mechanism, q, v, jnp), jnp))
@@ -102,7 +102,7 @@ def _guess_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: Arr
 
 
 def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
-    """The diagonal of the mass matrix, by NumPy or JAX."""
+    """Return the diagonal of the mass matrix, by NumPy or JAX."""
     bodies = mechanism.bodies.values()
     mass, inertia = (numbers_as_vector([getattr(body, name) for body in bodies]) for name in ("mass", "inertia"))
     return xp.ravel(xp.stack([mass, mass, inertia], 1))

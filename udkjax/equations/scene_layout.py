@@ -140,7 +140,7 @@ class SceneLayout:
         return constraint_programs(kind.structure, self.baumgarte, self._loaded)
 
     def _find_rows(self, redundant_rows: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """The independent rows of each constraint."""
+        """Return the independent rows of each constraint."""
         sizes = np.zeros(len(self._mechanism.constraints), int)
         for kind in self._kinds():
             sizes[kind.members] = self._programs(kind).row_count

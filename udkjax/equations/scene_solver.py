@@ -55,7 +55,7 @@ class SceneSolver:
         return [*self.position_terms("psi_q", residual), *factorize, *step]
 
     def refined_solve(self, solve: int, further: int) -> Parts:
-        """A linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
+        """Solve a linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
         yield from self.solve(solve)
         for _ in range(REFINEMENTS):
             yield from self.terms.remainder(solve, further)

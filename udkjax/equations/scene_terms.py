@@ -50,17 +50,17 @@ class SceneTerms:
         return self.kernels[key]
 
     def single_round(self, key: Hashable, write: Write) -> KernelLoop:
-        """A loop of one round."""
+        """Return a loop of one round."""
         return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int))
 
     def over_bodies(self, key: Hashable, write: Write, fixed: Collection[str] = (), **names: str) -> KernelLoop:
-        """A loop over all bodies; `names` are those of its arrays in the program, where they differ from the kernel's."""
+        """Return a loop over all bodies; `names` are those of its arrays in the program, where they differ from the kernel's."""
         return KernelLoop(self.kernel(key, write), self.layout.body_table, names, fixed)
 
     def over_group(
         self, key: Hashable, group: ElementGroup, write: Write, fixed: Collection[str] = (), **names: str
     ) -> KernelLoop:
-        """A loop over the elements of a group, in whose graph the inputs of their programs are bound to the scene's arrays."""
+        """Return a loop over the elements of a group, with the inputs of their programs bound to the arrays of the scene."""
         programs = group.programs
 
         def bind_inputs(w: KernelWriter):
@@ -84,7 +84,7 @@ class SceneTerms:
     # --- terms of the equations
 
     def sincos(self, q: str = "q", sines: str = "sines") -> KernelLoop:
-        """The sine and the cosine of the angle of each body."""
+        """Return the sine and the cosine of the angle of each body."""
 
         def write(w: KernelWriter):
             angle = np.asarray(w.read("q", BODY_COORDINATES, 2), object)
@@ -184,7 +184,7 @@ class SceneTerms:
             yield self.over_group("potential", group, write_potential)
 
     def pieces(self) -> Parts:
-        """The number of the smooth piece of each element that has several."""
+        """Return the number of the smooth piece of each element that has several."""
         for group, places in self.layout.pieces:
             base = group.table.shape[1]
 
@@ -221,7 +221,7 @@ class SceneTerms:
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
     def remainder(self, solve: int, to: int) -> Parts:
-        """The remainder right - Psi_q M^(-1) Psi_q^T x of a linear system, as the right-hand side of another one."""
+        """Return the remainder right - Psi_q M^(-1) Psi_q^T x of a linear system, as the right-hand side of another one."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

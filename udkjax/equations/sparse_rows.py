@@ -60,7 +60,7 @@ class SparsePosition(NamedTuple):
         return float(np.sqrt(self.pivots[self.independent].min(initial=1.0)))
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
-        """The part of a displacement that the constraints allow."""
+        """Return the part of a displacement that the constraints allow."""
         solve = splu(csc_array(self.D @ self.D.T + DAMPING * eye_array(self.D.shape[0])), **_SYMMETRIC).solve
         for _ in range(2):
             heading = heading - self.D.T @ solve(self.D @ heading)
@@ -176,7 +176,7 @@ class SparseRows(RowTerms):
 
 
 def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
-    """The pivots of D D^T in the order of elimination, for rows of length one; dependent rows are passed over."""
+    """Return the pivots of D D^T in the order of elimination, for rows of length one; dependent rows are passed over."""
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
     column: list[dict[int, float]] = [{} for _ in order]

@@ -47,7 +47,7 @@ def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
 
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
-    """All of some numbers and arrays as one vector, in order: NumPy's where they are known, and what is known in a row is one."""
+    """Return numbers and arrays as one vector, in order: by NumPy where they are known, and what is known in a row is one."""
     parts = []
     for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
         if traced:

@@ -42,7 +42,7 @@ class TextbookEquations(MechanismSystem):
         return _project(self, t, q, v)
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """One Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
+        """Take a Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
@@ -159,7 +159,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _at_projection(equations: TextbookEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """A state on the manifold, with the derivatives that `project` has where it returns it."""
+    """Return a state on the manifold, with the derivatives that `project` has where it returns it."""
     del equations, t
     return q, v
 

@@ -30,5 +30,5 @@ def traced_once(function: Callable[Arguments, Result]) -> Callable[Arguments, Re
 
 
 def _as_traced(value: Any) -> Mechanism | Array:
-    """A mechanism without its origin, and numbers as arrays: neither is part of what is traced."""
+    """Return a mechanism without its origin, and numbers as arrays: neither is part of what is traced."""
     return value.without_origin if isinstance(value, Mechanism) else jnp.asarray(value, jnp.result_type(float))

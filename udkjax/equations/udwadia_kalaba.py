@@ -130,7 +130,7 @@ def tangent_part(
 
 
 def inverse_sqrt_mass(mechanism: Mechanism) -> Float[Array, "n"]:
-    """The diagonal of M^(-1/2)."""
+    """Return the diagonal of M^(-1/2)."""
     return 1 / jnp.sqrt(loads.mass(mechanism))
 
 

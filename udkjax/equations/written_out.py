@@ -130,7 +130,7 @@ class WrittenOut:
     def _differentiate(
         self, given: DifferentiableProgram, n: int, reverse: bool
     ) -> tuple[dict[Place, Scalar], dict[Place, Scalar]]:
-        """The results, and their changes, or the cotangents of what they depend on."""
+        """Return the results, and their changes, or the cotangents of what they depend on."""
         arrays, derivative = self._unroll(given.program), given.derivative()
         results = [x for x in ("a", "q1", "v1") if x in arrays]
         variables = {"constants": self.moving, "q": range(n), "v": range(n)}

@@ -37,7 +37,7 @@ class Differential:
                 self._rows[index] = row
 
     def row(self, output: Scalar) -> Row:
-        """The partial derivatives of one output."""
+        """Return the partial derivatives of one output."""
         row = self._rows.get(output.index, {})
         return row if output.sign > 0 else {k: -p for k, p in row.items()}
 
@@ -143,7 +143,7 @@ def _factored(differential: Differential, outputs: Sequence[Scalar], given: Coll
 
 
 def product(row: Row, known: Mapping[int, Scalar], graph: Graph) -> Scalar:
-    """A row times a vector."""
+    """Return a row times a vector."""
     return sum((p * known[k] for k, p in row.items() if k in known), graph.constant(0.0))
 
 
@@ -181,7 +181,7 @@ def _without(entry: Scalar, factor: Scalar) -> Scalar:
 
 
 def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
-    """The derivative of a node with respect to its k-th argument."""
+    """Return the derivative of a node with respect to its k-th argument."""
     one, value = graph.constant(1.0, node.dtype), Scalar(graph, index)
     match node.kind:
         case "add":
@@ -205,7 +205,7 @@ def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
 
 @lru_cache(maxsize=256)
 def _slope(detail: BoundPrimitive, dtypes: tuple[np.dtype, ...], k: int) -> ClosedJaxpr:
-    """The derivative of a primitive on scalars with respect to its k-th argument, as a jaxpr."""
+    """Return the derivative of a primitive on scalars with respect to its k-th argument, as a jaxpr."""
 
     def slope(*scalars):
         f = lambda x: detail.primitive.bind(*scalars[:k], x, *scalars[k + 1 :], **detail.parameters)  # noqa: E731
@@ -255,7 +255,7 @@ def _pull_back(graph: Graph, call: int, seeds: Row, flags: Sequence[bool]) -> li
 def _restrict(
     detail: BoundPrimitive, arrays: Sequence[jax.Array], active: Sequence[int], wanted: Sequence[int]
 ) -> Callable[..., list[jax.Array]]:
-    """An array primitive as a function of some of its arguments, with some of its results."""
+    """Return an array primitive as a function of some of its arguments, with some of its results."""
 
     def function(*some):
         values = list(arrays)

@@ -164,7 +164,7 @@ class Graph:
         return Scalar(self, self._operation("div", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
 
     def sqrt(self, a: Scalar) -> Scalar:
-        """The square root."""
+        """Return the square root."""
         if a.constant is not None:
             return self.constant(math.sqrt(a.constant), a.node.dtype)
         return Scalar(self, self._operation("sqrt", (a,)))

@@ -143,7 +143,7 @@ def _read_inner(graph: Graph, jaxpr: core.Jaxpr | ClosedJaxpr, inputs: Sequence[
 
 
 def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """A loop of known length, round by round."""
+    """Evaluate a loop of known length, round by round."""
     body, order = equation.params["jaxpr"], range(equation.params["length"])
     inner = getattr(body, "jaxpr", body)
     # What is given round by round has one dimension more outside; before it come what is fixed, and what is handed on.

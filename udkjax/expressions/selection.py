@@ -22,7 +22,7 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
 
 
 def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
-    """One of two scalars."""
+    """Return one of two scalars."""
     if condition.constant is not None:
         return yes if condition.constant else no
     return yes.graph.apply(lax.select_n_p, {}, (condition, no, yes), yes.node.dtype, lambda c, n, y: y if c else n)

@@ -131,7 +131,7 @@ class Pseudoinverse(PrintsLine):
         return LeastSquaresSolution(plus @ jnp.asarray(b), plus.rank)
 
     def rank(self, D: Operator) -> Int[Array, ""]:
-        """The numerical rank: how many directions lie above the threshold."""
+        """Return the numerical rank: how many directions lie above the threshold."""
         return self.plus(D).rank
 
     def __call__(self, D: Operator) -> Float[Array, "n m"]:
@@ -165,7 +165,7 @@ class Dense(Pseudoinverse):
         return dot(D.T, y)
 
     def threshold(self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None) -> Float[Array, ""]:
-        """The threshold at or below which a singular value, or its substitute in this method, counts as zero.
+        """Return the threshold at or below which a singular value, or its substitute in this method, counts as zero.
 
         Where no `rank_tol` is given: `default`, else max(m, n) eps: rounding errors of a factorization relative to its matrix.
         """

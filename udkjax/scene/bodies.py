@@ -150,7 +150,7 @@ def frame_over_time(names: Sequence[str], q: Float[Array, "T bodies 3"], v: Floa
 
 
 def between(points: Float[Array, "2 2"] | Sequence[Vector], one: Frame, two: Frame) -> Point:
-    """The vector from `points[0]` of body 1 to `points[1]` of body 2.
+    """Return the vector from `points[0]` of body 1 to `points[1]` of body 2.
 
     Args:
         points: The two points, each in its body's own frame (m).

@@ -47,7 +47,7 @@ def _check_mechanism(name: str, value: Any, given: Given) -> None:
 
 
 def _check_thresholds(name: str, value: Any, given: Given) -> None:
-    """The thresholds of a pseudoinverse, or the gains of a stabilization."""
+    """Check the thresholds of a pseudoinverse, or the gains of a stabilization."""
     for field in dataclasses.fields(value) if isinstance(value, eqx.Module) else ():
         x = getattr(value, field.name)
         if eqx.is_array(x) or isinstance(x, float):
@@ -116,7 +116,7 @@ def _require_point(name: str, value: Any, given: Given) -> None:
 
 
 def _require_drivers(name: str, value: Any, given: Given) -> None:
-    """Names of drivers with their values, or, where they have none here, names alone."""
+    """Check names of drivers with their values, or, where they have none here, names alone."""
     if isinstance(value, Mapping):
         for driver, values in value.items():
             require_finite(f"{name}[{driver!r}]", values)

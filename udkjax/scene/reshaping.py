@@ -136,7 +136,7 @@ def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
 
 
 def _spanning_tree(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
-    """Pins by which each body is reached: the joint, the body that holds it, and the body that it reaches.
+    """Iterate over pins by which bodies are reached: the joint, the body that holds it, and the body that it reaches.
 
     From the ground on; of bodies that no pin joins to it, from the first of them, which stays.
     """

@@ -41,7 +41,7 @@ class Series(NamedTuple):
 
 
 def series(data: "xarray.Dataset") -> list[Series]:
-    """All channels of all records, in this order; those that a record does not have are left out."""
+    """Return all channels of all records, in this order; those that a record does not have are left out."""
     found = []
     for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
         one = data.isel(record=r, channel=c)
@@ -122,7 +122,7 @@ def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Fig
 
 
 def _least_white(data: "xarray.Dataset", most_channels: int) -> list[str]:
-    """The channels: as they are, or, where there are too many, those that look least like noise."""
+    """Return the channels: as they are, or, where there are too many, those that look least like noise."""
     names = [str(name) for name in data["channel"].values]
     if len(names) <= most_channels:
         return names
@@ -140,7 +140,7 @@ def _over_time(axes: Axes, one: Series, colour: str) -> None:
 
 
 def _distribution(axes: Axes, own: list[Series]) -> None:
-    """A histogram of all records, and the density of Gaussian noise of the size that it is taken to have."""
+    """Draw a histogram of all records, and the density of Gaussian noise of the size that it is taken to have."""
     left = np.concatenate([one.residual for one in own])
     noise = np.concatenate([one.noise for one in own])
     if np.ptp(left) > 0:

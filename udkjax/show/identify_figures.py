@@ -104,7 +104,7 @@ def convergence(data: "xarray.Dataset") -> Figure:
 
 
 def _short(name: str) -> str:
-    """The name of a parameter; of one that is tied, its first part, and how many there are."""
+    """Return the name of a parameter; of one that is tied, its first part, and how many there are."""
     first, *others = name.split(" = ")
     return f"{first} = ... ({len(others) + 1} tied)" if others else first
 

@@ -142,6 +142,6 @@ class CamPair(DrawnElement):
         return Parts(joint=Cam(pair, placement.points(pair, [placement.places[pin] for pin in self.pins]), self.profile))
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
-        """The links, or the only moving ones of the pins."""
+        """Return the links, or the only moving ones of the pins."""
         found = [[m for m in layout.members(pin) if m != GROUND] for pin in self.pins]
         return self.links or tuple(members[0] for members in found if len(members) == 1)

@@ -249,7 +249,7 @@ class _Drawing:
         self.shaped.add(two)
 
     def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
-        """The least and the largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
+        """Return the least and largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
         gap = self._path(two, point) - self._path(one, at)
         direction = axis + self._frames(one)[:, 2]
         along = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)

@@ -205,7 +205,7 @@ def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, Ar
 
 
 def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodies 3"]) -> list[float]:
-    """The rectangle that holds everything that is drawn in any pose: left, bottom, right, top (m)."""
+    """Return the rectangle that holds everything that is drawn in any pose: left, bottom, right, top (m)."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
 
     def hold(body: int, at: ArrayLike, radius: float = 0.0) -> None:
@@ -237,7 +237,7 @@ def _ends(record: Record) -> tuple[float, float]:
 
 
 def _speed(duration: float) -> float:
-    """The natural speed where that is comfortable, else the nearest that is."""
+    """Return the natural speed where that is comfortable, else the nearest that is."""
     shortest, longest = COMFORTABLE_DURATIONS
     if duration <= 0 or shortest <= duration <= longest:
         return 1.0

@@ -42,7 +42,7 @@ def _circle(frame: Frame, radius: Sequence[float], fill: str = "", stroke: str =
 
 
 def _offsets(points: ArrayLike) -> np.ndarray:
-    """Points in the unit of symbols alone."""
+    """Return points in the unit of symbols alone."""
     points = np.asarray(points, float)
     return np.hstack([np.zeros_like(points), points])
 
@@ -189,7 +189,7 @@ def _piston(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 
 def _turn(mark: Mark, radius: float, sign: int) -> Iterator[Symbol]:
-    """A round arrow: sign 1 is anticlockwise."""
+    """Draw a round arrow: sign 1 is anticlockwise."""
     frame, flip = _at(mark, turns=False), np.array([1, sign])
     line, direction = radius * _round(np.linspace(-0.5, 3.5, ROUND)), np.array([-np.sin(3.5), np.cos(3.5)])
     yield _line(frame, _offsets(flip * line), "accent", 1.8)
@@ -197,7 +197,7 @@ def _turn(mark: Mark, radius: float, sign: int) -> Iterator[Symbol]:
 
 
 def _head(frame: Frame, tip: np.ndarray, direction: np.ndarray) -> Symbol:
-    """The head of an arrow."""
+    """Return the head of an arrow."""
     side, back = np.array([-direction[1], direction[0]]), tip - 7.5 * np.cos(0.42) * direction
     corners = [tip, back + 7.5 * np.sin(0.42) * side, back - 7.5 * np.sin(0.42) * side]
     return _line(frame, _offsets(corners), "", 0, "accent", True)
