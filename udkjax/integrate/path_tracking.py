@@ -18,13 +18,13 @@ SHORTEST_STEP = 1e-10  # of the way: a path that takes shorter ones does not go 
 LEAST_SIZE = 0.1  # units: what an unknown is judged by at least
 LARGEST = 1e7  # units: an unknown beyond that has gone to infinity
 END_TOL = 1e-12  # a Newton step at the end, beside the unknowns, that rounding alone explains where F' is well conditioned
-END_CORRECTIONS = 12
+END_CORRECTIONS = 12  # of Newton, which doubles the digits: far more than a regular solution takes
 GROWTH = 2.0  # of a step, at most
 # Towards the end of a path to infinity an unknown goes like a power of the way that is left, of a whole number or a fraction like
 # 1/3; none does on the way to a finite point. Within these bounds a power is one; the way is then at most NEAR_END.
 POWERS = (0.1, 3.0)
 NEAR_END = 0.05
-ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3
+ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3  # codes of the ends of paths
 
 
 class Precision(NamedTuple):

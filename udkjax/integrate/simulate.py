@@ -40,8 +40,8 @@ from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe
 if TYPE_CHECKING:
     import diffrax
 
-MAX_STEPS = 100_000
-MAX_EVENTS = 64
+MAX_STEPS = 100_000  # tried by default: at some microseconds each, a small scene that hangs ends within a second or so
+MAX_EVENTS = 64  # by default; the arrays of events are as long
 
 
 @checked

@@ -27,7 +27,7 @@ from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 POINTS = 6  # accepted steps of one interval that reverse mode has stored; of more than that it runs again
-MAX_STEPS = 1_000
+MAX_STEPS = 1_000  # within one interval
 
 
 @checked

@@ -22,7 +22,7 @@ DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 64, 136, 144
 DATA, RANK, DIMS = 24, 32, 40
 # Of an extension that asks for metadata: where they go, and in them the version (of the interface) that the handler speaks.
 METADATA, MAJOR, MINOR = 24, 24, 28
-VERSION = (0, 1)
+VERSION = (0, 1)  # major, minor
 SHARE = 32  # members of a thread, at least: to wake it takes some 50 us, and the shortest runs take one or two each
 # Words of the work that threads share: how many may still look at it, how many have begun (and whether it is closed), how many
 # are done, the number of the next member, and what `run` is called with.

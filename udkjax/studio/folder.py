@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from udkjax.studio.limits import MOST_FOLDERS_DEEP, MOST_LISTED, MOST_TEXT_CHARACTERS, RefusedError
 
 SCENE_SUFFIX = ".toml"
-MOST_CHARACTERS_OF_A_PATH = 200
+MOST_CHARACTERS_OF_A_PATH = 200  # file systems take 255 of each name
 
 
 class Folder:

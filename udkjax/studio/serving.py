@@ -19,7 +19,7 @@ with OptionalImport():
 from udkjax.studio.worker import Worker
 
 LOOPBACK = "127.0.0.1"
-TOKEN_BYTES = 32
+TOKEN_BYTES = 32  # of randomness, which nobody guesses
 
 
 def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say: Callable[[str], None] = print) -> None:

@@ -17,7 +17,7 @@ from udkjax.study.reaction_peaks import pin_reactions
 Json = dict[str, Any]
 TURNS = 2  # of the slowest motor that a run shows
 SWINGS = 12  # characteristic times that a run without a motor shows
-INSTANTS = 401
+INSTANTS = 401  # of a run: two hundred of each of two turns
 DIGITS = 2  # of a duration
 TOLERANCE = 1e-8  # of a run, relative
 

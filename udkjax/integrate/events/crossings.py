@@ -13,7 +13,7 @@ from udkjax.integrate.events.hybrid import ConditionValues, Hybrid
 # and so are its first and second rate, per T and T^2. Rounding errors of a state are some 1e-15 of it.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
 BISECTIONS = 40  # to a root of a cubic, which Newton's method on the event time then improves
-NO_EVENT = -1
+NO_EVENT = -1  # no index of an event
 
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-NOT_KNOWN = -1
+NOT_KNOWN = -1  # before the first step, which says how many evaluations the start took
 
 
 class Tally(eqx.Module):

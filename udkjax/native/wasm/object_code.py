@@ -13,7 +13,7 @@ CUSTOM, IMPORTS, EXPORTS, DATA = 0, 2, 7, 11  # sections; those of a module are 
 SYMBOL_TABLE = 8  # a part of "linking"
 FUNCTION_SYMBOL, DATA_SYMBOL, SECTION_SYMBOL = 0, 1, 3  # all others have a number, too
 UNDEFINED, EXPLICIT_NAME = 0x10, 0x40  # flags of symbols
-I32_CONST = 0x41
+I32_CONST = 0x41  # the opcode
 
 
 class LinkedModule(NamedTuple):

@@ -21,7 +21,7 @@ from udkjax.scene.checks import abbreviate
 from udkjax.study.sweep.fingerprint import Json, differences
 from udkjax.study.sweep.plan import Chunk
 
-FORMAT = 2
+FORMAT = 2  # of what a folder holds: another one is another sweep
 UNFINISHED_SUFFIX = ".unfinished"  # what a file's name ends with while it is written
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
 MEMBERS, STORED_PREFIX = "members", "stored/"  # in a file: whom its numbers belong to, and what goes before the names of these

@@ -21,7 +21,7 @@ from udkjax.study.synthesis.balls import INFLATE, LONG, ROUNDING, Ball
 # A box is so many times as large as the Newton step in it; of components beside the largest one, at least so much.
 WIDTHS = (2.0, 16.0)
 LEAST_SHARE = 1e-3
-NEWTON_STEPS = 10
+NEWTON_STEPS = 10  # at most: they double the digits
 EPS = float(np.finfo(float).eps)
 
 System = Callable[[Ball], tuple[Ball, Ball]]

@@ -13,7 +13,6 @@ from udkjax.study.drive import Drive
 from udkjax.study.kinematics import Kinematics, kinematics
 
 TURN = 2.0 * np.pi
-COGNATES = 3
 
 
 class CompleteDesign(PrintsTable):

@@ -32,7 +32,7 @@ ALIKE = 1e-7  # relative: classes whose pivots differ by less are one; more, whe
 # Beside the largest unknown: coordinates whose conjugates agree so well may be a real four-bar, which the certificate decides.
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
 REFINED = 1e-8  # a Newton step with residuals in long numbers, beside the unknowns, that shows a regular solution
-REFINEMENTS = 8
+REFINEMENTS = 8  # of Newton at most: it doubles the digits
 
 
 class Paths(NamedTuple):
