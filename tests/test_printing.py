@@ -65,7 +65,7 @@ def objects() -> dict[str, object]:
         *(udk.Record(ts, {"body.a.x": ts}), udk.Candidate({"a": ts}), udk.Axis(ts), udk.Zipped({"a": udk.Axis(ts)})),
         *(udk.Sobol(4), udk.LatinHypercube(4), udk.Random(4), udk.Point(1.0, 2.0), free.bodies[free.body_names[0]].frame()),
         *(method() for method in (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination, udk.Auto)),
-        udk.Augmented(udk.SVD()),
+        *(udk.OneOf(), udk.Augmented(udk.SVD())),
         *(kind() for kind in (udk.Augmented, udk.NullSpaceQR, udk.NullSpaceSVD, udk.CoordinatePartitioning)),
         *(udk.Stop(), udk.Log(), udk.Verner65(), udk.Adams(), udk.BDF(), run.result, udk.Reached.lost),
         udk.ConstrainedSystem(mass=jnp.diag, force=anything),
@@ -81,14 +81,8 @@ def objects() -> dict[str, object]:
     return {type(one).__name__: one for one in found}
 
 
-ELSEWHERE = {
-    "Estimate",
-    "GradientCheck",
-    "Design",
-    "Designs",
-    "FoundDesign",
-    "DesignSearch",
-}  # tests/study: they take a fit or a search
+# In tests/study: they take a fit or a search.
+ELSEWHERE = set("Estimate GradientCheck Design Designs FoundDesign DesignSearch CompleteDesign CompleteDesigns".split())
 ABSTRACT = {"Constraint", "Joint", "Motion", "ForceElement"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
 

@@ -35,6 +35,7 @@ def test_the_published_problem_has_its_64_real_classes(published):
     assert published.classes == DATA["real_classes"] == len({*published.numbers})
     assert len(published) == DATA["real_solutions_with_cognates_and_swaps"]
     assert published.unproven == 0 and published.radius.max() < 1e-10
+    assert str(published).startswith(f"{len(published)} four-bars") and "proven within" in str(published[0])
 
 
 def test_pins_hold_their_links_in_all_positions(published):
