@@ -169,9 +169,26 @@ const THEMES = {
 
 const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
 
+const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
+const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
+
+/** The contrast of two colours, 1 to 21, as WCAG 2 defines it. */
+function contrast(one, two) {
+  const linear = x => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+  const light = hex => [0.2126, 0.7152, 0.0722].reduce((sum, share, k) => sum + share * linear(part(hex, k) / 255), 0.05);
+  const [a, b] = [light(one), light(two)];
+  return Math.max(a, b) / Math.min(a, b);
+}
+
+/** A colour in which texts can be read on all grounds of a theme: nearer to that of its ink, where need be. */
+function readable(colour, {back, panel, ink}) {
+  let found = colour;
+  for (let t = 0; Math.min(contrast(found, back), contrast(found, panel)) < READABLE && t < 1; t += 0.05) found = mix(colour, ink, t);
+  return found;
+}
+
 /** A colour on the way to another one: t from 0 to 1. */
 function mix(one, two, t) {
-  const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
 
@@ -197,6 +214,9 @@ class Painter {
   colour(body) {
     return body < 0 ? this.theme.soft : this.theme.bodies[body % this.theme.bodies.length];
   }
+
+  /** The colour of a body's name. */
+  textColour(body) { return readable(this.colour(body), this.theme); }
 
   line(points, width, colour, {closed = false, fill = null, dash = []} = {}) {
     const c = this.context;
@@ -312,7 +332,7 @@ class Painter {
   }
 
   names(run) {
-    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.colour(body), {align: "center", weight: 600}));
+    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.textColour(body), {align: "center", weight: 600}));
     for (const mark of run.marks) {
       if (mark.kind !== "pin") continue;
       const [x, y] = this.at(mark);
@@ -442,7 +462,7 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
   for (let k = runs.length - 1; k >= 0; k--) {
     const colour = theme.bodies[k % theme.bodies.length], {value} = now[k], words = room && runs.length > 1 ? whole[k] : now[k].words;
     if (!now[k].words) continue;
-    painter.text(words, [edge, 17], colour, {align: "right", weight: 600, halo: false});
+    painter.text(words, [edge, 17], readable(colour, theme), {align: "right", weight: 600, halo: false});
     if (Number.isFinite(value)) painter.circle([x(t), y(value)], 3.4, {fill: colour, stroke: theme.panel});
     edge -= context.measureText(words).width + 18;
   }
@@ -481,7 +501,7 @@ figcaption b { color: var(--ink); font-weight: 600; }
 button, select { font: inherit; font-size: 13px; color: var(--ink); background: transparent; border: 1px solid transparent; border-radius: 6px;
   height: 32px; padding: 0 8px; margin: 0; cursor: pointer; }
 button:hover, select:hover { background: color-mix(in srgb, var(--ink) 8%, transparent); }
-button[aria-pressed="true"] { color: var(--accent); background: color-mix(in srgb, var(--accent) 14%, transparent); }
+button[aria-pressed="true"] { color: color-mix(in srgb, var(--accent) 75%, var(--ink)); background: color-mix(in srgb, var(--accent) 14%, transparent); }
 button:disabled { opacity: 0.5; cursor: default; }
 option { color: #111; background: #fff; }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }

@@ -245,3 +245,14 @@ test("a body's frames become a motion of the drawing, and a run is smooth betwee
     assert.ok(Math.abs(state.q[0] - t ** 3) < 1e-12 && Math.abs(state.v[0] - 3 * t * t) < 1e-12);
   }
 });
+
+test("texts can be read on all grounds", async () => {
+  const {THEMES, contrast, mix, readable} = await page("player/painter");
+  assert.equal(contrast("#000000", "#ffffff"), 21);
+  for (const theme of Object.values(THEMES)) {
+    const {back, panel, ink, soft, accent, onAccent, force, bodies} = theme, texts = [ink, soft, accent, force, ...bodies.map(colour => readable(colour, theme))];
+    for (const colour of texts) for (const ground of [back, panel]) assert.ok(contrast(colour, ground) >= 4.5, `${colour} on ${ground}`);
+    assert.ok(contrast(mix(accent, ink, 0.25), mix(panel, accent, 0.14)) >= 4.5);  // what is pressed
+    assert.ok(contrast(onAccent, accent) >= 4.5);
+  }
+});

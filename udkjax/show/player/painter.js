@@ -18,9 +18,26 @@ export const THEMES = {
 
 const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
 
+const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
+const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
+
+/** The contrast of two colours, 1 to 21, as WCAG 2 defines it. */
+export function contrast(one, two) {
+  const linear = x => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+  const light = hex => [0.2126, 0.7152, 0.0722].reduce((sum, share, k) => sum + share * linear(part(hex, k) / 255), 0.05);
+  const [a, b] = [light(one), light(two)];
+  return Math.max(a, b) / Math.min(a, b);
+}
+
+/** A colour in which texts can be read on all grounds of a theme: nearer to that of its ink, where need be. */
+export function readable(colour, {back, panel, ink}) {
+  let found = colour;
+  for (let t = 0; Math.min(contrast(found, back), contrast(found, panel)) < READABLE && t < 1; t += 0.05) found = mix(colour, ink, t);
+  return found;
+}
+
 /** A colour on the way to another one: t from 0 to 1. */
 export function mix(one, two, t) {
-  const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
 
@@ -46,6 +63,9 @@ export class Painter {
   colour(body) {
     return body < 0 ? this.theme.soft : this.theme.bodies[body % this.theme.bodies.length];
   }
+
+  /** The colour of a body's name. */
+  textColour(body) { return readable(this.colour(body), this.theme); }
 
   line(points, width, colour, {closed = false, fill = null, dash = []} = {}) {
     const c = this.context;
@@ -161,7 +181,7 @@ export class Painter {
   }
 
   names(run) {
-    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.colour(body), {align: "center", weight: 600}));
+    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.textColour(body), {align: "center", weight: 600}));
     for (const mark of run.marks) {
       if (mark.kind !== "pin") continue;
       const [x, y] = this.at(mark);

@@ -1,7 +1,7 @@
 // The strip below the scene: curves of a measure over time.
 
 import {clamp, short} from "./motion.js";
-import {Painter} from "./painter.js";
+import {Painter, readable} from "./painter.js";
 
 const LEFT = 12, RIGHT = 68;  // px beside the curves; at the right stand the least and the largest value
 
@@ -55,7 +55,7 @@ export function drawStrip(context, width, height, runs, name, start, end, t, the
   for (let k = runs.length - 1; k >= 0; k--) {
     const colour = theme.bodies[k % theme.bodies.length], {value} = now[k], words = room && runs.length > 1 ? whole[k] : now[k].words;
     if (!now[k].words) continue;
-    painter.text(words, [edge, 17], colour, {align: "right", weight: 600, halo: false});
+    painter.text(words, [edge, 17], readable(colour, theme), {align: "right", weight: 600, halo: false});
     if (Number.isFinite(value)) painter.circle([x(t), y(value)], 3.4, {fill: colour, stroke: theme.panel});
     edge -= context.measureText(words).width + 18;
   }

@@ -31,7 +31,7 @@ figcaption b { color: var(--ink); font-weight: 600; }
 button, select { font: inherit; font-size: 13px; color: var(--ink); background: transparent; border: 1px solid transparent; border-radius: 6px;
   height: 32px; padding: 0 8px; margin: 0; cursor: pointer; }
 button:hover, select:hover { background: color-mix(in srgb, var(--ink) 8%, transparent); }
-button[aria-pressed="true"] { color: var(--accent); background: color-mix(in srgb, var(--accent) 14%, transparent); }
+button[aria-pressed="true"] { color: color-mix(in srgb, var(--accent) 75%, var(--ink)); background: color-mix(in srgb, var(--accent) 14%, transparent); }
 button:disabled { opacity: 0.5; cursor: default; }
 option { color: #111; background: #fff; }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }

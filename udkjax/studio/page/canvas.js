@@ -144,7 +144,7 @@ export class DrawingCanvas {
     }
     list(document, "link").forEach((link, k) => {
       const chosen = isChosen("link", undefined, k), places = this.placesOfName(link, k, document, painter, motions);
-      if (places && (chosen || (show.names && link.pins?.length > 1))) names.put(`link ${k}`, link.name ?? "", places, painter.colour(k), chosen ? 700 : 500);
+      if (places && (chosen || (show.names && link.pins?.length > 1))) names.put(`link ${k}`, link.name ?? "", places, painter.textColour(k), chosen ? 700 : 500);
     });
     for (const section of ["motor", "spring", "damper", "load", "gear", "cam"]) {
       list(document, section).forEach((entry, k) => {
