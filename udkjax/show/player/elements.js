@@ -50,6 +50,6 @@ export function keepKeys(root, focused) {
   root.addEventListener("mousedown", event => {
     if (!event.target.closest("button") || event.target.closest("dialog")) return;
     event.preventDefault();
-    focused.focus({preventScroll: true});
+    focused.focus({preventScroll: true, focusVisible: false});
   });
 }

@@ -42,7 +42,7 @@ export class Gestures {
     if (event.button > 1) return;
     const pixel = this.pixel(event);
     this.element.setPointerCapture(event.pointerId);
-    this.element.focus({preventScroll: true});
+    if (event.pointerType !== "mouse") this.element.focus({preventScroll: true});  // which a mouse does by itself
     this.pointers.set(event.pointerId, pixel);
     if (this.pointers.size > 1) return this.cancel();
     this.moved = false;
