@@ -77,10 +77,12 @@ def _first_of_each(found: Certificate) -> np.ndarray:
 def _zeros(dx: np.ndarray, dy: np.ndarray, c: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return homogeneous joints (3, 4) and pivots (3, 4) of all dyads, complex."""
     half = 0.5 * (dx**2 + dy**2)
-    # L[j, k] are the coefficients by (x, y, 1) of entry k of row j.
-    L = np.array([
-        [[1 - c, s, -dx], [-s, 1 - c, -dy], [dx * c + dy * s, dy * c - dx * s, half]],
-    ])[0].transpose(2, 0, 1)  # fmt: skip
+    # Coefficients by (x, y, 1) of entry k of row j, L[j, k]. Joints are measured by `size`: of links that turn little they are far.
+    by_x, by_y, rest = [1 - c, -s, dx * c + dy * s], [s, 1 - c, dy * c - dx * s], [-dx, -dy, half]
+    ways, turned = np.linalg.norm(rest[:2]), np.linalg.norm([by_x[:2], by_y[:2]])
+    size = ways / turned if ways > 0 and turned > 0 else 1.0
+    scales = np.array([size, size, 1.0])
+    L = np.transpose([by_x, by_y, rest], (2, 1, 0)) * scales / np.array([1.0, 1.0, size])[:, None]
     Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]  # no zero of it is at infinity, with probability one
     L = L @ Q
     minors = [_determinant(L[list(rows)]) for rows in combinations(range(4), 3)]
@@ -104,7 +106,7 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, c: np.ndarray, s: np.ndarray) -> tupl
     joints = joints[:, np.sort(order[2:])]
     rows = np.einsum("jkx,xm->mjk", L @ Q.T, joints)
     pivots = np.linalg.svd(rows)[2][:, -1].conj().T
-    return joints, pivots
+    return joints * scales[:, None], pivots / np.array([1.0, 1.0, size])[:, None]
 
 
 def _determinant(A: np.ndarray) -> dict[tuple[int, int], float]:

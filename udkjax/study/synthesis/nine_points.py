@@ -181,14 +181,14 @@ def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
     return found
 
 
-def distinct(z: np.ndarray) -> np.ndarray:
-    """Return the places of the first solutions of each class: there are no more classes than generic points have."""
+def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
+    """Return the places of the first solutions of each class: at most so many, those of generic points."""
     alike = ALIKE
     while True:
         keep = np.ones(z.shape[1], bool)
         for i, j in _pairs(z, alike):
             keep[j] &= not keep[i]
-        if np.count_nonzero(keep) <= CLASSES:
+        if np.count_nonzero(keep) <= most:
             return np.flatnonzero(keep)
         alike *= 10.0
 
