@@ -19,16 +19,15 @@ from udkjax.study.synthesis.nine_points import CLASSES, CLOSE, class_keys, disti
 def random_four_bar(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a solution (16, 1) and the displacements (16,) that it solves."""
     joints = complex_numbers(rng, JOINTS)
+    pairs = [(x, X, x - r, X - R) for x, X, r, R in (joints[:4], joints[4:])]
     d, D, turns = (np.zeros(POINTS, complex) for _ in range(3))
     for j in range(POINTS):
         t = turns[j] = np.exp(complex_numbers(rng, 1)[0])
-        first, other = (
-            np.array([X / t - A, t * x - a, x * A * (1 - t) + X * a * (1 - 1 / t)]) for x, X, a, A in (joints[:4], joints[4:])
-        )
+        first, other = (np.array([X / t - A, t * x - a, x * A * (1 - t) + X * a * (1 - 1 / t)]) for x, X, a, A in pairs)
         p, q, r = first - other  # p d + q D + r = 0, and the first dyad's d D + ... = 0
         d[j] = np.roots([-p / q, first[0] - (r + first[1] * p) / q, first[2] - first[1] * r / q])[rng.integers(2)]
         D[j] = -(p * d[j] + r) / q
-    return np.append(joints, turns)[:, None], np.append(d, D)
+    return np.append(joints, turns - 1.0)[:, None], np.append(d, D)
 
 
 def complex_numbers(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -56,10 +55,9 @@ def loops(
 def cognates(z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Return Roberts's two further four-bars of each (16, 2 M): with pivots a, c and b, c."""
     found, one, two = [], z[:4], z[4:JOINTS]
-    for (x, X, a, A), (y, Y, b, B) in ((one, two), (two, one)):
+    for (x, X, r, R), (y, Y, s, S) in ((one, two), (two, one)):
         k, K = x / (x - y), X / (X - Y)
-        pair = a - x, A - X, a, A
-        found.append(np.stack([*pair, a - x + k * (x - a), A - X + K * (X - A), a + k * (b - a), A + K * (B - A)]))
+        found.append(np.stack([-r, -R, -x, -X, k * r - r, K * R - R, k * s, K * S]))
     joints = np.concatenate(found, axis=1)
     return np.concatenate([joints, turns_of(joints, parameters)])
 

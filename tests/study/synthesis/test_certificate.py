@@ -77,5 +77,7 @@ def test_dyads_of_random_circles_are_found():
         P = pivot + rng.uniform(0.3, 3) * np.exp(1j * crank) - joint * np.exp(1j * turn)
         found = find_real_dyads(np.stack([P.real, P.imag, turn], 1))
         u = found.boxes.middle.astype(float) * found.scale
-        off = np.maximum(np.abs(u[0] + 1j * u[1] - joint * np.exp(1j * turn[0])), np.abs(u[2] + 1j * u[3] + P[0] - pivot))
+        off = np.maximum(
+            np.abs(u[0] + 1j * u[1] - joint * np.exp(1j * turn[0])), np.abs(u[0] + 1j * u[1] - u[2] - 1j * u[3] + P[0] - pivot)
+        )
         assert off.min() < 1e-9 and u.shape[1] in (2, 4) and found.unproven == 0

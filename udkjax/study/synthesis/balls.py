@@ -1,10 +1,11 @@
 """Real numbers known to within a radius, in arrays: what is computed from them holds whatever was rounded on the way.
 
-A ball is a middle and a radius. Middles are of the longest floating-point type that the processor has; each operation adds to
-the radius what its rounding may be off by, and radii, in float64, are rounded up by INFLATE, which is more than all the
-operations of a certificate could lose.
+A ball is a middle and a radius. Middles are of the longest floating-point type that the processor has, or fractions, which
+are exact; each operation adds to the radius what its rounding may be off by, and radii, in float64, are rounded up by
+INFLATE, which is more than all the operations of a certificate could lose.
 """
 
+from fractions import Fraction
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,10 +30,21 @@ class Ball(NamedTuple):
         mid = np.asarray(x, LONG)
         return cls(mid, np.broadcast_to(np.asarray(rad, float), mid.shape))
 
+    @classmethod
+    def fractions(cls, x: Any) -> "Ball":
+        """Return numbers as balls whose middles are fractions: exact ones."""
+        x = np.asarray(x, LONG)
+        high = x.astype(float)
+        low = (x - high).astype(float)
+        exact = [Fraction(a) + Fraction(b) for a, b in zip(high.ravel().tolist(), low.ravel().tolist(), strict=True)]
+        mid = np.empty(x.shape, object)
+        mid[...] = np.array(exact, object).reshape(x.shape)
+        return cls(mid, np.zeros(x.shape))
+
     def __add__(self, other: Any) -> "Ball":  # pyright: ignore[reportIncompatibleMethodOverride]
-        b = _ball(other)
+        b = self._like(other)
         mid = self.mid + b.mid
-        return Ball(mid, _up(self.rad + b.rad + ROUNDING * _size(mid)))
+        return Ball(mid, _up(self.rad + b.rad + _rounding(mid)))
 
     __radd__ = __add__
 
@@ -40,26 +52,32 @@ class Ball(NamedTuple):
         return Ball(-self.mid, self.rad)
 
     def __sub__(self, other: Any) -> "Ball":
-        return self + -_ball(other)
+        return self + -self._like(other)
 
     def __rsub__(self, other: Any) -> "Ball":
-        return _ball(other) - self
+        return self._like(other) - self
 
     def __mul__(self, other: Any) -> "Ball":  # pyright: ignore[reportIncompatibleMethodOverride]
-        b = _ball(other)
+        b = self._like(other)
         mid, one, two = self.mid * b.mid, _size(self.mid), _size(b.mid)
-        return Ball(mid, _up(one * b.rad + two * self.rad + self.rad * b.rad + ROUNDING * _size(mid)))
+        return Ball(mid, _up(one * b.rad + two * self.rad + self.rad * b.rad + _rounding(mid)))
 
     __rmul__ = __mul__  # pyright: ignore[reportAssignmentType]
 
     def __truediv__(self, other: Any) -> "Ball":
         """Return the quotient: of infinite radius where the divisor may be zero."""
-        b = _ball(other)
+        b = self._like(other)
         least = _size(b.mid) / INFLATE - b.rad
         with np.errstate(divide="ignore", invalid="ignore"):
             mid = self.mid / b.mid
             rad = _up((self.rad + _size(mid) * b.rad) / least + ROUNDING * _size(mid))
         return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
+
+    def _like(self, x: Any) -> "Ball":
+        """Return what is no ball as one, of the same numbers as these."""
+        if isinstance(x, Ball):
+            return x
+        return Ball.fractions(x) if self.mid.dtype == object else Ball.of(x)
 
     def part(self, index: Any) -> "Ball":
         """Return some of the numbers."""
@@ -113,12 +131,12 @@ class ComplexBall(NamedTuple):
         return np.hypot((self.re - np.real(z)).largest, (self.im - np.imag(z)).largest) * INFLATE
 
 
-def _ball(x: Any) -> Ball:
-    return x if isinstance(x, Ball) else Ball.of(x)
+def _rounding(x: np.ndarray) -> np.ndarray | float:
+    return 0.0 if x.dtype == object else ROUNDING * _size(x)
 
 
 def _size(x: np.ndarray) -> np.ndarray:
-    return np.abs(x).astype(float) * INFLATE
+    return np.asarray(np.abs(x), float) * INFLATE
 
 
 def _up(x: np.ndarray) -> np.ndarray:

@@ -22,7 +22,8 @@ class FourBarBoxes(NamedTuple):
 def cognate_joints(boxes: Certificate) -> tuple[FourBarBoxes, FourBarBoxes, FourBarBoxes]:
     """Return the joints of all three cognates, as `FourBars.cognates` has them."""
     u = boxes.balls
-    x, a, y, b = (ComplexBall(u.part(k), u.part(k + 1)) for k in (0, 2, 4, 6))
+    x, r, y, s = (ComplexBall(u.part(k), u.part(k + 1)) for k in (0, 2, 4, 6))
+    a, b = x - r, y - s
     return FourBarBoxes(a, b, x, y), _other(a, b, x, y), _other(b, a, y, x)
 
 

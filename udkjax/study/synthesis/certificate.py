@@ -16,12 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.study.synthesis.balls import INFLATE, LONG, ROUNDING, Ball
+from udkjax.study.synthesis.balls import INFLATE, LONG, ROUNDING, SMALLEST, Ball
 
 # A box is so many times as large as the Newton step in it; of components beside the largest one, at least so much.
 WIDTHS = (2.0, 16.0)
 LEAST_SHARE = 1e-3
-NEWTON_STEPS = 10  # at most: they double the digits
+NEWTON_STEPS, EXACT_STEPS = 10, 4  # at most: they double the digits
+FARTHEST = 1e8  # units: beyond, Newton's method has left for infinity
+SURE = 1e-3  # relative: a Newton step, rounding included, beyond which more digits do not help either
 EPS = float(np.finfo(float).eps)
 
 System = Callable[[Ball], tuple[Ball, Ball]]
@@ -50,19 +52,42 @@ class Certificate(NamedTuple):
         return Ball(self.middle, self.radius)
 
 
-def certify(system: System, u: np.ndarray) -> Certificate:
+def certify(system: System, u: np.ndarray, exact: System | None = None) -> Certificate:
     """Improve approximate solutions and prove that they are some.
 
     Args:
         system: from unknowns (N, M) to F (N, M) and F' (N, N, M), for balls.
         u: approximate solutions (N, M).
+        exact: the same system for fractions, if its data are some: for solutions that need more digits than there are.
 
     Returns:
         Their boxes; nothing is proven of a solution at which F' is singular, or so nearly that rounding hides the difference.
     """
     m, inverse = _improved(system, np.asarray(u, LONG))
-    proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     F, _ = system(Ball.of(m))
+    found = _prove(system, m, inverse, F)
+    step = np.max(_product(inverse, F) / np.maximum(np.abs(m).astype(float), 1.0), axis=0)
+    again = np.flatnonzero(~found.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
+    if exact is None or not len(again):
+        return found
+    m, inverse = m[:, again], inverse[again]
+    for _ in range(EXACT_STEPS):
+        m = m - np.einsum("mij,jm->im", inverse, _evaluate(exact, m).mid)
+    second = _prove(system, m, inverse, _evaluate(exact, m))
+    for old, new in zip(found, second, strict=True):
+        old[..., again] = new
+    return found
+
+
+def _evaluate(exact: System, m: np.ndarray) -> Ball:
+    """Return F at points, computed in fractions, and rounded."""
+    F = exact(Ball.fractions(m))[0].mid.astype(float)
+    return Ball.of(F, EPS * np.abs(F) + SMALLEST)
+
+
+def _prove(system: System, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
+    """Return boxes about points with F there; those that satisfy Krawczyk's condition are proven."""
+    proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     step = _product(inverse, F)
     size = np.maximum(np.abs(m).astype(float), 1.0)
     for width in WIDTHS:

@@ -115,9 +115,9 @@ def _through_points(targets: np.ndarray) -> _Solutions:
     found = find_real_classes(targets)
     J, u, R = len(targets), found.boxes.middle.astype(float), found.boxes.middle.shape[1]
     P = targets[:, 0] + 1j * targets[:, 1]
-    x, a, y, b = found.scale * (u[0:8:2] + 1j * u[1:8:2])
-    turns = np.concatenate([np.ones((1, R)), u[8 : 7 + J] + 1j * u[7 + J :]]).T
-    bars = FourBars(P[0] + a, P[0] + b, P + turns * x[:, None], P + turns * y[:, None], P)
+    x, r, y, s = found.scale * (u[0:8:2] + 1j * u[1:8:2])
+    turns = np.concatenate([np.ones((1, R)), 1.0 + u[8 : 7 + J] + 1j * u[7 + J :]]).T
+    bars = FourBars(P[0] + x - r, P[0] + y - s, P + turns * x[:, None], P + turns * y[:, None], P)
     cognates = bars.cognates()
     joints = cognate_joints(found.boxes)
     radii = [radius_of(joint, bar, P[0], found.scale) for joint, bar in zip(joints, cognates, strict=True)]
@@ -133,10 +133,12 @@ def _through_poses(targets: np.ndarray) -> _Solutions:
     found = find_real_dyads(targets)
     u, P = found.scale * found.boxes.middle.astype(float), targets[:, 0] + 1j * targets[:, 1]
     pairs = np.array(list(combinations(range(u.shape[1]), 2)), int).reshape(-1, 2)
-    pivots, joints = P[0] + u[2] + 1j * u[3], P + found.turns * (u[0] + 1j * u[1])[:, None]
+    joint, crank = u[0] + 1j * u[1], u[2] + 1j * u[3]
+    pivots, joints = P[0] + joint - crank, P + found.turns * joint[:, None]
     one, two = pairs.T
     bars = FourBars(pivots[one], pivots[two], joints[one], joints[two], P)
-    joint, pivot = (ComplexBall(found.boxes.balls.part(k), found.boxes.balls.part(k + 1)) for k in (0, 2))
+    joint, crank = (ComplexBall(found.boxes.balls.part(k), found.boxes.balls.part(k + 1)) for k in (0, 2))
+    pivot = joint - crank
     boxes = FourBarBoxes(pivot.part(one), pivot.part(two), joint.part(one), joint.part(two))
     radii = radius_of(boxes, bars, P[0], found.scale)
     counts = {"dyads": DYADS, "infinite": found.infinite}

@@ -31,7 +31,7 @@ class RealDyads(NamedTuple):
     """Dyads through five poses, in units of `scale` from the first place.
 
     Attributes:
-        boxes: proven to hold one solution each: x, y of the joint, a, b of the pivot.
+        boxes: proven to hold one solution each: the joint (two), the crank from the pivot to it (two).
         turns: of the link in each pose, as complex numbers (5,).
         infinite: how many have a joint or a pivot at infinity, complex ones counted.
         unproven: how many more appear to be real, but could not be proven.
@@ -52,7 +52,8 @@ def find_real_dyads(poses: np.ndarray) -> RealDyads:
     angle = np.asarray(poses[:, 2], np.longdouble) - np.longdouble(poses[0, 2])
     turn = angle[1:, None]
     rounded = SINE_TOL + ROUNDING * np.abs(turn).astype(float)
-    d = d._replace(c=Ball.of(np.cos(turn), rounded), s=Ball.of(np.sin(turn), rounded))
+    half = np.sin(0.5 * turn)
+    d = d._replace(p=Ball.of(-2.0 * half * half, 4.0 * rounded), s=Ball.of(np.sin(turn), rounded))
     joints, pivots = _zeros(*(part.mid[:, 0].astype(float) for part in d))
     points = np.concatenate([joints, pivots])
     is_finite = (np.abs(points[[2, 5]]) > AT_INFINITY * np.max(np.abs(points[[0, 1, 3, 4]]), axis=0)).all(axis=0)
@@ -74,11 +75,11 @@ def _first_of_each(found: Certificate) -> np.ndarray:
     return keep
 
 
-def _zeros(dx: np.ndarray, dy: np.ndarray, c: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return homogeneous joints (3, 4) and pivots (3, 4) of all dyads, complex."""
     half = 0.5 * (dx**2 + dy**2)
-    # Coefficients by (x, y, 1) of entry k of row j, L[j, k]. Joints are measured by `size`: of links that turn little they are far.
-    by_x, by_y, rest = [1 - c, -s, dx * c + dy * s], [s, 1 - c, dy * c - dx * s], [-dx, -dy, half]
+    # Coefficients by (x, y, 1) of entry k of row j, L[j, k]. Joints are measured by `size`: far ones, of links that turn little.
+    by_x, by_y, rest = [-p, -s, dx * (1 + p) + dy * s], [s, -p, dy * (1 + p) - dx * s], [-dx, -dy, half]
     ways, turned = np.linalg.norm(rest[:2]), np.linalg.norm([by_x[:2], by_y[:2]])
     size = ways / turned if ways > 0 and turned > 0 else 1.0
     scales = np.array([size, size, 1.0])

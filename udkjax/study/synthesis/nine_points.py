@@ -57,7 +57,7 @@ class RealClasses(NamedTuple):
     """Four-bars of real classes, one each, in units of `scale` from the first place.
 
     Attributes:
-        boxes: proven to hold one solution each: x, y, a, b of both dyads, then cosines and sines of the coupler's turns.
+        boxes: proven to hold one solution each: joint and crank of both dyads, then cosines less one and sines of turns.
         paths: what became of all paths.
         unproven: how many more appear to be real, but could not be proven.
         scale: m, a power of two.
@@ -78,10 +78,11 @@ def find_real_classes(points: np.ndarray) -> RealClasses:
     x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
     reality = np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0))
     near = reality < NEARLY_REAL
-    joints, turns = 0.5 * (x + conjugates)[:, near], z[JOINTS:, near]
-    turns = turns / np.abs(turns)
+    joints, turns = 0.5 * (x + conjugates)[:, near], 1.0 + z[JOINTS:, near]
+    turns = turns / np.abs(turns) - 1.0
     u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
-    found = certify(four_bar_system(displacements(places)), u)
+    exact = Displacements(*(Ball.fractions(places[1:, k : k + 1]) - Ball.fractions(places[:1, k : k + 1]) for k in (0, 1)))
+    found = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
     keep = np.flatnonzero(found.is_proven)
     keep = keep[distinct(isotropic(found.middle[:, keep]))]
     sure = np.count_nonzero(~found.is_proven & (reality[near] < SURELY_REAL))
@@ -137,13 +138,14 @@ def start_solutions() -> tuple[np.ndarray, np.ndarray]:
 
 
 def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Return the turns t (8, M) of four-bars whose joints are known: both dyads' equations are linear in t and 1/t."""
+    """Return f (8, M) of four-bars whose joints are known: both dyads' equations are linear in 1 + f and 1 / (1 + f)."""
     d, D = parameters[:POINTS, None], parameters[POINTS:, None]
     rows = []
-    for x, X, a, A in (joints[:4], joints[4:]):
+    for x, X, r, R in (joints[:4], joints[4:]):
+        a, A = x - r, X - R
         rows.append((x * (D - A), X * (d - a), a * D + A * d - d * D - x * A - X * a))
-    (u, v, w), (p, q, r) = rows
-    return (w * q - v * r) / (u * q - v * p)
+    (u, v, w), (p, q, s) = rows
+    return (w * q - v * s) / (u * q - v * p) - 1.0
 
 
 def displacements(places: np.ndarray) -> Displacements:
@@ -159,7 +161,7 @@ def power_of_two_near(points: np.ndarray) -> float:
 
 
 def isotropic(u: np.ndarray) -> np.ndarray:
-    """Return x, X, a, A, y, Y, b, B (8, M) of real coordinates."""
+    """Return x, X, r, R, y, Y, s, S (8, M) of real coordinates."""
     z = (u[0:JOINTS:2] + 1j * u[1:JOINTS:2]).astype(complex)
     return np.stack([z, z.conj()], 1).reshape(JOINTS, -1)
 
@@ -169,7 +171,8 @@ def isotropic(u: np.ndarray) -> np.ndarray:
 
 def class_keys(z: np.ndarray) -> np.ndarray:
     """Return numbers (4, M) that all six of a class share: symmetric functions of the pivots a, b, c of all cognates."""
-    x, X, a, A, y, Y, b, B = z[:JOINTS]
+    x, X, r, R, y, Y, s, S = z[:JOINTS]
+    a, A, b, B = x - r, X - R, y - s, Y - S
     c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
     return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
 
@@ -222,7 +225,7 @@ def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.
     w, p = z[:, open_ends].astype(np.clongdouble), target.astype(np.clongdouble)
     size = np.full(len(open_ends), np.inf)
     for _ in range(REFINEMENTS):
-        columns = np.maximum(np.abs(w), 0.1).astype(float)
+        columns = np.maximum(np.abs(w), 1e-3).astype(float)
         slopes = _jacobian(w.astype(complex), target) * columns.T[:, None, :]
         singular = ~(np.linalg.slogdet(np.where(np.isfinite(slopes), slopes, 0.0))[1] > -np.inf)
         slopes[singular] = np.eye(UNKNOWNS)
@@ -235,18 +238,22 @@ def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.
 
 
 def _residuals(z: np.ndarray, p: np.ndarray) -> np.ndarray:
-    t, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
-    return np.concatenate(
-        [t * x * (D - A) + X * (d - a) / t + d * D - a * D - A * d + x * A + X * a for x, X, a, A in (z[:4], z[4:JOINTS])]
-    )
+    f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    F, found = -f / (1 + f), []
+    for x, X, r, R in (z[:4], z[4:JOINTS]):
+        e, E = d + f * x, D + F * X
+        found.append(e * (E + R) + E * r)
+    return np.concatenate(found)
 
 
 def _jacobian(z: np.ndarray, p: np.ndarray) -> np.ndarray:
-    t, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
-    found, places = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex), np.arange(POINTS)
+    f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    F, places = -f / (1 + f), np.arange(POINTS)
+    found = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex)
     for k, first in ((0, 0), (4, POINTS)):
-        x, X, a, A = z[k : k + 4]
-        for column, slope in enumerate((t * (D - A) + A, (d - a) / t + a, X - X / t - D, x - t * x - d)):
+        x, X, r, R = z[k : k + 4]
+        e, E = d + f * x, D + F * X
+        for column, slope in enumerate((f * (E + R), F * (e + r), E, e)):
             found[:, first : first + POINTS, k + column] = slope.T
-        found[:, first + places, JOINTS + places] = (x * (D - A) - X * (d - a) / t**2).T
+        found[:, first + places, JOINTS + places] = (x * (E + R) - X * (e + r) / (1 + f) ** 2).T
     return found
