@@ -21,6 +21,7 @@ SLOW: set[str] = {
     "gains",
     "threshold_map",
     "tune_gains",
+    "nine_points",
     "properties",  # a slice of it: tests/properties
 }
 README = (HERE / "README.md").read_text(encoding="utf-8")
