@@ -35,8 +35,3 @@ def exact(ts: Float[np.ndarray, "T"], state: udk.State) -> Float[np.ndarray, "T 
     q = exact_coordinates(parallelogram(), ts, state.q, state.v)
     assert q is not None
     return q
-
-
-def errors(ts: Float[np.ndarray, "T"], q, state: udk.State) -> Float[np.ndarray, " T"]:
-    """Return the largest error of any coordinate (m, rad) at each output; not a number where the run has ended."""
-    return np.abs(np.asarray(q) - exact(ts, state)).max(axis=(1, 2))
