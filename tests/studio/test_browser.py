@@ -546,3 +546,19 @@ def test_a_pin_between_the_ends_of_a_bar_stays_on_it_and_what_cannot_move_is_sai
     assert "it cannot move" in studio.findings  # three cranks that are no parallelogram
     assert studio.js("studio.motion.end") == 0
     assert "loops closed" in studio.status()
+
+
+@pytest.mark.slow
+def test_exports_are_chosen_and_named_in_a_dialog(studio):
+    studio.js("studio.files.openTemplate('four_bar')")
+    studio.settle()
+    for ending in ("csv", "svg", "py"):
+        studio.page.get_by_role("button", name="export as").click()
+        studio.page.get_by_label("form", exact=True).select_option(ending)
+        studio.page.get_by_label("file name").fill(f"exported.{ending}")
+        studio.page.get_by_label("file name").press("Enter")
+        studio.until(f"studio.parts.status.textContent.startsWith('wrote exported.{ending}')")
+        assert (studio.folder / f"exported.{ending}").stat().st_size > 500
+    studio.page.keyboard.press("Control+n")  # what the dialog leaves the keys to
+    studio.settle()
+    assert studio.document["pins"] == {}
