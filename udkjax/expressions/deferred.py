@@ -99,11 +99,11 @@ def _evaluate(*xs: Any, call_jaxpr: Any) -> list[Array]:
         try:
             with np.errstate(all="ignore"):
                 found = numpy_program(call_jaxpr)(meter, [np.asarray(x) for x in xs])
-            return jax.device_put([np.asarray(x, a.dtype) for x, a in zip(found, call_jaxpr.out_avals, strict=True)])
         except TooLongError:
-            pass
-        finally:
+            _SPENT[call_jaxpr] = limit
+        else:
             _SPENT[call_jaxpr] = spent + meter.count
+            return jax.device_put([np.asarray(x, a.dtype) for x, a in zip(found, call_jaxpr.out_avals, strict=True)])
     return _compiled(call_jaxpr)(*xs)
 
 

@@ -13,6 +13,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.expressions.numpy_program import TooLongError, expand_as
 from udkjax.integrate.traced_numbers import Mask, replaced, select
 from udkjax.pinv.linear_primitive import linear_primitive
 
@@ -172,6 +174,17 @@ def _transpose(inputs, cotangent):
 
 
 _linear_p = linear_primitive("derivative_of_a_run", _apply, _shape, _derivative, _transpose)
+
+
+@eqxi.filter_primitive_def
+def _apply_first(linear, vector):
+    """Apply a map of first derivatives; those of higher orders take diffrax's loops, which are compiled in any case."""
+    if linear.run is None:
+        raise TooLongError
+    return _apply(linear, vector)
+
+
+expand_as(_linear_p, lambda **parameters: partial(_apply_first, **parameters))
 
 
 def _bind(linear: Linear, vector: Array) -> Array:

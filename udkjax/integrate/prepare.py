@@ -19,6 +19,7 @@ from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.outcome import increases, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
+from udkjax.integrate.solvers import is_explicit
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.checks import traced_numbers_hold
@@ -55,6 +56,12 @@ class Choices(NamedTuple):
     def of_mechanism(self) -> tuple[Any, ...]:
         """The arguments of `compile_mechanism` besides the mechanism and its analysis."""
         return (*self[4:10], self.engine)
+
+    @property
+    def take_diffrax(self) -> bool:
+        """True if diffrax integrates, whatever the mechanism is."""
+        others = self.adjoint is not None or self.meter is not None or not is_explicit(self.solver)
+        return self.engine == "diffrax" or others
 
     def arrays(self) -> "Choices":
         """Return the same with arrays of JAX in place of plain numbers, which compiled programs would take as fixed."""

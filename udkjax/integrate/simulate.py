@@ -6,6 +6,7 @@ from itertools import count
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -210,7 +211,10 @@ def _run(
                 return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
     given = bare, analysis, number(ts), state, closure, choices.arrays()
-    return _simulate(*given) if is_within_jit() else _compiled(*given)  # in which known numbers are traced, too
+    if is_within_jit():  # in which known numbers are traced, too
+        return _simulate(*given)
+    takes_diffrax = choices.take_diffrax or not isinstance(system, Mechanism)
+    return _compiled(*given) if takes_diffrax else _deferred(*given)  # diffrax takes hundreds of operations for each step
 
 
 def _simulate(
@@ -230,7 +234,7 @@ def _simulate(
     return _finish(run, raw, getattr(system, "body_names", ()), choices)
 
 
-_compiled = deferred(_simulate)
+_compiled, _deferred = eqx.filter_jit(_simulate), deferred(_simulate)
 
 
 def _finish(

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,7 +71,8 @@ def simulate_events(
     """
     listed, phases = _prepare(mechanism, events, analysis)
     given = Given(phases, listed, ts, state, closure, choices, max_events)
-    found, reasons = _run(given)
+    run = _run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run
+    found, reasons = run(given)
     names = tuple(e.name for e in listed)
     if is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
@@ -104,7 +106,6 @@ def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents], analysis: A
     return found, phases_of(mechanism, found, analysis)
 
 
-@deferred
 def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     """Run, and return with the result why machine code does not serve each phase."""
     phases, events, ts, state, closure, choices, max_events = given
@@ -135,6 +136,9 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     code = jnp.where(run.is_usable & stop_gradients(hybrid.has_usable_numbers), code, Result.invalid_argument)
     start = RunInput(problem.ts, problem.q, problem.v, code, choices.drift_tol)
     return run_events(hybrid, start, max_events), tuple(x.plan.why_not_native for x in compiled)
+
+
+_compiled_run, _deferred_run = eqx.filter_jit(_run), deferred(_run)
 
 
 def _solution(
