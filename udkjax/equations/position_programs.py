@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from udkjax.equations.motion_measures import MotionMeasures, MotionModel
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, trace
 from udkjax.expressions.differential import Differential
 from udkjax.expressions.elimination import SymbolicFactors
@@ -57,6 +58,7 @@ class PositionPrograms:
         derivatives: Whether measures have derivatives.
         rows: The scales of the m rows of Psi, by which what redundant rows leave is judged; by default one.
         chosen: Which of the model's measures; by default all.
+        motion: Measures of the motion, after those of the position.
 
     Raises:
         ValueError: The positions do not follow from the driver's value.
@@ -73,6 +75,7 @@ class PositionPrograms:
         derivatives: bool = True,
         rows: Sequence[float] | np.ndarray | None = None,
         chosen: slice | None = None,
+        motion: MotionModel | None = None,
     ):
         graph = self._graph = Graph()
         self._x = _inputs(graph, "x", "parameter", parameters)
@@ -89,8 +92,9 @@ class PositionPrograms:
         entries = [{place[k]: a for k, a in self._differential.row(r).items() if k in place} for r in self._psi]
         self._factors = SymbolicFactors(graph, entries, coordinates)
         self._measures = [*(self._q if positions else []), *measures.ravel()[chosen or slice(None)]]
+        self._motion = MotionMeasures(graph, motion, self._factors, self._x, self._s, self._q, self._d) if motion else None
         self._transmission = self._find_transmission() if transmission else None
-        count = len(self._measures) + transmission
+        count = len(self._measures) + (len(self._motion.values) if self._motion else 0) + transmission
         self.sizes = Sizes(parameters, coordinates, data, count)
         step = 2 + parameters if derivatives else 1
         self.places = [Place(k * step, k * step + 1, slice(k * step + 2, (k + 1) * step)) for k in range(count)]
@@ -116,7 +120,8 @@ class PositionPrograms:
         """The constants, s, q and d; the outputs."""
 
     def _outputs(self, derivatives: bool) -> list[Scalar]:
-        values = [*self._measures, *([] if self._transmission is None else [self._transmission[0]])]
+        of_motion = self._motion.values if self._motion else []
+        values = [*self._measures, *of_motion, *([] if self._transmission is None else [self._transmission[0]])]
         if not derivatives:
             return values
         slopes = self._slopes()
@@ -137,7 +142,9 @@ class PositionPrograms:
         else:
             adjoints = [self._factors.solve_transposed(row[len(moved) :]) for row in partial]
             along = [[-_dot(y, column, zero) for column in columns] for y in adjoints]
-        return [[a + b for a, b in zip(row, part, strict=False)] for row, part in zip(partial, along, strict=True)]
+        found = [[a + b for a, b in zip(row, part, strict=False)] for row, part in zip(partial, along, strict=True)]
+        place = len(self._measures)
+        return [*found[:place], *(self._motion.slopes() if self._motion else []), *found[place:]]
 
     def _column(self, variable: Scalar) -> list[Scalar]:
         """Return the derivatives of Psi by one number."""

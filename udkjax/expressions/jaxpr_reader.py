@@ -33,6 +33,7 @@ _INLINED = (
     "remat2",
     "checkpoint",
 )
+POWERS = 20  # of two that are summed exactly, also in single precision
 UNROLLED_OPERATIONS = 20_000  # operations of a loop of known length, of all rounds together: beyond it takes too long to compile
 # Primitives that put elements into an array: which of their inputs these are, and which are the indices.
 _REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.ndarray]]]] = {
@@ -127,6 +128,12 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [np.asarray(_select(equation, inputs), object)]
     if name in _REPLACING and all(s.constant is not None for i in _REPLACING[name](inputs)[1] for s in i.flat):
         return [np.asarray(_replace(equation, inputs), object)]
+    if name == "pad":
+        places = np.arange(inputs[0].size).reshape(inputs[0].shape)
+        taken = _fold(equation.primitive, parameters, [places, np.asarray(inputs[0].size)])
+        return [np.append(inputs[0].reshape(-1), inputs[1])[np.asarray(taken)]]
+    if name == "scatter-add" and all(s.constant is not None for s in inputs[1].flat):
+        return [_add_at(equation, *inputs)]
     if name == "unstack":
         return [np.asarray(x, object) for x in np.moveaxis(inputs[0], parameters["axis"], 0)]
     if name == "split":
@@ -203,6 +210,19 @@ def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
     values = [_values(i) if any(i is x for x in indices) else next(numbered).reshape(i.shape) for i in inputs]
     taken = _fold(equation.primitive, equation.params, values)
     return elements[np.asarray(taken, int)]
+
+
+def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates: np.ndarray) -> np.ndarray:
+    """Add the elements of one array to another at known indices: where each goes, JAX tells of powers of two, which sums hold."""
+    found, dtype = array.copy(), equation.outvars[0].aval.dtype
+    for first in range(0, updates.size, POWERS):
+        powers = np.zeros(updates.size, dtype)
+        powers[first : first + POWERS] = 2.0 ** np.arange(min(POWERS, updates.size - first))
+        zeros, places = np.zeros(array.shape, dtype), _values(indices)
+        sums = np.asarray(_fold(equation.primitive, equation.params, [zeros, places, powers.reshape(updates.shape)]), np.int64)
+        for k in range(first, min(first + POWERS, updates.size)):
+            found[sums >> (k - first) & 1 == 1] += updates.flat[k]
+    return found
 
 
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:

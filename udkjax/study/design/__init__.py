@@ -12,3 +12,10 @@ from udkjax.study.design.found import FoundDesign as FoundDesign
 from udkjax.study.design.goals import FunctionGoal as FunctionGoal
 from udkjax.study.design.goals import PathGoal as PathGoal
 from udkjax.study.design.goals import PoseGoal as PoseGoal
+from udkjax.study.design.motion_goals import EnergyGoal as EnergyGoal
+from udkjax.study.design.motion_goals import FrequencyGoal as FrequencyGoal
+from udkjax.study.design.motion_goals import LoadGoal as LoadGoal
+from udkjax.study.design.motion_goals import MotionGoal as MotionGoal
+from udkjax.study.design.motion_goals import MotionPoint as MotionPoint
+from udkjax.study.design.motion_goals import ToleranceGoal as ToleranceGoal
+from udkjax.study.design.motion_goals import TorqueGoal as TorqueGoal

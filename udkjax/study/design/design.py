@@ -13,7 +13,8 @@ from udkjax.scene.requirements import require_count, require_number
 from udkjax.study.design.design_problem import DesignProblem
 from udkjax.study.design.found import Designs, FoundDesign, verified
 from udkjax.study.design.goals import Goal
-from udkjax.study.design.limits import LengthLimits, Range, read_bounds
+from udkjax.study.design.limits import LengthLimits, Range, box_of, read_bounds
+from udkjax.study.design.motion_goals import MotionTerm
 from udkjax.study.design.polish import polish
 from udkjax.study.design.search import KEPT_TO, SearchState, improve, loss_of
 from udkjax.study.design.starts import find_starts
@@ -37,6 +38,7 @@ class DesignSearch:
         free: see `design`.
         bounds: see `design`.
         lengths: see `design`.
+        areas: see `design`.
         transmission: see `design`.
         rotation: see `design`.
         driver: see `design`.
@@ -49,10 +51,11 @@ class DesignSearch:
     def __init__(
         self,
         drawing: Drawing | Mechanism,
-        goal: Goal,
+        goal: Goal | Sequence[Goal | MotionTerm],
         free: Sequence[str] | None = None,
         bounds: Mapping[str, Any] | None = None,
         lengths: Mapping[tuple[str, str], Range] | None = None,
+        areas: Mapping[str, Any] | None = None,
         transmission: float = 0.0,
         rotation: bool | None = None,
         driver: Drive = None,
@@ -63,11 +66,16 @@ class DesignSearch:
             raise ValueError(f"transmission must be an angle below a right one (rad), not {transmission:g}")
         numbers = FreeNumbers(mechanism, _all_pins(mechanism) if free is None else free)
         driver = only_driver(mechanism) if driver is None else driver
+        goal, terms = _split(goal)
         goal.check(mechanism)
         goal.check_line(mechanism)
-        found = read_bounds(numbers, bounds or {}, _places(mechanism, goal), mechanism.name)
-        limits = LengthLimits(numbers, {} if lengths is None else lengths)
-        self.problem = DesignProblem(mechanism, goal, numbers, driver, found, limits, float(np.sin(transmission)), rotation)
+        limits = LengthLimits(numbers, lengths or {}, areas)
+        boxes = {f"pin.{pin}": box_of(np.asarray(area, float)) for pin, area in (areas or {}).items()}
+        boxes = {name: box for name, box in boxes.items() if name in numbers.names}
+        found = read_bounds(numbers, {**boxes, **(bounds or {})}, _places(mechanism, goal), mechanism.name)
+        self.problem = DesignProblem(
+            mechanism, goal, numbers, driver, found, limits, float(np.sin(transmission)), rotation, terms
+        )
 
     def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
         """Search from so many random mechanisms; return the best that differ.
@@ -86,7 +94,7 @@ class DesignSearch:
         if not len(trials.x):
             return Designs((), np.zeros(0), starts)
         state = search(problem, improve(problem, trials, STAGES[0][0], threads), threads)
-        loss = loss_of(state.found.r)
+        loss = loss_of(state.found)
         excess = np.max(state.found.limits, axis=1, initial=-np.inf)
         good = np.flatnonzero(state.found.is_there & (excess <= 100 * KEPT_TO * problem.scale))
         order = good[np.argsort(loss[good], kind="stable")]
@@ -125,10 +133,11 @@ def _distinct(problem: DesignProblem, state: SearchState, order: np.ndarray, los
 @checked
 def design(
     drawing: Drawing | Mechanism,
-    goal: Goal,
+    goal: Goal | Sequence[Goal | MotionTerm],
     free: Sequence[str] | None = None,
     bounds: Mapping[str, Any] | None = None,
     lengths: Mapping[tuple[str, str], Range] | None = None,
+    areas: Mapping[str, Any] | None = None,
     transmission: float = 0.0,
     rotation: bool | None = None,
     driver: Drive = None,
@@ -145,10 +154,13 @@ def design(
     Args:
         drawing: the structure: a drawing, or a mechanism with one degree of freedom once its drivers hold. Its pins say nothing
             but how links are joined, where they are free.
-        goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`.
+        goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`; or a list of it and of goals about the motion: `TorqueGoal`, `LoadGoal`,
+            `EnergyGoal`, `FrequencyGoal`, `ToleranceGoal` and `MotionGoal`.
         free: names of the numbers that are free, such as `pin.A` or `pin.C[0]`; by default all pins.
         bounds: (low, high) by the names of free numbers; each end one number, or of the number's shape (m).
         lengths: (least, most) distances (m) by two pins.
+        areas: by the name of a pin, where it stays as it is drawn: a circle (x, y, radius) or the corners (k, 2) of a convex
+            polygon (m).
         transmission: the least angle (rad) between the transmission and none: of a four-bar, by how much the transmission angle
             stays away from 0 and pi; over the whole turn if there is one.
         rotation: whether the driver has to make a whole turn; by default where it is an angle.
@@ -165,8 +177,17 @@ def design(
             instruction for something in the mechanism.
         ValueError: another argument cannot be used.
     """
-    found = DesignSearch(drawing, goal, free, bounds, lengths, transmission, rotation, driver)
+    found = DesignSearch(drawing, goal, free, bounds, lengths, areas, transmission, rotation, driver)
     return found(starts, seed, results)
+
+
+def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[MotionTerm]]:
+    """Return the one goal that says where the motion goes, and those that measure the motion."""
+    found = [goals] if isinstance(goals, Goal) else list(goals)
+    firsts, terms = [g for g in found if isinstance(g, Goal)], [g for g in found if isinstance(g, MotionTerm)]
+    if len(firsts) != 1 or len(terms) != len(found) - 1:
+        raise ValueError("goal must be a PathGoal, PoseGoal or FunctionGoal; in a list, one of them and any motion goals")
+    return firsts[0], terms
 
 
 def _all_pins(mechanism: Mechanism) -> list[str]:

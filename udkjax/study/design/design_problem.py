@@ -1,6 +1,6 @@
 """A design as a least-squares problem, evaluated for batches of trials by machine code in lanes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,10 +15,11 @@ from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.design.goals import Goal, goal_scale, place_of
 from udkjax.study.design.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
+from udkjax.study.design.motion_goals import MotionTerm
+from udkjax.study.design.motion_terms import TURN, CompiledTerm
 from udkjax.study.drive import Drive, drive
 from udkjax.study.free_numbers import FreeNumbers, position_model
 
-TURN = 2.0 * np.pi
 TURN_VALUES = 72  # of a turn from which searches start
 FINE_VALUES = 720  # of a turn that is to be made, in the end
 MARGIN_WEIGHT = 10.0  # of limits of transmission beside those of lengths: beyond them there is no mechanism
@@ -45,6 +46,8 @@ class TrialResiduals(NamedTuple):
         r: residuals (M, J, G).
         by_value: their derivatives by s (M, J, G).
         by_unknowns: their derivatives by x (M, J, G, P).
+        terms: residuals of motion goals (M, T).
+        terms_by_unknowns: their derivatives by x (M, T, P).
         transmission: (M, J), with the sign of the branch.
         limits: rows (M, K) that must not exceed zero, in the unit of residuals.
         limits_by_unknowns: their derivatives by x (M, K, P).
@@ -55,6 +58,8 @@ class TrialResiduals(NamedTuple):
     r: np.ndarray
     by_value: np.ndarray
     by_unknowns: np.ndarray
+    terms: np.ndarray
+    terms_by_unknowns: np.ndarray
     transmission: np.ndarray
     limits: np.ndarray
     limits_by_unknowns: np.ndarray
@@ -88,6 +93,7 @@ class DesignProblem:
         lengths: LengthLimits,
         transmission: float,
         rotation: bool | None,
+        terms: Sequence[MotionTerm] = (),
     ):
         self.mechanism, self.goal, self.free, self.driver, self.lengths = mechanism, goal, free, driver, lengths
         self.driven, self.least = drive(mechanism, driver), max(transmission, LEAST_TRANSMISSION)
@@ -108,6 +114,20 @@ class DesignProblem:
         self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # of the free numbers
         self.local = goal.values is None  # values are unknowns, too
         self._compile()
+        self.terms = self._compile_terms(terms)
+        self._require_effects()
+
+    def _compile_terms(self, terms: Sequence[MotionTerm]) -> list[CompiledTerm]:
+        goal, span = self.goal, None
+        if terms and not self.rotation:
+            if goal.values is None:
+                problem = (
+                    "goal: a motion is measured over a whole turn, or over values: give the first goal values, or say rotation"
+                )
+                raise SceneError([problem], self.mechanism.name)
+            span = float(goal.values[0]), float(goal.values[-1])
+        where = self._unit, self.scale, span, self.unknowns, goal.origin, self.shifted
+        return [CompiledTerm(term, self.mechanism, self.free, self.driver, self.driven, *where) for term in terms]
 
     def _compile(self):
         goal, count = self.goal, self.free.count
@@ -133,13 +153,12 @@ class DesignProblem:
         if self.rotation:
             self._margin, self._margin_code = made(slice(0, 0), True)
         self._points = self._point_program()
-        self._require_effects()
 
     def _require_effects(self):
         """Raise `SceneError` where a free number cannot change what is measured, such as a mass."""
-        outputs, places = self._fit.measure.outputs, self._fit.places[:-1]
-        entries = self.free.entries()
-        idle = [name for k, name in enumerate(entries) if all(outputs[place.by_parameters][k].is_zero for place in places)]
+        rows = [self._fit.measure.outputs[place.by_parameters] for place in self._fit.places[:-1]]
+        rows += [term.entries for term in self.terms]
+        idle = [name for k, name in enumerate(self.free.entries()) if all(row[k].is_zero for row in rows)]
         if idle:
             listed = ", ".join(map(quote, idle))
             raise SceneError([f"free: {listed} cannot change what the goal measures: leave it out"], self.mechanism.name)
@@ -300,7 +319,18 @@ class DesignProblem:
             limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
             by_x = table[:, :, G, 2:]  # values that are unknowns are held: what moves them is another residual's matter
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
-        return TrialResiduals(found.q, r, by_value, by_unknowns, tau, limits, slopes, is_there)
+        terms, by_terms = self._terms_of(x, is_there, threads)
+        return TrialResiduals(found.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, is_there)
+
+    def _terms_of(self, x: np.ndarray, is_there: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals of motion goals and their derivatives; trials without a motion are no longer there."""
+        count = sum(term.goal.samples for term in self.terms)
+        r, by_unknowns, place = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
+        for term in self.terms:
+            which, columns = np.flatnonzero(is_there), slice(place, place + term.goal.samples)
+            r[which, columns], by_unknowns[which, columns], is_there[which] = term(x[which], threads)
+            place = columns.stop
+        return r, by_unknowns
 
     def residuals_at(self, trials: Trials, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return residuals (M, J, G) alone, rows of lengths, and whether all positions exist (M,)."""

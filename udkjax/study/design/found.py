@@ -26,6 +26,7 @@ class FoundDesign(PrintsTable):
         mechanism: the mechanism, to be run, animated or saved.
         values: of the driver at the positions of the goal (J,) (rad, m).
         residuals: (J, G), of its motion, which `kinematics` follows over these values.
+        measures: of each goal about the motion, at its samples.
         transmission: the least over the positions, from 0 to 1; of a four-bar the sine of the transmission angle.
         turns: whether the driver makes a whole turn.
         parameters: the numbers that were free, by name.
@@ -36,6 +37,7 @@ class FoundDesign(PrintsTable):
     mechanism: Mechanism
     values: Float[np.ndarray, "J"]
     residuals: Float[np.ndarray, "J G"]
+    measures: tuple[np.ndarray, ...]
     transmission: float
     turns: bool
     parameters: dict[str, np.ndarray]
@@ -63,6 +65,7 @@ class FoundDesign(PrintsTable):
 
     def _table(self) -> PrintedTable:
         rows = [("loss", f"{self.loss:.6g}"), ("largest residual", f"{np.max(np.abs(self.residuals)):.3g}")]
+        rows += [("measures", ", ".join(f"{np.min(m):.4g} to {np.max(m):.4g}" for m in self.measures))] if self.measures else []
         rows += [("transmission", f"{self.transmission:.3g}"), ("turns", "yes" if self.turns else "no")]
         rows += [(f"pin.{name}", format_numbers(place, "m")) for name, place in self.pins.items()]
         return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
@@ -110,16 +113,19 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
     if problem.driven.is_angle:
         values = values + TURN * np.round((drawn - values[0]) / TURN)
     moved = follow(mechanism, problem.driver, values)
-    if moved is None:
-        return None
     numbers = FreeNumbers(mechanism, problem.free.names)
-    residuals = problem.residuals(np.append(numbers.vector, x[problem.free.count :]), moved.reshape(len(s), -1))
-    found = float(np.sum(residuals**2))
+    unknowns = np.append(numbers.vector, x[problem.free.count :])
+    measures = [term.measure_motion(mechanism, unknowns, values[0] - s[0]) for term in problem.terms]
+    if moved is None or any(m is None for m in measures):
+        return None
+    residuals = problem.residuals(unknowns, moved.reshape(len(s), -1))
+    of_terms = [term.residual(m) for term, m in zip(problem.terms, measures, strict=True)]
+    found = float(sum(np.sum(r**2) for r in (residuals, *of_terms)))
     if not abs(found - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
         return None
     tau = problem.transmission_at(x, s, q)
     parameters = dict(zip(numbers.names, numbers.values, strict=True))
-    return FoundDesign(found, mechanism, values, residuals, tau, turns, parameters, problem.driver)
+    return FoundDesign(found, mechanism, values, residuals, tuple(measures), tau, turns, parameters, problem.driver)
 
 
 def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:

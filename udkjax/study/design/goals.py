@@ -130,7 +130,8 @@ def place_of(mechanism: Mechanism, of: str, point: Numbers | None, q: Float[Arra
     return [jnp.asarray(found.x), jnp.asarray(found.y)]
 
 
-def _check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
+def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
+    """Raise `SceneError` where there is no such pin or body."""
     try:
         locate(mechanism, of, point)
     except ValueError as problem:
@@ -161,7 +162,7 @@ class PathGoal(Goal):
         return True
 
     def check(self, mechanism):
-        _check_place(mechanism, self.point, self.at)
+        check_place(mechanism, self.point, self.at)
 
     def measure(self, mechanism, q):
         return jnp.stack(place_of(mechanism, self.point, self.at, q))
@@ -206,7 +207,7 @@ class PoseGoal(Goal):
             problem = f"goal: no body named {quote(self.body)}{suggestion(self.body, mechanism.body_names)}"
             raise SceneError([problem], mechanism.name)
         if self.pin is not None:
-            _check_place(mechanism, self.pin, None)
+            check_place(mechanism, self.pin, None)
 
     def measure(self, mechanism, q):
         place = place_of(mechanism, f"body.{self.body}" if self.pin is None else f"joint.{self.pin}", None, q)

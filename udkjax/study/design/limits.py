@@ -1,4 +1,4 @@
-"""Limits of a design: bounds of free numbers, lengths between pins, and the least transmission."""
+"""Limits of a design: bounds of free numbers, lengths between pins, areas of pins, and the least transmission."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -74,41 +74,95 @@ def read_bounds(
 
 
 class LengthLimits:
-    """Ranges of distances between pins of a drawing: rows c(x) (K,) in m that must not exceed zero, and their derivatives.
+    """Distances between pins of a drawing, and areas of pins: rows c(x) (K,) in m that must not exceed zero, with derivatives.
 
     Args:
         free: the free numbers x.
         lengths: (least, most) in m by two pins.
+        areas: by a pin, a circle (x, y, radius) or the corners (k, 2) of a convex polygon, in m.
 
     Raises:
-        SceneError: there is no drawing, no such pin, or no such range.
+        SceneError: there is no drawing, no such pin, no such range, or no such area.
     """
 
-    def __init__(self, free: FreeNumbers, lengths: Mapping[tuple[str, str], Range]):
+    def __init__(self, free: FreeNumbers, lengths: Mapping[tuple[str, str], Range], areas: Mapping[str, object] | None = None):
         mechanism = free.mechanism
         ranges = [_read_range(mechanism, pins, ends) for pins, ends in lengths.items()]
-        if problems := [p for found in ranges for p in found[3]]:
+        problems = [p for found in ranges for p in found[3]]
+        found = {pin: read_area(mechanism, pin, area, problems) for pin, area in (areas or {}).items()}
+        if problems:
             raise SceneError(problems, mechanism.name)
         rows = [(pins, way, end) for pins, low, high, _ in ranges for way, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf]
-        self.count, self._free = len(rows), free.count
+        rows += [((None, pin), 1.0, area[2]) for pin, area in found.items() if area.ndim == 1]
+        centres = np.array([area[:2] for area in found.values() if area.ndim == 1]).reshape(-1, 2)
+        sides = [(pin, *side) for pin, area in found.items() if area.ndim == 2 for side in zip(*_sides(area), strict=True)]
+        self.count, self._free = len(rows) + len(sides), free.count
         self._way, self._end = np.array([way for _, way, _ in rows]), np.array([end for *_, end in rows])
 
         def between(x: Array) -> Array:  # affine: pins are free numbers, or stay where they are
             pins = free.moved(x).drawing.pins  # pyright: ignore
-            return jnp.stack([pins[b] - pins[a] for (a, b), *_ in rows])
+            ways = [pins[b] if a is None else pins[b] - pins[a] for (a, b), *_ in rows]
+            return jnp.stack([*ways, *(pins[pin] for pin, *_ in sides)])
 
         x = jnp.asarray(free.vector)
-        self._slopes = np.asarray(jax.jacobian(between)(x)) if rows else np.zeros((0, 2, free.count))
-        self._offset = np.asarray(between(x)) - self._slopes @ free.vector if rows else np.zeros((0, 2))
+        slopes = np.asarray(jax.jacobian(between)(x)) if self.count else np.zeros((0, 2, free.count))
+        offset = np.asarray(between(x)) - slopes @ free.vector if self.count else np.zeros((0, 2))
+        offset[len(rows) - len(centres) : len(rows)] -= centres
+        self._slopes, self._offset, ends = slopes[: len(rows)], offset[: len(rows)], slice(len(rows), None)
+        normals, distances = np.array([n for _, n, _ in sides]).reshape(-1, 2), np.array([d for *_, d in sides])
+        self._linear = np.einsum("kc,kcp->kp", normals, slopes[ends])
+        self._level = np.einsum("kc,kc->k", normals, offset[ends]) - distances
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return c (M, K) and dc/dx (M, K, P) of vectors (M, P), of which the first entries are the free numbers."""
         between = np.tensordot(x[:, : self._free], self._slopes, (1, 2)) + self._offset  # (M, K, 2)
         length = np.sqrt(np.sum(between**2, axis=2))
-        slopes = np.zeros((*length.shape, x.shape[1]))
+        slopes, first = np.zeros((len(x), self.count, x.shape[1])), length.shape[1]
         unit = self._way[:, None] * between / np.maximum(length, np.finfo(float).tiny)[..., None]
-        slopes[:, :, : self._free] = np.sum(unit[..., None] * self._slopes, axis=2)
-        return self._way * (length - self._end), slopes
+        slopes[:, :first, : self._free] = np.sum(unit[..., None] * self._slopes, axis=2)
+        slopes[:, first:, : self._free] = self._linear
+        sides = x[:, : self._free] @ self._linear.T + self._level
+        return np.concatenate([self._way * (length - self._end), sides], 1), slopes
+
+
+def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str]) -> np.ndarray:
+    """Return an area of a pin: a circle (3,), or the corners (k, 2) of a convex polygon; tell where it is neither."""
+    known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
+    try:
+        found = np.asarray(area, float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    is_circle = found.shape == (3,) and found[2] > 0
+    is_polygon = found.ndim == 2 and found.shape[1] == 2 and len(found) > 2 and _is_convex(found)
+    if pin not in known:
+        problems.append(f"areas: no pin named {quote(pin)}{suggestion(pin, known)}")
+    if not np.all(np.isfinite(found)) or not (is_circle or is_polygon):
+        problems.append(
+            f"areas.{pin}: must be a circle (x, y, radius), or the corners of a convex polygon, one after another (m)"
+        )
+        return np.zeros(3)
+    return found
+
+
+def box_of(area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest x and y of an area."""
+    return (area[:2] - area[2], area[:2] + area[2]) if area.ndim == 1 else (area.min(0), area.max(0))
+
+
+def _is_convex(corners: np.ndarray) -> bool:
+    way = np.roll(corners, -1, 0) - corners
+    after = np.roll(way, -1, 0)
+    turn = way[:, 0] * after[:, 1] - way[:, 1] * after[:, 0]
+    around = np.sum(np.arctan2(turn, np.sum(way * after, 1)))
+    return bool(np.all(turn > 0) or np.all(turn < 0)) and abs(around) < 3 * np.pi  # once around
+
+
+def _sides(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outward normal (k, 2) of each side of a convex polygon, and its distance from the origin (k,)."""
+    way = np.roll(corners, -1, 0) - corners
+    normal = np.stack([way[:, 1], -way[:, 0]], 1) / np.linalg.norm(way, axis=1)[:, None]
+    outward = np.sign(np.sum(normal * (corners - corners.mean(0)), 1, keepdims=True))
+    return outward * normal, np.sum(outward * normal * corners, 1)
 
 
 def _read_range(mechanism: Mechanism, pins: Sequence[str], ends: Range) -> tuple[tuple[str, ...], float, float, list[str]]:

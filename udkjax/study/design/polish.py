@@ -112,6 +112,7 @@ def _gradient(
 ) -> np.ndarray:
     excess = weight[:, None] ** 2 * (found.limits + multipliers) * pressed
     by_x = np.einsum("mjgp,mjg->mp", found.by_unknowns, found.r) + np.einsum("mkp,mk->mp", found.limits_by_unknowns, excess)
+    by_x += np.einsum("mtp,mt->mp", found.terms_by_unknowns, found.terms)
     if not problem.local:
         return 2.0 * by_x
     return 2.0 * np.concatenate([by_x, np.einsum("mjg,mjg->mj", found.by_value, found.r)], 1)

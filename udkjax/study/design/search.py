@@ -46,9 +46,9 @@ class SearchState:
         return SearchState(self.trials.take(which), found, *(a[which] for a in rest))
 
 
-def loss_of(r: np.ndarray) -> np.ndarray:
-    """Return the sum of the squares of residuals (M,)."""
-    return np.einsum("mjg,mjg->m", r, r)
+def loss_of(found: TrialResiduals) -> np.ndarray:
+    """Return the sum of the squares of all residuals (M,)."""
+    return np.einsum("mjg,mjg->m", found.r, found.r) + np.einsum("mt,mt->m", found.terms, found.terms)
 
 
 def improve(
@@ -81,13 +81,12 @@ def _first_state(problem: DesignProblem, trials: Trials, threads: int | None) ->
 
 def merit_of(found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the loss with what limits add to it (M,)."""
-    return merit(found.r, found.limits, multipliers, weight)
+    return loss_of(found) + _pressure(found.limits, multipliers, weight)
 
 
-def merit(r: np.ndarray, limits: np.ndarray, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the merit (M,) of residuals and rows of limits, such as the first ones."""
+def _pressure(limits: np.ndarray, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
     excess = weight[:, None] * np.maximum(limits + multipliers, 0.0)
-    return loss_of(r) + np.einsum("mk,mk->m", excess, excess)
+    return np.einsum("mk,mk->m", excess, excess)
 
 
 def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: np.ndarray, threads: int | None):
@@ -97,7 +96,7 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     before, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
 
     def worth(r: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        return merit(r, lengths, u[:, : lengths.shape[1]], weight) < before
+        return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < before
 
     there = problem.evaluate(new, state.margin[active], threads, worth)
     exists = there.is_there & np.all(np.sign(there.transmission) == sign[active][:, None], axis=1)

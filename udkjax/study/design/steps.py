@@ -36,6 +36,8 @@ class StepEquations:
         members, P = trials.x.shape
         J = found.by_unknowns.reshape(members, -1, P)
         self.A = J.transpose(0, 2, 1) @ J
+        if found.terms.size:
+            self.A += found.terms_by_unknowns.transpose(0, 2, 1) @ found.terms_by_unknowns
         self.diagonal = np.einsum("mpp->mp", self.A).copy()
         if problem.local:
             self.w = np.einsum("mjg,mjgp->mjp", found.by_value, found.by_unknowns)
@@ -46,6 +48,7 @@ class StepEquations:
     def find(self) -> tuple[np.ndarray, np.ndarray]:
         """Return changes dx (M, P), ds (M, J) that are not too long, and leave values in their order."""
         b, g = self._right_hand_side(self.found.r)
+        b = b + (self.found.terms[:, None] @ self.found.terms_by_unknowns)[:, 0]
         members, P = b.shape
         slopes, low, high = self.found.limits_by_unknowns, self.trials.x <= self.problem.low, self.trials.x >= self.problem.high
         self.matrix, dx = np.empty((members, P, P)), np.empty((members, P))

@@ -1,0 +1,144 @@
+"""Measures of a motion of a driven mechanism, such as torques, as expressions, with their derivatives by adjoint equations.
+
+Along the value s of the driver, from Psi(x, s, q) = 0,
+
+    F_1 = Psi_q u + Psi_s = 0,      u = dq/ds,
+    F_2 = Psi_q w + D^2 Psi = 0,    w = d^2q/ds^2, D the derivative along (s, q) = (1, u),
+    F_3 = Psi_q^T y - b = 0,        b(x, s, q, u, w), such as M a - F, of which y are the forces of the joints.
+
+The derivatives of a measure g(x, s, q, u, w, y, d) are those of L = g - z_0 Psi - z_1 F_1 - z_2 F_2 - z_3 F_3 by x and s, with
+multipliers by which L does not change with y, w, u and q, one after another: each by one solution with Psi_q or its transpose.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
+from udkjax.expressions.differential import Differential, Row
+from udkjax.expressions.elimination import SymbolicFactors
+
+
+class MotionModel(NamedTuple):
+    """What is measured of a motion, by JAX.
+
+    Attributes:
+        psi: Psi (m,) of x, s and q.
+        loads: b (k, n) of x, s, q, u and w; k may be zero.
+        measures: g (G,) of x, s, q, u, w, y (k, m) and d.
+    """
+
+    psi: Callable[..., jax.Array]
+    loads: Callable[..., jax.Array]
+    measures: Callable[..., jax.Array]
+
+
+class MotionMeasures:
+    """The measures of a model in a graph: `values`, and by `slopes` their derivatives by s and x.
+
+    Everything is written first in a graph of its own, in which x, s, q, u, w, y and the multipliers are inputs, so that it can be
+    differentiated by each; then it is copied with what they are.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        model: MotionModel,
+        factors: SymbolicFactors,
+        x: Sequence[Scalar],
+        s: Scalar,
+        q: Sequence[Scalar],
+        d: Sequence[Scalar],
+    ):
+        self._graph, self._factors, n = graph, factors, len(q)
+        self._own, self._known = Graph(), {}
+        zero = self._own.constant(0.0)
+        X, S, Q = self._let("x", x), self._let("s", [s]), self._let("q", q)
+        (psi,) = _read(self._own, model.psi, X, S[0], Q)
+        moved = Differential(self._own, psi, [*S, *Q])
+        u = self._inputs("u", n)
+        first = [moved.row(r).get(S[0].index, zero) + _along(moved.row(r), Q, u, zero) for r in psi]
+        self._set(u, self._solved(first, u))
+        bent = Differential(self._own, first, [*S, *Q])
+        w = self._inputs("w", n)
+        second = [
+            bent.row(f).get(S[0].index, zero) + _along(bent.row(f), Q, u, zero) + _along(moved.row(r), Q, w, zero)
+            for f, r in zip(first, psi, strict=True)
+        ]
+        self._set(w, self._solved(second, w))
+        (b,) = _read(self._own, model.loads, X, S[0], Q, u, w)
+        y = [self._inputs(f"y{k}", len(psi)) for k in range(len(b))]
+        for row, right in zip(y, b, strict=True):
+            self._set(row, factors.solve_transposed(self._copy(list(right))))
+        shaped = np.array(y, object).reshape(len(b), len(psi))
+        (g,) = _read(self._own, model.measures, X, S[0], Q, u, w, shaped, self._let("d", d))
+        self.values = self._copy(list(g.flat))
+        left = [[_column(moved, psi, row, v, zero) - right[k] for k, v in enumerate(Q)] for row, right in zip(y, b, strict=True)]
+        self._parts = list(g.flat), list(psi), first, second, left
+        self._by = (*S, *X), Q, u, w, y
+
+    def slopes(self) -> list[list[Scalar]]:
+        """Return the derivatives of each measure by s and x."""
+        g, psi, first, second, left = self._parts
+        moved, Q, u, w, y = self._by
+        z = [self._inputs(f"z{k}", len(psi)) for k in range(3)]
+        z3 = [self._inputs(f"z3{k}", len(Q)) for k in range(len(y))]
+        taken = self._own.constant(0.0)
+        for rows, by in ((psi, z[0]), (first, z[1]), (second, z[2]), *zip(left, z3, strict=True)):
+            for row, multiplier in zip(rows, by, strict=True):
+                taken = taken + row * multiplier
+        found, zero = [], self._graph.constant(0.0)
+        for measure in g:
+            L = measure - taken
+            every = [*moved, *Q, *u, *w, *(v for row in y for v in row)]
+            row = Differential(self._own, [L], every).row(L)
+            for k in (*z[0], *z[1], *z[2], *(v for right in z3 for v in right)):
+                self._known[k.index] = zero
+            for variables, multipliers in zip(y, z3, strict=True):
+                self._set(multipliers, self._factors.solve(self._slope(row, variables)))
+            for variables, multipliers in ((w, z[2]), (u, z[1]), (Q, z[0])):
+                self._set(multipliers, self._factors.solve_transposed(self._slope(row, variables)))
+            found.append(self._slope(row, moved))
+        return found
+
+    def _slope(self, row: Row, variables: Sequence[Scalar]) -> list[Scalar]:
+        zero = self._own.constant(0.0)
+        return self._copy([row.get(v.index, zero) for v in variables])
+
+    def _inputs(self, name: str, count: int) -> np.ndarray:
+        return np.array([self._own.input((name, k), name) for k in range(count)], object)
+
+    def _let(self, name: str, values: Sequence[Scalar]) -> np.ndarray:
+        found = self._inputs(name, len(values))
+        self._set(found, values)
+        return found
+
+    def _set(self, variables: Sequence[Scalar] | np.ndarray, values: Sequence[Scalar]):
+        self._known |= {v.index: value for v, value in zip(variables, values, strict=True)}
+
+    def _solved(self, rows: Sequence[Scalar], variables: np.ndarray) -> list[Scalar]:
+        """Return the values of variables for which rows vanish, which are Psi_q times them and more."""
+        self._set(variables, [self._graph.constant(0.0)] * len(variables))
+        return [-v for v in self._factors.solve(self._copy(rows))]
+
+    def _copy(self, outputs: Sequence[Scalar]) -> list[Scalar]:
+        inputs = [Scalar(self._own, k) for k in self._known]
+        return self._graph.copy(ScalarProgram(self._own, inputs, list(outputs)), self._known)
+
+
+def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar | np.ndarray) -> list[np.ndarray]:
+    given = [np.array(a, object) for a in arguments]
+    return trace(function, *[jnp.zeros(a.shape) for a in given])(graph, *given)
+
+
+def _along(row: Row, variables: Sequence[Scalar], tangents: Sequence[Scalar], zero: Scalar) -> Scalar:
+    """Return a row times tangents of some of its variables."""
+    return sum((row[v.index] * t for v, t in zip(variables, tangents, strict=True) if v.index in row), zero)
+
+
+def _column(moved: Differential, rows: Sequence[Scalar], y: Sequence[Scalar], variable: Scalar, zero: Scalar) -> Scalar:
+    """Return the derivative of rows times y by one variable."""
+    return sum((moved.row(r)[variable.index] * k for r, k in zip(rows, y, strict=True) if variable.index in moved.row(r)), zero)
