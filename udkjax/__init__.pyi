@@ -98,10 +98,17 @@ from udkjax.study.channel_values import path as path
 from udkjax.study.continuation import Reached as Reached
 from udkjax.study.design import Designs as Designs
 from udkjax.study.design import DesignSearch as DesignSearch
+from udkjax.study.design import EnergyGoal as EnergyGoal
 from udkjax.study.design import FoundDesign as FoundDesign
+from udkjax.study.design import FrequencyGoal as FrequencyGoal
 from udkjax.study.design import FunctionGoal as FunctionGoal
+from udkjax.study.design import LoadGoal as LoadGoal
+from udkjax.study.design import MotionGoal as MotionGoal
+from udkjax.study.design import MotionPoint as MotionPoint
 from udkjax.study.design import PathGoal as PathGoal
 from udkjax.study.design import PoseGoal as PoseGoal
+from udkjax.study.design import ToleranceGoal as ToleranceGoal
+from udkjax.study.design import TorqueGoal as TorqueGoal
 from udkjax.study.design import design as design
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
 from udkjax.study.diagnosis import diagnose as diagnose

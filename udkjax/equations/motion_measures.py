@@ -21,9 +21,11 @@ from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
 from udkjax.expressions.differential import Differential, Row
 from udkjax.expressions.elimination import SymbolicFactors
 
+Scalars = Sequence[Scalar] | np.ndarray
+
 
 class MotionModel(NamedTuple):
-    """What is measured of a motion, by JAX.
+    """The functions of a motion, by JAX.
 
     Attributes:
         psi: Psi (m,) of x, s and q.
@@ -104,7 +106,7 @@ class MotionMeasures:
             found.append(self._slope(row, moved))
         return found
 
-    def _slope(self, row: Row, variables: Sequence[Scalar]) -> list[Scalar]:
+    def _slope(self, row: Row, variables: Scalars) -> list[Scalar]:
         zero = self._own.constant(0.0)
         return self._copy([row.get(v.index, zero) for v in variables])
 
@@ -116,7 +118,7 @@ class MotionMeasures:
         self._set(found, values)
         return found
 
-    def _set(self, variables: Sequence[Scalar] | np.ndarray, values: Sequence[Scalar]):
+    def _set(self, variables: Scalars, values: Sequence[Scalar]):
         self._known |= {v.index: value for v, value in zip(variables, values, strict=True)}
 
     def _solved(self, rows: Sequence[Scalar], variables: np.ndarray) -> list[Scalar]:
@@ -134,11 +136,11 @@ def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar |
     return trace(function, *[jnp.zeros(a.shape) for a in given])(graph, *given)
 
 
-def _along(row: Row, variables: Sequence[Scalar], tangents: Sequence[Scalar], zero: Scalar) -> Scalar:
+def _along(row: Row, variables: Scalars, tangents: Scalars, zero: Scalar) -> Scalar:
     """Return a row times tangents of some of its variables."""
     return sum((row[v.index] * t for v, t in zip(variables, tangents, strict=True) if v.index in row), zero)
 
 
-def _column(moved: Differential, rows: Sequence[Scalar], y: Sequence[Scalar], variable: Scalar, zero: Scalar) -> Scalar:
+def _column(moved: Differential, rows: Scalars, y: Scalars, variable: Scalar, zero: Scalar) -> Scalar:
     """Return the derivative of rows times y by one variable."""
     return sum((moved.row(r)[variable.index] * k for r, k in zip(rows, y, strict=True) if variable.index in moved.row(r)), zero)

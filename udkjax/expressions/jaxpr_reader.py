@@ -128,10 +128,10 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [np.asarray(_select(equation, inputs), object)]
     if name in _REPLACING and all(s.constant is not None for i in _REPLACING[name](inputs)[1] for s in i.flat):
         return [np.asarray(_replace(equation, inputs), object)]
-    if name == "pad":
-        places = np.arange(inputs[0].size).reshape(inputs[0].shape)
-        taken = _fold(equation.primitive, parameters, [places, np.asarray(inputs[0].size)])
-        return [np.append(inputs[0].reshape(-1), inputs[1])[np.asarray(taken)]]
+    if name in ("pad", "tile"):  # where elements go, JAX tells of their places; after them comes that of what pads
+        places, size = np.arange(inputs[0].size).reshape(inputs[0].shape), inputs[0].size
+        taken = _fold(equation.primitive, parameters, [places, *(np.asarray(size) for _ in inputs[1:])])
+        return [np.concatenate([i.reshape(-1) for i in inputs])[np.asarray(taken)]]
     if name == "scatter-add" and all(s.constant is not None for s in inputs[1].flat):
         return [_add_at(equation, *inputs)]
     if name == "unstack":

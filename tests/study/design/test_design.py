@@ -25,7 +25,23 @@ SLIDER_CRANK = udk.Drawing(
     slots=[{"pin": "B", "direction": 0.3}],
     motors={"motor": {"pin": "O", "speed": 1.0}},
 )
-SIX_BAR = udk.load(Path(__file__).parents[3] / "examples" / "six_bar.toml")
+SCENES = Path(__file__).parents[3] / "examples"
+SIX_BAR = udk.load(SCENES / "six_bar.toml")
+GEARED = udk.Drawing(
+    pins={"O": (0, 0), "A": (1, 1.5), "B": (4, 5), "C": (8, 1.5), "D": (6, 0), "P": (4.5, 7)},
+    links={"first": {"pins": ["O", "A"], "mass": 1.0}, "one": {"pins": ["A", "B", "P"], "mass": 1.0}}
+    | {"other": {"pins": ["C", "B"], "mass": 1.0}, "second": {"pins": ["D", "C"], "mass": 1.0}},
+    ground=["O", "D"],
+    motors={"motor": {"pin": "O", "speed": 1.0}},
+    gears=[{"links": ["first", "second"], "teeth": [20, 40]}],
+)
+PARALLELOGRAM = udk.Drawing(
+    pins={"O": (0, 0), "A": (1, 2), "B": (5, 2), "C": (4, 0), "D": (2, -1), "E": (3, 1), "P": (3, 4)},
+    links={"crank": {"pins": ["O", "A"], "mass": 1.0}, "coupler": {"pins": ["A", "E", "B", "P"], "mass": 1.0}}
+    | {"first": {"pins": ["C", "B"], "mass": 1.0}, "second": {"pins": ["D", "E"], "mass": 1.0}},
+    ground=["O", "C", "D"],
+    motors={"motor": {"pin": "O", "speed": 1.0}},
+)
 
 
 def motion(mechanism, count, span=1.8):
@@ -157,6 +173,15 @@ KINDS = {
     "a slot": (SLIDER_CRANK.mechanism(), ["pin.A", "pin.B", "pin.P", "slot.slot1.direction"], "P"),
     "pins of a six-bar": (SIX_BAR, [f"pin.{name}" for name in ("O2", "A", "B", "C", "O4", "D")], "D"),
     "points of joints": (udk.library.four_bar(), ["joint.A.points", "joint.B.points", "joint.D.points[0]"], "C"),
+    "pins of a geared five-bar": (GEARED.mechanism(), [f"pin.{name}" for name in "OABCDP"], "P"),
+    "radii of a cam": (udk.load(SCENES / "drawings" / "cam_follower.toml"), ["cam.cam1.profile.radius"], "P"),
+    "the point of a redundant parallelogram": (PARALLELOGRAM.mechanism(), ["pin.P"], "P"),
+}
+GOALS = {
+    "pins of a four-bar": [
+        udk.PoseGoal("coupler", [[6, 12, 0.1], [4, 10, 0.3], [2, 8, 0.2]], pin="P"),
+        udk.FunctionGoal("body.rocker.angle", [0.1, 0.2, 0.3], [0.0, 0.1, 0.3]),
+    ],
 }
 
 
@@ -166,29 +191,67 @@ def test_the_loss_moves_when_any_parameter_does(kind):
     driver = mechanism.driver_names[0] if mechanism.driver_names else "body.crank.angle"
     moved = udk.kinematics(mechanism, driver, start_of(mechanism, driver) + np.array([0.1, 0.2, 0.3]))
     places = np.asarray(udk.path(mechanism, moved, point))
-    goal = udk.PathGoal(point, places + 0.1 * np.ptp(places) * np.array([[1.0, 0.3], [-0.2, 0.7], [0.5, -1.0]]))
-    problem = udk.DesignSearch(mechanism, goal, free, driver=driver, rotation=False).problem
-    x, s = problem.free.vector[None], np.asarray(moved.values)[None]
+    path = udk.PathGoal(point, places + 0.1 * np.ptp(places) * np.array([[1.0, 0.3], [-0.2, 0.7], [0.5, -1.0]]))
+    for goal in (path, *GOALS.get(kind, [])):
+        moving = free if goal.has_place else [name for name in free if name != "pin.P"]  # an output does not depend on a point
+        problem = udk.DesignSearch(mechanism, goal, moving, driver=driver, rotation=False).problem
+        require_slopes(problem, np.asarray(moved.values)[None])
+
+
+def require_slopes(problem, s):
+    """The slopes of the loss by all unknowns are not zero, and those of differences."""
+    x = np.append(problem.free.vector, np.full(problem.unknowns - problem.free.count, 0.1))[None]
     q, reached = problem.march(x, s)
     assert reached.all()
 
     def loss(x):
         found = problem.evaluate(Trials(x, np.repeat(s, len(x), 0), np.repeat(q, len(x), 0)), np.zeros(len(x)))
-        return loss_of(found.r), 2.0 * np.einsum("mjg,mjgp->mp", found.r, found.by_unknowns)
+        return loss_of(found), 2.0 * np.einsum("mjg,mjgp->mp", found.r, found.by_unknowns)
 
-    h = 1e-6 * np.ptp(places)
+    h = 1e-6 * problem.scale
     steps = h * np.eye(x.shape[1])
     slopes = (loss(x + steps)[0] - loss(x - steps)[0]) / (2 * h)
     exact = loss(x)[1][0]
     np.testing.assert_allclose(exact, slopes, atol=1e-6 * np.max(np.abs(slopes)))
-    for name, slope in zip(problem.free.entries(), exact, strict=True):
-        assert slope != 0.0, name
+    assert np.all(exact != 0.0), problem.free.entries()
 
 
 def start_of(mechanism, driver):
     from udkjax.study.drive import drive
 
     return float(drive(mechanism, driver).value(mechanism.q0))
+
+
+@pytest.mark.slow
+def test_geared_cam_and_redundant_mechanisms_are_designed():
+    places = np.array([[0, 0], [2, 1], [3, 3], [1, 4], [-1, 3], [0, 0.0]])
+    geared = udk.design(GEARED, udk.PathGoal("P", places), starts=60, results=1)
+    assert geared[0].loss < 0.5 and geared[0].turns
+    plane = udk.design(PARALLELOGRAM, udk.PathGoal("P", [[3, 4], [2, 5], [1, 4.5], [0.5, 4]]), ["pin.P"], starts=30, results=1)
+    radius = np.hypot(1, 2)  # P goes along a circle of the cranks' radius, wherever it is
+    moved = udk.kinematics(plane[0].mechanism, "motor", np.linspace(0, 2, 5) + plane[0].values[0])
+    path = np.asarray(udk.path(plane[0].mechanism, moved, "P"))
+    chord = np.linalg.norm(path[1:] - path[0], axis=1)
+    np.testing.assert_allclose(chord, 2 * radius * np.sin(np.linspace(0, 2, 5)[1:] / 2), rtol=1e-9)
+    angles = 2 * np.pi * np.arange(12) / 12
+    goals = [udk.FunctionGoal("body.follower.y", angles, 0.01 * (1 - np.cos(angles))), udk.TorqueGoal(most=2.0)]
+    ends = {"cam.cam1.profile.radius": (0.02, 0.06)}
+    cam = udk.design(KINDS["radii of a cam"][0], goals, ["cam.cam1.profile.radius"], bounds=ends, starts=30, results=1)
+    assert cam[0].loss < 1e-20 and np.max(cam[0].measures[0]) <= 2.0
+
+
+def test_pins_stay_within_their_areas():
+    areas = {"O": (-2, -2, 1.5), "C": [[10, 0], [14, 1], [12, 5]]}
+    found = udk.design(FOUR_BAR, udk.PathGoal("P", [[6, 12], [4, 10], [2, 8]]), areas=areas, starts=30, results=2)
+    assert len(found)
+    for one in found:
+        assert np.linalg.norm(np.asarray(one.pins["O"]) + 2) < 1.5 + 1e-5
+        corners, place = np.array(areas["C"], float), np.asarray(one.pins["C"])
+        way = np.roll(corners, -1, 0) - corners
+        assert np.all(way[:, 0] * (place - corners)[:, 1] - way[:, 1] * (place - corners)[:, 0] > -1e-4)
+    for bad in ({"Q": (0, 0, 1)}, {"O": (0, 0, -1)}, {"O": [[0, 0], [1, 0], [0.2, 0.2], [0, 1]]}):
+        with pytest.raises(udk.SceneError, match="areas"):
+            udk.DesignSearch(FOUR_BAR, udk.PathGoal("P", [[0, 0], [1, 1]]), areas=bad)
 
 
 def test_places_that_are_one_do_not_shrink_the_mechanism_to_a_point():

@@ -115,8 +115,9 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
     moved = follow(mechanism, problem.driver, values)
     numbers = FreeNumbers(mechanism, problem.free.names)
     unknowns = np.append(numbers.vector, x[problem.free.count :])
-    measures = [term.measure_motion(mechanism, unknowns, values[0] - s[0]) for term in problem.terms]
-    if moved is None or any(m is None for m in measures):
+    tried = [term.measure_motion(mechanism, unknowns, values[0] - s[0]) for term in problem.terms]
+    measures = [m for m in tried if m is not None]
+    if moved is None or len(measures) < len(tried):
         return None
     residuals = problem.residuals(unknowns, moved.reshape(len(s), -1))
     of_terms = [term.residual(m) for term, m in zip(problem.terms, measures, strict=True)]

@@ -12,11 +12,25 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.toml_text import parse_toml
 from udkjax.study.design.design import DesignSearch
 from udkjax.study.design.goals import FunctionGoal, Goal, PathGoal, PoseGoal
+from udkjax.study.design.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
 from udkjax.study.synthesis.complete_design import CompleteSearch
 
 Table = Mapping[str, Any]
-TOP = ("mechanism", "units", "goal", "complete", "free", "driver", "bounds", "length", "transmission", "rotation")
-SEARCHED = ("free", "bounds", "length", "transmission", "rotation")  # what only a search can hold to
+TOP = (
+    "mechanism",
+    "units",
+    "goal",
+    "motion",
+    "complete",
+    "free",
+    "driver",
+    "bounds",
+    "areas",
+    "length",
+    "transmission",
+    "rotation",
+)
+SEARCHED = ("free", "motion", "bounds", "areas", "length", "transmission", "rotation")  # what only a search can hold to
 LENGTH = ("pins", "least", "most")
 # The keys of each kind of goal, and the SI units of those that have some; "value" is that of what drives.
 GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
@@ -30,6 +44,16 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
         {"output": "", "values": "value", "targets": "output", "start": "", "output_start": "", "line": ""},
     ),
 }
+# The kinds of goals about the motion, each with the unit of its measure, or that of what drives; and their further keys.
+MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
+    "torque": (TorqueGoal, "effort"),
+    "load": (LoadGoal, "N"),
+    "energy": (EnergyGoal, "J"),
+    "frequency": (FrequencyGoal, "1/s"),
+    "tolerance": (ToleranceGoal, "m"),
+}
+MOTION_KEYS = ("kind", "most", "least", "speed", "weight", "samples")
+OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances")}
 
 
 def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
@@ -61,6 +85,8 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     goal = _read_goal(mechanism, table["goal"], units, problems)
     bounds = _read_bounds(mechanism, table.get("bounds", {}), units, problems)
     lengths = _read_lengths(table.get("length", []), units, problems)
+    terms = [_read_motion(k, mechanism, one, units, problems) for k, one in enumerate(table.get("motion", []))]
+    areas = {pin: units.convert(f"areas.{pin}", area, "m", problems) for pin, area in dict(table.get("areas", {})).items()}
     transmission = units.convert("transmission", table.get("transmission", 0.0), "rad", problems)
     if problems:
         raise SceneError(problems, name)
@@ -71,7 +97,10 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
         return CompleteSearch(mechanism, goal, table.get("driver"))
     choices = {key: table[key] for key in ("free", "driver", "rotation") if key in table}
     try:
-        return DesignSearch(mechanism, goal, bounds=bounds, lengths=lengths, transmission=float(transmission), **choices)
+        goals = [goal, *(term for term in terms if term is not None)]
+        return DesignSearch(
+            mechanism, goals, bounds=bounds, lengths=lengths, areas=areas, transmission=float(transmission), **choices
+        )
     except (TypeError, ValueError) as problem:
         if isinstance(problem, SceneError):
             raise
@@ -99,6 +128,31 @@ def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[st
         return make(**given)
     except (TypeError, ValueError) as problem:
         problems.append(f"goal: {problem}")
+        return None
+
+
+def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> MotionTerm | None:
+    where, kind = f"motion[{k}]", table.get("kind") if isinstance(table, Mapping) else None
+    if kind not in MOTION:
+        problems.append(f"{where}.kind must be one of {', '.join(map(quote, MOTION))}, not {quote(str(kind))}")
+        return None
+    make, unit = MOTION[kind]
+    keys, before = (*MOTION_KEYS, *OWN_KEYS.get(kind, ())), len(problems)
+    problems += [f"{where}.{key}: unknown key{suggestion(key, keys)}" for key in table if key not in keys]
+    given, driven = {key: value for key, value in table.items() if key != "kind"}, _driven_unit(mechanism)
+    unit = {"rad": "N m", "m": "N"}[driven] if unit == "effort" else unit
+    for key, si in (("most", unit), ("least", unit), ("speed", f"{driven}/s")):
+        if key in given:
+            given[key] = units.convert(f"{where}.{key}", given[key], si, problems)
+    if "tolerances" in given:
+        tolerances = dict(given["tolerances"])
+        given["tolerances"] = {n: units.convert(f"{where}.tolerances.{n}", x, "m", problems) for n, x in tolerances.items()}
+    if len(problems) > before:
+        return None
+    try:
+        return make(**given)
+    except (TypeError, ValueError) as problem:
+        problems.append(f"{where}: {problem}")
         return None
 
 

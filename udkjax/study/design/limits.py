@@ -133,7 +133,7 @@ def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str])
     except (TypeError, ValueError):
         found = np.zeros(0)
     is_circle = found.shape == (3,) and found[2] > 0
-    is_polygon = found.ndim == 2 and found.shape[1] == 2 and len(found) > 2 and _is_convex(found)
+    is_polygon = found.ndim == 2 and found.shape[-1] == 2 and len(found) > 2 and _is_convex(found)
     if pin not in known:
         problems.append(f"areas: no pin named {quote(pin)}{suggestion(pin, known)}")
     if not np.all(np.isfinite(found)) or not (is_circle or is_polygon):

@@ -184,7 +184,7 @@ class FrequencyGoal(MotionTerm):
 
 
 class ToleranceGoal(MotionTerm):
-    """How far a point goes astray where numbers do: sqrt(sum_k (t_k dp/dx_k)^2) (m) stays below `most`.
+    """The error of a point where numbers have errors t_k: sqrt(sum_k (t_k dp/dx_k)^2) (m) stays below `most`.
 
     Args:
         point: as of a `PathGoal`.
