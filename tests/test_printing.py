@@ -83,8 +83,8 @@ def objects() -> dict[str, object]:
     return {type(one).__name__: one for one in found}
 
 
-# In tests/study: they take a fit or a search.
-ELSEWHERE = set("Estimate GradientCheck Design Designs FoundDesign DesignSearch CompleteDesign CompleteDesigns".split())
+# In tests/study: they take a fit or a search, or are made within one.
+ELSEWHERE = set("Estimate GradientCheck Design Designs FoundDesign DesignSearch CompleteDesign CompleteDesigns MotionPoint".split())
 ABSTRACT = {"Constraint", "Joint", "Motion", "ForceElement"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
 

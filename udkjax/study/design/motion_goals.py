@@ -60,7 +60,15 @@ class MotionPoint(NamedTuple):
 
 
 class MotionTerm(PrintsTable):
-    """A goal about a motion; see the module."""
+    """A goal about a motion; see the module.
+
+    Args:
+        most: the measure's upper end, above zero.
+        least: its lower end, above zero.
+        speed: the rate of the driver (rad/s, m/s); by default that of its motion at the time 0.
+        weight: what a measure at twice its end counts: as much as a place missed by so many scales of the first goal.
+        samples: positions that are measured.
+    """
 
     most: float | None = eqx.field(static=True, default=None, kw_only=True)
     least: float | None = eqx.field(static=True, default=None, kw_only=True)
@@ -110,11 +118,6 @@ class MotionGoal(MotionTerm):
 
     Args:
         function: returns the measure of a `MotionPoint`, written with jax.numpy.
-        most: the measure's upper end, above zero.
-        least: its lower end, above zero.
-        speed: the rate of the driver (rad/s, m/s); by default that of its motion at the time 0.
-        weight: what a measure at twice its end counts: as much as a place missed by so many scales of the first goal.
-        samples: positions that are measured.
     """
 
     function: Callable[[MotionPoint], Float[Array, ""]] = eqx.field(static=True)
