@@ -70,9 +70,10 @@ def design_all(drawing: Drawing | Mechanism, goal: PathGoal | PoseGoal, driver: 
     bars, both = solutions.bars, np.tile(np.arange(len(solutions.radius)), 2)
     bars = stack_four_bars([bars, bars.swapped()])
     found = classify(bars)
-    confirmed = check_motions(drawn, bars, found)
+    confirmed = check_motions(bars, found)
     least = np.min(np.abs(bars.transmission), axis=1)
-    best = np.lexsort((-least, ~found.turns, found.defect))
+    doubtful = (found.defect == 0) & ~confirmed.all(axis=1)
+    best = np.lexsort((-least, ~found.turns, doubtful, found.defect))
     places = drawn.places(bars, np.arange(len(bars.O)), np.zeros(len(bars.O), int))
     first = drawn.drawn_values(bars.crank_angles[:, :1])
     values = first + drawn.sign * (found.values - found.values[:, :1])
@@ -94,6 +95,7 @@ def design_all(drawing: Drawing | Mechanism, goal: PathGoal | PoseGoal, driver: 
         solutions.unproven,
         solutions.paths,
         mechanism,
+        drawn.coupler,
         drawn.driver,
     )
 

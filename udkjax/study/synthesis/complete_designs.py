@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.study.drive import Drive
 from udkjax.study.kinematics import Kinematics, kinematics
@@ -85,7 +86,7 @@ class CompleteDesign(PrintsTable):
 class CompleteDesigns(PrintsTable):
     """All four-bars that meet a goal: a sequence of `CompleteDesign`, each made when it is asked for.
 
-    Those without defects come first; then those whose driver turns; then those with the better transmission. Each four-bar is
+    Those without defects come first, of these what motions confirm; then those whose driver turns; then those with the better transmission. Each four-bar is
     there twice, once with its crank on either side; through nine points each class has three cognates.
 
     Attributes:
@@ -106,6 +107,7 @@ class CompleteDesigns(PrintsTable):
         unproven: how many more appear to be real without a proof.
         paths: what became of the solutions of the whole problem, complex ones counted, by name.
         mechanism: the drawing's, as it was given.
+        coupler: the name of its coupler.
         driver: what drives.
     """
 
@@ -126,6 +128,7 @@ class CompleteDesigns(PrintsTable):
     unproven: int = eqx.field(static=True)
     paths: dict[str, int] = eqx.field(static=True)
     mechanism: Mechanism
+    coupler: str = eqx.field(static=True)
     driver: Drive = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -134,7 +137,11 @@ class CompleteDesigns(PrintsTable):
     def __getitem__(self, k: int) -> CompleteDesign:
         if not -len(self) <= k < len(self):
             raise IndexError(f"design {k} of {len(self)}")
-        mechanism = self.mechanism.with_parameters({name: jnp.asarray(places[k]) for name, places in self.pins.items()})
+        places = {name: jnp.asarray(pins[k]) for name, pins in self.pins.items()}
+        try:
+            mechanism = self.mechanism.with_parameters(places)
+        except SceneError:  # a coupler whose pins are on one line is no plate, but a rod
+            mechanism = self.mechanism.with_parameters(places | {f"link.{self.coupler}.width": 0.0})
         order = tuple(int(j) for j in self.order[k] if j >= 0)
         return CompleteDesign(
             mechanism, self.values[k], self.kinds[k], bool(self.turns[k]), self.defects[k], self.circuits[k], self.branches[k],

@@ -173,8 +173,9 @@ def class_keys(z: np.ndarray) -> np.ndarray:
     """Return numbers (4, M) that all six of a class share: symmetric functions of the pivots a, b, c of all cognates."""
     x, X, r, R, y, Y, s, S = z[:JOINTS]
     a, A, b, B = x - r, X - R, y - s, Y - S
-    c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
-    return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
+    with np.errstate(all="ignore"):  # of ends that are no solutions
+        c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
+        return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
 
 
 def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -201,8 +202,9 @@ def _pairs(z: np.ndarray, alike: float = ALIKE) -> np.ndarray:
     if not z.shape[1]:
         return np.zeros((0, 2), int)
     keys = class_keys(z)
-    size = np.maximum(np.abs(keys), 1e-300)
-    keys = keys / size * np.log1p(size)  # near differences become relative ones
+    with np.errstate(all="ignore"):
+        size = np.maximum(np.abs(keys), 1e-300)
+        keys = keys / size * np.log1p(size)  # near differences become relative ones
     table = np.concatenate([np.real(keys), np.imag(keys)]).T
     pairs = KDTree(np.where(np.isfinite(table), table, 0.0)).query_pairs(alike, output_type="ndarray")
     return pairs[np.lexsort(pairs.T[::-1])]
