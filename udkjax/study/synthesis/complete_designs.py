@@ -86,8 +86,9 @@ class CompleteDesign(PrintsTable):
 class CompleteDesigns(PrintsTable):
     """All four-bars that meet a goal: a sequence of `CompleteDesign`, each made when it is asked for.
 
-    Those without defects come first, of these what motions confirm; then those whose driver turns; then those with the better transmission. Each four-bar is
-    there twice, once with its crank on either side; through nine points each class has three cognates.
+    Those without defects come first, of these what motions confirm; then those whose driver turns; then those with the better
+    transmission. Each four-bar is there twice, once with its crank on either side; through nine points each class has three
+    cognates.
 
     Attributes:
         pins: the pins of each in the first position, by name (M, 2), in m.
