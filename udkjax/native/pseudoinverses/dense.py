@@ -237,7 +237,7 @@ class DenseMatrices:
 
     def sum(self, registers: int, term: Callable[[Operand, Value], Value]) -> Value:
         """Add up over registers, and of one member over what they hold: `term(r, sum)` is the sum with a register's share."""
-        f, totals = self.f, [self.register(0.0)] * min(SUMS, registers)
+        f, totals = self.f, [self.register(0.0)] * max(1, min(SUMS, registers))  # rows of a free body have none
         if registers <= UNROLLED:
             for r in range(registers):
                 totals[r % len(totals)] = term(r, totals[r % len(totals)])
