@@ -75,11 +75,9 @@ def design_all(drawing: Drawing | Mechanism, goal: PathGoal | PoseGoal, driver: 
     doubtful = (found.defect == 0) & ~confirmed.all(axis=1)
     best = np.lexsort((-least, ~found.turns, doubtful, found.defect))
     places = drawn.places(bars, np.arange(len(bars.O)), np.zeros(len(bars.O), int))
-    first = drawn.drawn_values(bars.crank_angles[:, :1])
-    values = first + drawn.sign * (found.values - found.values[:, :1])
     return CompleteDesigns(
         {name: place[best] for name, place in places.items()},
-        values[best],
+        drawn.values(bars, found.values)[best],
         tuple(KINDS[k] for k in found.kind[best]),
         found.turns[best],
         tuple(DEFECTS[k] for k in found.defect[best]),

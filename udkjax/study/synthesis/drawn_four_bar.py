@@ -39,10 +39,11 @@ class DrawnFourBar(NamedTuple):
         joints |= {"A": bars.A[which, position], "B": bars.B[which, position]}
         return {f"pin.{self.pins[key]}": np.stack([np.real(z), np.imag(z)], 1) for key, z in joints.items()}
 
-    def drawn_values(self, angles: np.ndarray) -> np.ndarray:
-        """Return the driver's values (rad) at angles of the crank from O to A, as the mechanism has them where it is drawn so."""
-        own = angles + np.pi * self.is_reversed
-        return self.sign * (own - 2 * np.pi * np.ceil((own - np.pi) / (2 * np.pi)))
+    def values(self, bars: FourBars, angles: np.ndarray) -> np.ndarray:
+        """Return the driver's values (M, J) (rad) at angles of the crank, counted as the mechanism does where it is drawn."""
+        own = bars.crank_angles[:, :1] + np.pi * self.is_reversed
+        own = own - 2 * np.pi * np.ceil((own - np.pi) / (2 * np.pi))
+        return self.sign * (own + angles - angles[:, :1])
 
 
 def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourBar:
