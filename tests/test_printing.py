@@ -84,7 +84,8 @@ def objects() -> dict[str, object]:
 
 
 # In tests/study: they take a fit or a search, or are made within one.
-ELSEWHERE = set("Estimate GradientCheck Design Designs FoundDesign DesignSearch CompleteDesign CompleteDesigns MotionPoint".split())
+ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
+ELSEWHERE |= {"CompleteDesign", "CompleteDesigns"}
 ABSTRACT = {"Constraint", "Joint", "Motion", "ForceElement"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
 
