@@ -1,4 +1,4 @@
-"""Runs by each pseudoinverse, and of mechanisms whose numbers are traced: the paper's linkage, 5 s, 101 outputs, at 1e-8.
+"""Runs by each pseudoinverse and formulation, and of mechanisms whose numbers are traced: the paper's linkage, 5 s, 101 outputs, at 1e-8.
 
 Each method takes one run and 64 of them under `vmap`, by machine code and in plain JAX; Adams and BDF of diffrax take the same
 equations. A jitted function of a mechanism, a function of the library and stacked mechanisms stand beside a known mechanism.
@@ -15,6 +15,7 @@ import udkjax as udk
 from benchmarks.common import Compiled, in_turn, machine, ratio, report
 
 METHODS = (udk.Auto(), udk.Elimination(), udk.Greville(), udk.GramSchmidt(), udk.Householder(), udk.Varga(), udk.SVD())
+FORMULATIONS = (udk.NullSpaceQR(), udk.NullSpaceSVD(), udk.Augmented(udk.SVD()))
 MEMBERS, ROUNDS = 64, 9
 
 
@@ -35,10 +36,13 @@ def main(smoke: bool = False, out: Path | None = None):
 
     about, figures = machine(), []
     stacked = jax.vmap(lambda angle: udk.library.parallelogram(angle=angle))(angles)
-    methods = METHODS[:3] if smoke else METHODS
-    single = {type(m).__name__: (by(method=m), 1.0) for m in methods}
-    batch = {f"{type(m).__name__}, {members}": (jax.vmap(by(method=m)), masses) for m in methods}
-    plain = {} if smoke else {f"{type(m).__name__}, plain JAX": (by("diffrax", method=m), 1.0) for m in methods[2:]}
+    chosen: dict[str, dict[str, Any]] = {type(m).__name__: {"method": m} for m in METHODS}
+    chosen |= {type(x).__name__: {"formulation": x} for x in FORMULATIONS}
+    if smoke:
+        chosen = {name: chosen[name] for name in ("Auto", "Greville", "NullSpaceQR")}
+    single = {name: (by(**choices), 1.0) for name, choices in chosen.items()}
+    batch = {f"{name}, {members}": (jax.vmap(by(**choices)), masses) for name, choices in chosen.items()}
+    plain = {f"{name}, plain JAX": (by("diffrax", **choices), 1.0) for name, choices in list(chosen.items())[2:] if not smoke}
     solvers = {}
     if not smoke:
         for solver in (udk.Adams(), udk.BDF()):
