@@ -19,6 +19,7 @@ from udkjax.integrate.assembly import Closure, State, close
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import is_explicit
+from udkjax.native.formulations import formulation_code
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -99,7 +100,7 @@ class GroupRun:
             is_explicit(fixed.get("solver"))
             and (isinstance(method := fixed.get("method"), STRAIGHT_METHODS) or not reason_for_plain(method))
             and self.redundant is not None
-            and fixed.get("formulation") is None
+            and ((formulation := fixed.get("formulation")) is None or formulation_code(formulation) is not None)
         )
         self._placed: Shared | None = None
         devices = jax.local_devices()
