@@ -77,6 +77,15 @@ def _reduce(function: Callable[..., Any]) -> Rule:
     return lambda x, axes, **_: function(x, axis=tuple(axes)) if axes else x
 
 
+def _extremum(function: Callable[..., Any]) -> Rule:
+    def rule(x: Any, axes: Sequence[int], **_: Any) -> Any:
+        if not np.size(x):  # of which XLA's is an infinity
+            return NotImplemented
+        return function(x, axis=tuple(axes)) if axes else x
+
+    return rule
+
+
 def _argument(function: Callable[..., Any]) -> Rule:
     return lambda x, axes, index_dtype: function(x, axis=axes[0]).astype(index_dtype)
 
@@ -233,8 +242,8 @@ RULES: dict[str, Rule] = {name: _ufunc(function) for name, function in UFUNCS.it
     "scatter-add": scatter(np.add.at),
     "reduce_sum": _reduce(np.sum),
     "reduce_prod": _reduce(np.prod),
-    "reduce_max": _reduce(np.max),
-    "reduce_min": _reduce(np.min),
+    "reduce_max": _extremum(np.max),
+    "reduce_min": _extremum(np.min),
     "reduce_or": _reduce(np.any),
     "reduce_and": _reduce(np.all),
     "argmax": _argument(np.argmax),
