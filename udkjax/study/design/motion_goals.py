@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from udkjax.equations import constraints, loads
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_count, require_number
 from udkjax.study.design.goals import check_place, place_of
@@ -59,6 +60,10 @@ class MotionPoint(NamedTuple):
         return loads.mass(self.mechanism) * self.a.ravel() - force
 
 
+def _float(x: Number | None) -> Number | None:
+    return float(x) if np.ndim(x) == 0 and isinstance(x, jax.Array | np.ndarray | np.generic) else x
+
+
 class MotionTerm(PrintsTable):
     """A goal about a motion; see the module.
 
@@ -70,9 +75,9 @@ class MotionTerm(PrintsTable):
         samples: positions that are measured.
     """
 
-    most: float | None = eqx.field(static=True, default=None, kw_only=True)
-    least: float | None = eqx.field(static=True, default=None, kw_only=True)
-    speed: float | None = eqx.field(static=True, default=None, kw_only=True)
+    most: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
+    least: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
+    speed: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
     weight: float = eqx.field(static=True, default=0.1, kw_only=True)
     samples: int = eqx.field(static=True, default=36, kw_only=True)
 
