@@ -63,3 +63,15 @@ def test_what_no_row_determines_is_refused():
         SymbolicFactors(graph, [{0: a}, {0: a}], 2)
     with pytest.raises(ValueError, match="1 rows cannot determine 2"):
         SymbolicFactors(graph, [{0: a}], 2)
+
+
+def test_what_is_zero_but_for_rounding_is_no_pivot():
+    graph = Graph()
+    a, b, c = (graph.input(name, "a") for name in "abc")
+    rows = [{0: graph.constant(1.0), 1: graph.constant(6e-17), 2: a}, {0: graph.constant(1.0), 1: b, 2: c}, {1: b * c, 2: a}]
+    factors = SymbolicFactors(graph, rows, 3)
+    program = ScalarProgram(graph, [a, b, c], factors.solve([graph.constant(x) for x in (1.0, 2.0, 3.0)]))
+    values = 0.7, 0.4, -1.3
+    A = np.array([[1.0, 6e-17, 0.7], [1.0, 0.4, -1.3], [0.0, -0.52, 0.7]])
+    found = [x[0] for x in program.by_numpy([np.array([v]) for v in values])]
+    np.testing.assert_allclose(found, np.linalg.solve(A, [1.0, 2.0, 3.0]), rtol=1e-12)

@@ -16,6 +16,8 @@ from udkjax.expressions.differential import Row
 from udkjax.expressions.graph import Graph, Scalar
 
 Vector = list[Scalar]
+# Of the largest known entry that its row had: the cosine of a right angle, 6e-17, is no pivot, and others lose three digits.
+LEAST_PIVOT = 1e-3
 
 
 class SymbolicFactors:
@@ -35,6 +37,7 @@ class SymbolicFactors:
             raise ValueError(f"{len(rows)} rows cannot determine {columns} unknowns")
         self._graph = graph
         self._rows = [{k: x for k, x in row.items() if not x.is_zero} for row in rows]
+        self._sizes = [max((abs(x.constant) for x in row.values() if x.constant is not None), default=0.0) for row in self._rows]
         self._pivots: list[tuple[int, int]] = []
         self._operations: list[tuple[int, int, Scalar]] = []  # row i loses so many times row r
         while (place := self._sparsest_constant()) is not None:
@@ -99,7 +102,12 @@ class SymbolicFactors:
         for _, row in left:
             for c in row:
                 counts[c] = counts.get(c, 0) + 1
-        costs = [((len(row) - 1) * (counts[c] - 1), r, c) for r, row in left for c, a in row.items() if a.constant is not None]
+        costs = [
+            ((len(row) - 1) * (counts[c] - 1), r, c)
+            for r, row in left
+            for c, a in row.items()
+            if a.constant is not None and abs(a.constant) >= LEAST_PIVOT * self._sizes[r]
+        ]
         return min(costs)[1:] if costs else None
 
     def _eliminate(self, r: int, c: int):

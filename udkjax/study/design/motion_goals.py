@@ -7,7 +7,7 @@ adds nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 from udkjax.equations import constraints, loads
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.checks import SceneError, quote, suggestion
-from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_count, require_number
 from udkjax.study.design.goals import check_place, place_of
@@ -60,7 +59,7 @@ class MotionPoint(NamedTuple):
         return loads.mass(self.mechanism) * self.a.ravel() - force
 
 
-def _float(x: Number | None) -> Number | None:
+def _float(x: Any) -> Any:
     return float(x) if np.ndim(x) == 0 and isinstance(x, jax.Array | np.ndarray | np.generic) else x
 
 
