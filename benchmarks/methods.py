@@ -1,4 +1,4 @@
-"""Runs by each pseudoinverse and formulation, and of mechanisms whose numbers are traced: the paper's linkage, 5 s, 101 outputs, at 1e-8.
+"""Runs by each pseudoinverse and formulation, and of traced mechanisms: the paper's linkage, 5 s, 101 outputs, at 1e-8.
 
 Each method takes one run and 64 of them under `vmap`, by machine code and in plain JAX; Adams and BDF of diffrax take the same
 equations. A jitted function of a mechanism, a function of the library and stacked mechanisms stand beside a known mechanism.

@@ -133,17 +133,18 @@ def _reason_for_diffrax(
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
     """Return why machine code cannot evaluate equations, whatever the scene is; empty where it can."""
+    formulation = None
     if isinstance(equations, FormulatedSystem):
-        if formulation_code(equations.formulation) is None:
-            return f"it does not know the formulation {equations.formulation}"
-        equations = equations.equations
+        equations, formulation = equations.equations, equations.formulation
     if type(equations) is not TextbookEquations:
         return f"it knows the equations of a mechanism, not {type(equations).__name__}"
-    return reason_for_plain(equations.method)
+    return reason_for_plain(equations.method, formulation)
 
 
-def reason_for_plain(method: Pseudoinverse) -> str:
-    """Return why machine code cannot evaluate equations by a method, whatever the scene is; empty where it can."""
+def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = None) -> str:
+    """Return why machine code cannot evaluate equations by a method and a formulation, whatever the scene is; empty if it can."""
+    if formulation is not None and formulation_code(formulation) is None:
+        return f"it does not know the formulation {formulation}"
     if not eliminates(method) and dense_method(method) is None:
         return f"it does not know the pseudoinverse {type(method).__name__}"
     if jax.default_backend() != "cpu":

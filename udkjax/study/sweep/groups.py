@@ -19,7 +19,6 @@ from udkjax.integrate.assembly import Closure, State, close
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import is_explicit
-from udkjax.native.formulations import formulation_code
 from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
@@ -96,11 +95,12 @@ class GroupRun:
         self.assembled = fixed.get("state") is None
         closure = close(fixed["mechanism"], plan.ts[0]) if self.assembled and not self.varied and not moving else None
         self.shared = jax.tree.map(np.asarray, Shared(arrays, closure))
+        method, formulation = fixed.get("method"), fixed.get("formulation")
+        is_straight = isinstance(method, STRAIGHT_METHODS) and formulation is None
         in_lanes = (
             is_explicit(fixed.get("solver"))
-            and (isinstance(method := fixed.get("method"), STRAIGHT_METHODS) or not reason_for_plain(method))
+            and (is_straight or not reason_for_plain(method or Auto(), formulation))
             and self.redundant is not None
-            and ((formulation := fixed.get("formulation")) is None or formulation_code(formulation) is not None)
         )
         self._placed: Shared | None = None
         devices = jax.local_devices()
