@@ -8,6 +8,7 @@ import xarray
 
 import udkjax as udk
 from tests.command_line import udkjax
+from udkjax.show.player.animation import FailedRunWarning
 
 SCENE = "examples/four_bar.toml"
 
@@ -81,7 +82,7 @@ def test_a_run_that_failed_is_shown_and_how_it_ended_is_said(tmp_path, capsys):
     assert "the run failed: step limit at t = " in shown.err and "UserWarning" not in shown.err
     assert "step limit" in json.loads(shown.out)["failures"][""]
     assert "step limit at t" in (tmp_path / "run.html").read_text()
-    with pytest.warns(udk.show.player.animation.FailedRunWarning, match="the run failed: step limit"):
+    with pytest.warns(FailedRunWarning, match="the run failed: step limit"):
         udk.animate(mech, failed)
 
 

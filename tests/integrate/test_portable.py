@@ -61,7 +61,7 @@ def evaluated():
         host = Host(zlib.decompress(base64.b64decode(module["code"])), module["data_end"])
         host.begin()
         marks = np.ones(engine.data["marks"])
-        marks[list(udk.analyse(mechanism).redundant_rows if len(marks) else ())] = 0.0
+        marks[list(udk.analyse(mechanism).redundant_rows or ()) if len(marks) else []] = 0.0
         to = host.put(np.concatenate([engine.numbers.base[: engine.numbers.count], marks, engine.data["thresholds"]]))
         host.call("numbers", host.put([p["value"] for p in engine.data["parameters"]]), to)
         work = host.put(np.zeros(module["size"]))

@@ -107,10 +107,11 @@ _PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()
 
 
 def numpy_program(jaxpr: Any) -> NumpyProgram:
-    """Return a closed program of JAX as one of NumPy; the same for the same."""
+    """Return a program of JAX as one of NumPy, with its constants where it is a closed one; the same for the same."""
     found = _PROGRAMS.get(jaxpr)
     if found is None:
-        found = _PROGRAMS[jaxpr] = NumpyProgram(jaxpr.jaxpr, jaxpr.consts)
+        parts = (jaxpr.jaxpr, jaxpr.consts) if hasattr(jaxpr, "consts") else (jaxpr, ())
+        found = _PROGRAMS[jaxpr] = NumpyProgram(*parts)
     return found
 
 

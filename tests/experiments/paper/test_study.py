@@ -61,6 +61,7 @@ def test_thresholds_and_starts_are_those_of_the_case():
 @pytest.mark.parametrize("name", METHODS)
 def test_the_papers_methods_have_their_threshold_in_the_units_of_the_matrix(name):
     method = paper.pseudoinverse(name, 0.5, paper.number_of(name))
+    assert isinstance(method, udk.OneOf)
     assert type(method.methods[int(method.number)]).__name__ == name and not method.relative
     matrix = np.diag([30.0, 3.0, 0.4])
     assert int(method.rank(matrix)) == 2  # 0.4 is beyond 1 % of 30, but not beyond 0.5
