@@ -22,9 +22,7 @@ FACTS = {  # of each example, what must be true of the numbers that it prints
     "identification": lambda off, *_: off < 3,
     "double_pendulum_map": lambda members, over, calm, failed: members == 2500 and over > 0.1 and calm == 0 and failed == 0,
     "neural_friction": lambda after, before, law: after < 0.1 * before and law < 0.4,
-    "straight_line": lambda off, back: off < 1e-3 and back < 1e-8,
-    "walking_foot": lambda off, back: off < 0.01 and back < 1e-8,
-    "letter": lambda off, back: off < 0.02 and back < 1e-8,
+    "designed_paths": lambda line, letter, foot: line < 1e-3 and letter < 0.02 and foot < 0.01,
 }
 FAST = ("four_bar",)
 
