@@ -16,7 +16,7 @@ from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
-GROUND_FLOOR = {"annotations", "extras", "printing"}  # every floor may import them
+GROUND_FLOOR = {"annotations", "extras", "lazy_names", "printing"}  # every floor may import them
 BELOW = {
     **{module: set() for module in GROUND_FLOOR},
     "expressions": set(),
@@ -144,11 +144,13 @@ DEFAULT = """
 import sys
 import udkjax as udk
 udk.simulate(udk.library.double_pendulum(), [0.0, 0.1])
-print({"jax", "diffrax", "optimistix", "lineax", "scipy", "xarray", "pandas", "matplotlib", "tyro"} & set(sys.modules))
+others = {"diffrax", "optimistix", "lineax", "scipy", "xarray", "pandas", "matplotlib", "tyro", "tomllib", "xml.sax"}
+own = {f"udkjax.{name}" for name in ("integrate.events", "scene.drawing", "scene.files", "scene.mjcf", "study")}
+print(({"jax"} | others | own) & set(sys.modules))
 """
 
 
-def test_a_run_by_default_imports_no_other_solvers():
+def test_a_run_by_default_imports_no_other_solvers_nor_scenes():
     assert python(DEFAULT, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"]) == "{'jax'}"
 
 

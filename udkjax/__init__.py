@@ -5,25 +5,13 @@ Importing this package turns float64 on in JAX, unless the environment says `JAX
 """
 
 import os
-import pkgutil
-import re
 import sys
 from importlib import import_module
 
-_STUB = (pkgutil.get_data(__name__, "__init__.pyi") or b"").decode()
-_HOME: dict[str, str] = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", _STUB, re.MULTILINE)}
+from udkjax.lazy_names import lazy_names
 
 __version__ = "0.1.0"
-__all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str):
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = _HOME[name]
-    value = import_module(f"{home}.{name}") if home == __name__ else getattr(import_module(home), name)
-    globals()[name] = value
-    return value
+__getattr__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __dir__():

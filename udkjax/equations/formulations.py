@@ -11,8 +11,8 @@ differ in what they need to get by, and in whether they do.
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
@@ -98,7 +98,7 @@ class NullSpaceQR(PointwiseFormulation):
         q, r, order, rank = complete_qr(A.T, threshold)
         inside = jnp.arange(len(order)) < rank
         triangle = jnp.where(inside[:, None] & inside, r[: len(order), order], jnp.eye(len(order)))
-        z = solve_triangular(triangle, jnp.where(inside, c[order], 0), trans=1)
+        z = jax.scipy.linalg.solve_triangular(triangle, jnp.where(inside, c[order], 0), trans=1)
         a_p = q[:, : len(order)] @ z
         null = jnp.where(jnp.arange(len(F)) < rank, 0, q)
         return null_space_accelerations(M, F, null, a_p)

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,12 +13,14 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.equations.quantities import efforts
 from udkjax.extras import OptionalImport
-from udkjax.integrate.events.event import Events
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
 from udkjax.scene.bodies import COORDINATES, Frame, frame_over_time
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, number
 from udkjax.scene.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    from udkjax.integrate.events.event import Events
 
 
 class Result(PrintsWords):
@@ -117,7 +119,7 @@ class Solution(PrintsTable):
     atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
-    events: Events | None = None  # `Events`, where there were any to look for
+    events: "Events | None" = None  # `Events`, where there were any to look for
     found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
     @property

@@ -1,45 +1,5 @@
 """Scenes: bodies, joints, drivers, force elements, the mechanism of them all, and its files. No equations."""
 
-from udkjax.scene import library as library
-from udkjax.scene.bodies import GROUND as GROUND
-from udkjax.scene.bodies import Body as Body
-from udkjax.scene.bodies import Frame as Frame
-from udkjax.scene.bodies import Point as Point
-from udkjax.scene.bodies import between as between
-from udkjax.scene.checks import SceneError as SceneError
-from udkjax.scene.drawing import Drawing as Drawing
-from udkjax.scene.drawing import Link as Link
-from udkjax.scene.drivers import Driver as Driver
-from udkjax.scene.drivers import Motion as Motion
-from udkjax.scene.drivers import Polynomial as Polynomial
-from udkjax.scene.drivers import Sine as Sine
-from udkjax.scene.drivers import Spline as Spline
-from udkjax.scene.files import dumps as dumps
-from udkjax.scene.files import load as load
-from udkjax.scene.files import loads as loads
-from udkjax.scene.files import save as save
-from udkjax.scene.forces import Force as Force
-from udkjax.scene.forces import ForceElement as ForceElement
-from udkjax.scene.forces import Friction as Friction
-from udkjax.scene.forces import Spring as Spring
-from udkjax.scene.forces import Torque as Torque
-from udkjax.scene.forces import TorsionSpring as TorsionSpring
-from udkjax.scene.held import Held as Held
-from udkjax.scene.joints import Angle as Angle
-from udkjax.scene.joints import Cam as Cam
-from udkjax.scene.joints import Constraint as Constraint
-from udkjax.scene.joints import Distance as Distance
-from udkjax.scene.joints import Gear as Gear
-from udkjax.scene.joints import Joint as Joint
-from udkjax.scene.joints import Prismatic as Prismatic
-from udkjax.scene.joints import Profile as Profile
-from udkjax.scene.joints import Rack as Rack
-from udkjax.scene.joints import Revolute as Revolute
-from udkjax.scene.joints import Slot as Slot
-from udkjax.scene.joints import Weld as Weld
-from udkjax.scene.mechanism import Mechanism as Mechanism
-from udkjax.scene.mjcf import MjcfWarning as MjcfWarning
-from udkjax.scene.mjcf import mjcf_text as mjcf_text
-from udkjax.scene.mjcf import read_mjcf as read_mjcf
-from udkjax.scene.reshaping import with_angle as with_angle
-from udkjax.scene.reshaping import with_length as with_length
+from udkjax.lazy_names import lazy_names
+
+__getattr__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]

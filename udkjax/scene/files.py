@@ -9,9 +9,7 @@ from udkjax.scene.checks import SceneError, abbreviate
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.mjcf.mjcf_reader import is_xml, mechanism_of_text
-from udkjax.scene.mjcf.mjcf_writer import mjcf_text
-from udkjax.scene.toml_text import parse_toml
+from udkjax.scene.toml_text import is_xml, parse_toml
 
 DRAWN_VERSION = 2  # of the format: drawings, of pins and links
 
@@ -63,7 +61,12 @@ def save(mechanism: Mechanism | Drawing, path: str | os.PathLike[str]) -> None:
         OSError: The file cannot be written.
     """
     path = Path(path)
-    text = (mjcf_text if path.suffix.lower() == ".xml" else dumps)(mechanism)
+    if path.suffix.lower() == ".xml":
+        from udkjax.scene.mjcf.mjcf_writer import mjcf_text  # and with it XML, which other scenes do without
+
+        text = mjcf_text(mechanism)
+    else:
+        text = dumps(mechanism)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -97,6 +100,8 @@ def dumps(mechanism: Mechanism | Drawing) -> str:
 
 def _read(text: str, source: str) -> Mechanism:
     if is_xml(text):
+        from udkjax.scene.mjcf.mjcf_reader import mechanism_of_text  # likewise
+
         return mechanism_of_text(text, source, stacklevel=4)
     scene = parse_toml(text, source, SceneError)
     version = scene.get("format")

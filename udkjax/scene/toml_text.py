@@ -26,3 +26,8 @@ def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
         raise error(["not valid here: lists or tables nest too deeply to be read; three levels are enough"], source) from None
     except ValueError as problem:  # not TOML, or a whole number of more digits than Python reads
         raise error([f"not valid TOML: {problem}"], source) from None
+
+
+def is_xml(text: str) -> bool:
+    """Return whether a text is XML rather than TOML, or the name of a file."""
+    return text.removeprefix("\ufeff").lstrip().startswith("<")

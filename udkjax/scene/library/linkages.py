@@ -1,22 +1,12 @@
 """Linkages with one degree of freedom, the paper's among them. SI units, radians."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.drawing.drawn_forces import Motor
-from udkjax.scene.drawing.drawn_joints import Slide
-from udkjax.scene.drawing.link import Link
-from udkjax.scene.fields import array_namespace
-from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Revolute, Slot
 from udkjax.scene.library.posed_bodies import (
-    ORIGINS,
-    apex,
     bodies_on_pose,
-    draw_on_pose,
     gravity_vector,
     uniform_rod,
     unit_vector,
@@ -82,70 +72,6 @@ def n_four_bar(
         joints[f"C{i}"] = Revolute((f"link{i + 1}", f"coupler{i}"), [(0.5, 0.0), (0.5, 0.0)])
     bodies = bodies_on_pose(names, [uniform_rod(1.0, 1.0)] * len(names), pose, angle, angular_velocity)
     return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name=f"{n}-four-bar")
-
-
-@with_known_numbers
-def four_bar(
-    angle: ArrayLike = np.pi / 3,
-    angular_velocity: ArrayLike = 0.0,
-    lengths: Sequence[ArrayLike] = (1.0, 2.5, 2.0),
-    ground: ArrayLike = 2.5,
-    density: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
-) -> Mechanism:
-    """Return a four-bar, by default a crank-rocker: crank, coupler and rocker of `lengths`, uniform, `density` in kg/m.
-
-    The crank turns on the origin at `angle`, the rocker on (`ground`, 0); the coupler's far pin is above their line.
-    """
-    a, b, c = lengths
-
-    def places(s):
-        start, end = a * unit_vector(s), ground * np.array([1.0, 0.0])
-        return {"A": np.zeros(2), "B": start, "C": apex(start, end, b, c), "D": end}
-
-    through = {"crank": ("AB", a), "coupler": ("BC", b), "rocker": ("DC", c)}
-    links = {name: Link(list(pins), mass=density * length) for name, (pins, length) in through.items()}
-    return draw_on_pose(places, angle, angular_velocity, links, ["A", "D"], gravity, "four-bar")
-
-
-@with_known_numbers
-def slider_crank(
-    angle: ArrayLike = 0.0,
-    angular_velocity: ArrayLike = 4.0,
-    driven: bool = True,
-    crank: ArrayLike = 0.5,
-    rod: ArrayLike = 1.5,
-    masses: Sequence[ArrayLike] = (1.0, 1.5, 2.0),
-    slider_inertia: ArrayLike = 0.1,
-    gravity: ArrayLike = 9.81,
-    spring: Sequence[ArrayLike] | None = None,
-) -> Mechanism:
-    """Return a slider-crank on the x axis: crank of length `crank` on the origin, connecting rod, slider in a guide.
-
-    `driven`: a motor turns the crank at constant `angular_velocity` from `angle`; otherwise these are its initial state.
-    `masses` are those of crank, rod (both uniform) and slider. `spring`: stiffness (N/m), length (m) and damping (N s/m) of one
-    that holds the slider to the origin, from which it is rod - crank to rod + crank away.
-    """
-
-    def places(s):
-        xp = array_namespace(s, crank, rod)
-        tilt = -xp.arcsin(crank * xp.sin(s) / rod)
-        pin = crank * unit_vector(s)
-        return {"O": np.zeros(2), "P": pin, "B": pin + rod * unit_vector(tilt)}
-
-    links = {"crank": Link(["O", "P"], mass=masses[0]), "rod": Link(["P", "B"], mass=masses[1])}
-    return draw_on_pose(
-        places,
-        angle,
-        angular_velocity,
-        links | {"slider": Link(["B"], mass=masses[2], inertia=slider_inertia)},
-        ["O"],
-        gravity,
-        "slider-crank",
-        slides={"guide": Slide("slider", direction=0.0)},
-        motors={"motor": Motor("O", speed=angular_velocity)} if driven else {},
-        forces={} if spring is None else {"spring": Spring((GROUND, "slider"), ORIGINS, *spring)},
-    )
 
 
 @with_known_numbers

@@ -1,4 +1,4 @@
-"""Larger mechanisms: a scissor lift, a straight-line linkage, a planetary gear. SI units, radians."""
+"""Larger mechanisms: a straight-line linkage, a planetary gear. SI units, radians."""
 
 from collections.abc import Sequence
 
@@ -6,16 +6,12 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.drawing.drawn_joints import PinInSlot, Slide
-from udkjax.scene.drawing.link import Link
 from udkjax.scene.joints import Gear, Joint, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,
-    as_array,
     bar_pose,
     bodies_on_pose,
-    draw_on_pose,
     gravity_vector,
     uniform_disc,
     uniform_rod,
@@ -23,51 +19,6 @@ from udkjax.scene.library.posed_bodies import (
     with_known_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
-
-
-@with_known_numbers
-def scissor_lift(
-    stages: int = 2,
-    angle: ArrayLike = np.pi / 6,
-    angular_velocity: ArrayLike = 0.0,
-    length: ArrayLike = 1.0,
-    mass: ArrayLike = 1.0,
-    platform_mass: ArrayLike = 5.0,
-    gravity: ArrayLike = 9.81,
-) -> Mechanism:
-    """Return a scissor lift: `stages` pairs of crossed bars and a platform, overconstrained by 2 rows by the platform's guide.
-
-    The bars rising0, falling0, ... cross at their middles, pinned, at `angle` to the horizontal; left ends stay on the y axis.
-    """
-    left = ["foot", *(f"left{i}" for i in range(stages - 1)), "head"]  # pins, from the bottom up
-    right = ["sliding foot", *(f"right{i}" for i in range(stages))]
-
-    def places(s):
-        x, y = length * unit_vector(s)
-        found = {f"middle{i}": (0.5 * x, (i + 0.5) * y) for i in range(stages)}
-        found |= {pin: (x * k, i * y) for k, side in enumerate((left, right)) for i, pin in enumerate(side)}
-        found["end"] = (0.0 * x + length, stages * y)
-        return {name: as_array(place) for name, place in found.items()}
-
-    links = {}
-    for i in range(stages):
-        links[f"rising{i}"] = Link([left[i], f"middle{i}", right[i + 1]], mass=mass, width=0.0)
-        links[f"falling{i}"] = Link([left[i + 1], f"middle{i}", right[i]], mass=mass, width=0.0)
-    slots = {
-        "sliding foot": PinInSlot("sliding foot", direction=0.0),
-        "sliding head": PinInSlot(right[-1], along=("head", "end"), on="platform"),
-    }
-    return draw_on_pose(
-        places,
-        angle,
-        angular_velocity,
-        links | {"platform": Link(["head", "end"], mass=platform_mass)},
-        ["foot"],
-        gravity,
-        "scissor lift",
-        slides={"guide": Slide("platform", direction=np.pi / 2)},
-        slots=slots,
-    )
 
 
 @with_known_numbers

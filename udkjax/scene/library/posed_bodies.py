@@ -5,10 +5,10 @@ the velocity is the pose's derivative times the rate of s. NumPy computes it, wh
 the pose is traced, JAX does. So it is written in the functions of `array_namespace` of its numbers.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import wraps
 from inspect import signature
-from typing import Any, ParamSpec, TypeAlias
+from typing import ParamSpec, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,6 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.scene.bodies import Body
-from udkjax.scene.drawing import Drawing
-from udkjax.scene.drawing.link import Link
 from udkjax.scene.fields import array_namespace, number
 from udkjax.scene.mechanism import Mechanism
 
@@ -67,22 +65,6 @@ def bodies_on_pose(names: Sequence[str], physics: Sequence[tuple], pose: Callabl
     places, rates = derivative(pose, as_array(s), rate)
     bodies = zip(names, physics, places, rates, strict=True)
     return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
-
-
-def draw_on_pose(
-    places: Callable,
-    s: ArrayLike,
-    rate: ArrayLike,
-    links: Mapping[str, Link],
-    ground: Sequence[str],
-    gravity: ArrayLike,
-    name: str,
-    **more: Any,
-) -> Mechanism:
-    """Draw links through pins at {name: place} of places(s), moving as s does at its rate; and more, as `Drawing` takes it."""
-    pins, velocities = derivative(places, as_array(s), rate)
-    drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name, **more)
-    return drawing.mechanism()
 
 
 def as_array(numbers: Several) -> Array | np.ndarray:

@@ -21,6 +21,7 @@ from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion, plane_of
 from udkjax.scene.mjcf.plane_model import PlaneModel
 from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
+from udkjax.scene.toml_text import is_xml
 
 INITIAL = "initial"  # the keyframe that `mjcf_text` writes velocities and controls into
 CLOSED = 1e-9  # of the model's size: what rounding leaves open of a loop
@@ -58,11 +59,6 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
         return mechanism_of_text(Path(path).read_text(encoding="utf-8") if path else str(source), path, leave_out, key)
     except UnicodeDecodeError as error:
         raise SceneError([f"not a text file in UTF-8 ({error})"], path) from None
-
-
-def is_xml(text: str) -> bool:
-    """Return whether a text is XML rather than TOML, or the name of a file."""
-    return text.removeprefix("\ufeff").lstrip().startswith("<")
 
 
 def mechanism_of_text(

@@ -1,0 +1,24 @@
+"""Packages whose names are imported when they are first asked for: they stand in the package's `__init__.pyi`."""
+
+import pkgutil
+import re
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+
+def lazy_names(package: str) -> tuple[Callable[[str], Any], list[str]]:
+    """Return `__getattr__` and `__all__` of a package, from the imports of its stub, which type checkers and editors read."""
+    stub = (pkgutil.get_data(package, "__init__.pyi") or b"").decode()
+    homes = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)}
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        home = homes[name]
+        value = import_module(f"{home}.{name}") if home == package else getattr(import_module(home), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return find, [*homes]

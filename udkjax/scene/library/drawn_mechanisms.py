@@ -1,0 +1,142 @@
+"""Mechanisms that are drawn: a four-bar, a slider-crank, a scissor lift. SI units, radians."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.drawing.drawing import Drawing
+from udkjax.scene.drawing.drawn_forces import Motor
+from udkjax.scene.drawing.drawn_joints import PinInSlot, Slide
+from udkjax.scene.drawing.link import Link
+from udkjax.scene.fields import array_namespace
+from udkjax.scene.forces import Spring
+from udkjax.scene.library.posed_bodies import ORIGINS, apex, as_array, derivative, gravity_vector, unit_vector, with_known_numbers
+from udkjax.scene.mechanism import Mechanism
+
+
+@with_known_numbers
+def four_bar(
+    angle: ArrayLike = np.pi / 3,
+    angular_velocity: ArrayLike = 0.0,
+    lengths: Sequence[ArrayLike] = (1.0, 2.5, 2.0),
+    ground: ArrayLike = 2.5,
+    density: ArrayLike = 1.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a four-bar, by default a crank-rocker: crank, coupler and rocker of `lengths`, uniform, `density` in kg/m.
+
+    The crank turns on the origin at `angle`, the rocker on (`ground`, 0); the coupler's far pin is above their line.
+    """
+    a, b, c = lengths
+
+    def places(s):
+        start, end = a * unit_vector(s), ground * np.array([1.0, 0.0])
+        return {"A": np.zeros(2), "B": start, "C": apex(start, end, b, c), "D": end}
+
+    through = {"crank": ("AB", a), "coupler": ("BC", b), "rocker": ("DC", c)}
+    links = {name: Link(list(pins), mass=density * length) for name, (pins, length) in through.items()}
+    return draw_on_pose(places, angle, angular_velocity, links, ["A", "D"], gravity, "four-bar")
+
+
+@with_known_numbers
+def slider_crank(
+    angle: ArrayLike = 0.0,
+    angular_velocity: ArrayLike = 4.0,
+    driven: bool = True,
+    crank: ArrayLike = 0.5,
+    rod: ArrayLike = 1.5,
+    masses: Sequence[ArrayLike] = (1.0, 1.5, 2.0),
+    slider_inertia: ArrayLike = 0.1,
+    gravity: ArrayLike = 9.81,
+    spring: Sequence[ArrayLike] | None = None,
+) -> Mechanism:
+    """Return a slider-crank on the x axis: crank of length `crank` on the origin, connecting rod, slider in a guide.
+
+    `driven`: a motor turns the crank at constant `angular_velocity` from `angle`; otherwise these are its initial state.
+    `masses` are those of crank, rod (both uniform) and slider. `spring`: stiffness (N/m), length (m) and damping (N s/m) of one
+    that holds the slider to the origin, from which it is rod - crank to rod + crank away.
+    """
+
+    def places(s):
+        xp = array_namespace(s, crank, rod)
+        tilt = -xp.arcsin(crank * xp.sin(s) / rod)
+        pin = crank * unit_vector(s)
+        return {"O": np.zeros(2), "P": pin, "B": pin + rod * unit_vector(tilt)}
+
+    links = {"crank": Link(["O", "P"], mass=masses[0]), "rod": Link(["P", "B"], mass=masses[1])}
+    return draw_on_pose(
+        places,
+        angle,
+        angular_velocity,
+        links | {"slider": Link(["B"], mass=masses[2], inertia=slider_inertia)},
+        ["O"],
+        gravity,
+        "slider-crank",
+        slides={"guide": Slide("slider", direction=0.0)},
+        motors={"motor": Motor("O", speed=angular_velocity)} if driven else {},
+        forces={} if spring is None else {"spring": Spring((GROUND, "slider"), ORIGINS, *spring)},
+    )
+
+
+@with_known_numbers
+def scissor_lift(
+    stages: int = 2,
+    angle: ArrayLike = np.pi / 6,
+    angular_velocity: ArrayLike = 0.0,
+    length: ArrayLike = 1.0,
+    mass: ArrayLike = 1.0,
+    platform_mass: ArrayLike = 5.0,
+    gravity: ArrayLike = 9.81,
+) -> Mechanism:
+    """Return a scissor lift: `stages` pairs of crossed bars and a platform, overconstrained by 2 rows by the platform's guide.
+
+    The bars rising0, falling0, ... cross at their middles, pinned, at `angle` to the horizontal; left ends stay on the y axis.
+    """
+    left = ["foot", *(f"left{i}" for i in range(stages - 1)), "head"]  # pins, from the bottom up
+    right = ["sliding foot", *(f"right{i}" for i in range(stages))]
+
+    def places(s):
+        x, y = length * unit_vector(s)
+        found = {f"middle{i}": (0.5 * x, (i + 0.5) * y) for i in range(stages)}
+        found |= {pin: (x * k, i * y) for k, side in enumerate((left, right)) for i, pin in enumerate(side)}
+        found["end"] = (0.0 * x + length, stages * y)
+        return {name: as_array(place) for name, place in found.items()}
+
+    links = {}
+    for i in range(stages):
+        links[f"rising{i}"] = Link([left[i], f"middle{i}", right[i + 1]], mass=mass, width=0.0)
+        links[f"falling{i}"] = Link([left[i + 1], f"middle{i}", right[i]], mass=mass, width=0.0)
+    slots = {
+        "sliding foot": PinInSlot("sliding foot", direction=0.0),
+        "sliding head": PinInSlot(right[-1], along=("head", "end"), on="platform"),
+    }
+    return draw_on_pose(
+        places,
+        angle,
+        angular_velocity,
+        links | {"platform": Link(["head", "end"], mass=platform_mass)},
+        ["foot"],
+        gravity,
+        "scissor lift",
+        slides={"guide": Slide("platform", direction=np.pi / 2)},
+        slots=slots,
+    )
+
+
+def draw_on_pose(
+    places: Callable,
+    s: ArrayLike,
+    rate: ArrayLike,
+    links: Mapping[str, Link],
+    ground: Sequence[str],
+    gravity: ArrayLike,
+    name: str,
+    **more: Any,
+) -> Mechanism:
+    """Draw links through pins at {name: place} of places(s), moving as s does at its rate; and more, as `Drawing` takes it."""
+    pins, velocities = derivative(places, as_array(s), rate)
+    drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name, **more)
+    return drawing.mechanism()
