@@ -82,6 +82,8 @@ def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
     places = sorted((c.dxf.center.x, c.dxf.center.y) for c in space.query('CIRCLE[layer=="joints"]'))
     np.testing.assert_allclose(places, sorted(closed_form.pins(0.3).values()), atol=2e-5)
     assert {"links", "joints", "ground", "motors", "blocks"} <= {layer.dxf.name for layer in drawing.layers}
+    paths = space.query('LWPOLYLINE[layer=="paths"]')
+    assert_paths_of_slider_crank([np.array([point[:2] for point in path.get_points()]) for path in paths], 1e-4)
 
 
 def painted_by_script(symbols, pose, view, folder):
@@ -149,3 +151,29 @@ def test_wrong_names_and_themes(animation, tmp_path):
         animation.save(tmp_path / "motion.bmp")
     with pytest.raises(ValueError, match="theme 'blue'"):
         animation.save(tmp_path / "pose.png", theme="blue")
+
+
+def assert_paths_of_slider_crank(paths, atol):
+    """The crank's pin goes round a circle, the wrist pin to and fro along a line (m)."""
+    line, circle = sorted(paths, key=lambda path: np.ptp(path[:, 1]))
+    np.testing.assert_allclose(np.hypot(*circle.T), 0.5, atol=atol)
+    np.testing.assert_allclose([circle.min(axis=0), circle.max(axis=0)], [[-0.5, -0.5], [0.5, 0.5]], atol=1e-3)
+    np.testing.assert_allclose(line[:, 1], 0.0, atol=atol)
+    np.testing.assert_allclose([line[:, 0].min(), line[:, 0].max()], [1.0, 2.0], atol=1e-3)
+
+
+def test_paths_are_those_of_the_closed_form(animation, run, slider_crank, tmp_path):
+    text = animation.save(tmp_path / "pose.svg", t=0.3, width=800).read_text()
+    view = view_of(animation.data["bounds"], 800)
+    found = re.findall(r'"path" points="([^"]+)"', text)
+    pixels = [np.array([pair.split(",") for pair in points.split()], float) for points in found]
+    assert_paths_of_slider_crank([(p - [view.x, view.y]) * [1, -1] / view.scale for p in pixels], 0.02 / view.scale)
+    plain = udk.animate(slider_crank, run, traces=[], measures=()).save(tmp_path / "plain.svg").read_text()
+    assert '"path"' not in plain
+
+
+def test_a_path_is_painted(animation, closed_form):
+    view = view_of(animation.data["bounds"], 900)
+    x, y = closed_form.pins(1.0)["P"]
+    place = round(view.x + view.scale * x), round(view.y - view.scale * y)
+    assert films.image(animation, 0.0, 900).getpixel(place) != (255, 255, 255)

@@ -20,7 +20,8 @@ from udkjax.show.player.marks import Shapes
 from udkjax.show.player.measure_curves import Measures, ShownMotion
 from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
-from udkjax.show.player.player_data import Traces, failure_of, mode_record, motion_of, player_data, run_record
+from udkjax.show.player.player_data import Traces, failure_of, mode_record, motion_of, paths_of, player_data, run_record
+from udkjax.show.player.sketch import TracedPath
 
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
@@ -47,6 +48,7 @@ class Animation:
     def __init__(self, data: Json, failures: Mapping[str, str] | None = None):
         self.data, self.failures = data, dict(failures or {})  # how runs failed, by their labels
         self._motions = [motion_of(record) for record in data["runs"]]
+        self._paths: list[list[TracedPath]] | None = None
 
     def html(self, theme: str | None = None, autoplay: bool = False) -> str:
         """Return one self-contained HTML page. `theme` is "light" or "dark"; by default, what the reader's system prefers."""
@@ -99,6 +101,12 @@ class Animation:
         """Return the coordinates of each run at time t (s; of a mode, the part of a cycle), as the player shows them."""
         t = float(self.data["start"] if t is None else t)
         return [motion(t) for motion in self._motions]
+
+    def paths(self) -> list[list[TracedPath]]:
+        """Return the paths (m) of the traced points of each run."""
+        if self._paths is None:
+            self._paths = [paths_of(record) for record in self.data["runs"]]
+        return self._paths
 
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)

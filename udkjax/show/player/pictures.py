@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from udkjax.extras import OptionalImport
 from udkjax.show.player.packing import Json
-from udkjax.show.player.sketch import THEMES, Circle, Line, Sketch, View, view_of
+from udkjax.show.player.sketch import THEMES, Circle, Line, Sketch, TracedPath, View, view_of
 
 DXF_LAYERS = {
     "pin": "joints",
@@ -30,6 +30,10 @@ class Posed(Protocol):
         """Return the coordinates of each run at time t."""
         ...
 
+    def paths(self) -> list[list[TracedPath]]:
+        """Return the paths of the traced points of each run."""
+        ...
+
 
 def sketches(animation: Posed, t: float | None, width: int, theme: str, times: int = 1) -> tuple[View, list[Sketch]]:
     """Return the view of each panel, `width` over all and so many times as large, and the sketch of each run at time t."""
@@ -37,7 +41,8 @@ def sketches(animation: Posed, t: float | None, width: int, theme: str, times: i
         raise ValueError(f"theme {theme!r} is neither of {', '.join(THEMES)}")
     runs = animation.data["runs"]
     view = view_of(animation.data["bounds"], width // len(runs), times)
-    return view, [Sketch(run["marks"], pose, view, theme) for run, pose in zip(runs, animation.pose(t), strict=True)]
+    shown = zip(runs, animation.pose(t), animation.paths(), strict=True)
+    return view, [Sketch(run["marks"], pose, view, theme, paths) for run, pose, paths in shown]
 
 
 def svg(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> str:

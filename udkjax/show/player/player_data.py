@@ -32,7 +32,7 @@ from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
-from udkjax.show.player.sketch import POINT, view_of
+from udkjax.show.player.sketch import POINT, TracedPath, view_of
 from udkjax.show.player.symbols import symbols_of
 from udkjax.study.channels import locate
 
@@ -50,6 +50,7 @@ COMFORTABLE_DURATIONS = (4.0, 40.0)  # s: how long it takes to play something at
 SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 MODE_PERIOD = 2.0  # s: how long one cycle of a mode takes
 MODE_AMPLITUDE = 0.12  # of the characteristic length, or rad: how far a mode is shown to move
+PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # of a path: for each instant of its run, and in all
 SMALLEST_PATH = 1e-6  # characteristic lengths: what moves less has no path
 
 
@@ -147,6 +148,17 @@ def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]
     return at
 
 
+def paths_of(record: Record) -> list[TracedPath]:
+    """Return the paths of the traced points of a run, through points that are evenly spaced in time."""
+    if not record["traces"]:
+        return []
+    ts = unpack(record["time"])[:, 0]
+    motion = motion_of(record)
+    times = np.linspace(ts[0], ts[-1], min(PATH_POINTS * len(ts), MOST_PATH_POINTS))
+    poses = np.array([motion(t) for t in times])
+    return [TracedPath(int(body), to_ground((x, y), poses[:, int(body)])) for body, x, y in record["traces"]]
+
+
 def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.ndarray, "T bodies 3"]]]) -> Record:
     """Return the data of the player for runs, or for modes."""
     is_mode = runs[0][1]["mode"] is not None
@@ -224,8 +236,8 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
             hold(mark["body"], np.add(point, mark.get("at", (0.0, 0.0))))
         for k, x, y in (mark[end] for end in ("a", "b") if end in mark):
             hold(int(k), (x, y))
-    for k in range(len(mechanism.bodies)):
-        hold(k, (0.0, 0.0))
+    for body, *at in [*record["traces"], *([k, 0.0, 0.0] for k in range(len(mechanism.bodies)))]:
+        hold(int(body), at)
     least = 0.1 * float(analyse(mechanism).length)  # a single bar on a line has no height
     grow = np.maximum(0.0, least - (high - low) / 2)
     return [*(low - grow).tolist(), *(high + grow).tolist()]

@@ -24,6 +24,14 @@ THEMES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 POINT = 420.0  # px: of pictures whose shorter side is this long a symbol's unit is one pixel
 MARGIN = 44.0  # px
+PATH_WIDTH, PATH_TINT = 1.2, 0.4  # units of a symbol; of the way from the colour of a body to the background
+
+
+class TracedPath(NamedTuple):
+    """The path of a point (n, 2) of a body, in metres."""
+
+    body: int
+    points: Float[np.ndarray, "n 2"]
 
 
 class View(NamedTuple):
@@ -77,11 +85,24 @@ def mix(one: str, two: str, t: float) -> str:
 
 
 class Sketch:
-    """The symbols of a mechanism's marks at one pose, in the order in which they cover one another."""
+    """Paths and the symbols of a mechanism's marks at one pose, in the order in which they cover one another."""
 
-    def __init__(self, marks: Sequence[Mark], pose: Float[np.ndarray, "bodies 3"], view: View, theme: str = "light"):
+    def __init__(
+        self,
+        marks: Sequence[Mark],
+        pose: Float[np.ndarray, "bodies 3"],
+        view: View,
+        theme: str = "light",
+        paths: Sequence[TracedPath] = (),
+    ):
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
-        self.shapes = [self._shape(symbol) for symbol in symbols_of(marks, view.pt / view.scale)]
+        symbols = symbols_of(marks, view.pt / view.scale)
+        self.shapes = [*map(self._path, paths), *map(self._shape, symbols)]
+
+    def _path(self, path: TracedPath) -> Line:
+        points = np.array([self.view.x, self.view.y]) + self.view.scale * path.points * [1, -1]
+        colour = mix(self._colour(f"edge:{path.body}"), self.theme["back"], PATH_TINT)
+        return Line("path", points, PATH_WIDTH * self.view.pt, colour)
 
     def _shape(self, symbol: Symbol) -> Line | Circle:
         look = symbol["width"] * self.view.pt, self._colour(symbol["stroke"]), self._colour(symbol["fill"])
