@@ -562,3 +562,98 @@ def test_exports_are_chosen_and_named_in_a_dialog(studio):
     studio.page.keyboard.press("Control+n")  # what the dialog leaves the keys to
     studio.settle()
     assert studio.document["pins"] == {}
+
+
+@pytest.mark.slow
+def test_gestures_that_cross_each_other_leave_no_trace(studio):
+    draw_five_bar(studio)
+    studio.tool("v")
+    entries = studio.js("studio.history.at")
+    x, y = studio.pin("B")
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(x + 50, y)
+    studio.page.keyboard.press("Delete")
+    studio.page.mouse.move(x + 90, y)
+    studio.page.mouse.up()
+    assert "B" not in studio.document["pins"] and studio.js("studio.history.at") == entries + 1
+    studio.page.keyboard.press("Control+z")
+    for button in ("right", "middle"):
+        studio.page.mouse.move(*studio.pin("B"))
+        studio.page.mouse.down(button=button)
+        studio.page.mouse.move(x + 50, y)
+        studio.page.mouse.up(button=button)
+        assert studio.document["pins"]["B"] == [80, 100]
+    studio.tool("l")
+    studio.page.mouse.dblclick(*studio.pixel(60, 40))
+    assert len(studio.document["link"]) == 4 and "needs two pins" in studio.status()
+    studio.tool("v")
+    studio.page.mouse.click(*studio.pin("B"))
+    studio.page.get_by_label("x", exact=True).fill("7 cm")
+    x, y = studio.pin("D")
+    studio.drag((x, y), (x + 30, y), pixels=True)
+    assert studio.document["pins"]["B"][0] == "7 cm" and studio.document["pins"]["D"] != [240, 100]
+
+
+@pytest.mark.slow
+def test_a_click_selects_while_it_runs_and_what_is_selected_can_be_deleted(studio):
+    studio.js("studio.files.openTemplate('four_bar')")
+    studio.settle()
+    studio.page.keyboard.press(" ")
+    studio.until("studio.motion.t > 0.1")
+    name = studio.js("Object.keys(studio.document.pins)[1]")
+    studio.page.mouse.click(*studio.pin(name))
+    assert studio.js("[studio.motion.playing, studio.motion.posed, studio.selection[0].name]") == [True, None, name]
+    studio.page.keyboard.press("Delete")
+    assert name not in studio.document["pins"]
+    assert studio.js("[studio.motion.playing, studio.motion.t]") == [False, 0]
+    studio.settle()
+
+
+@pytest.mark.slow
+def test_names_that_are_taken_and_what_is_no_length_are_refused_in_words(studio):
+    studio.link((40, 100), (60, 130))
+    studio.tool("v")
+    studio.click(60, 130)
+    before = studio.document
+    for label, typed, said in (
+        ("name", "A", "there is a pin A already"),
+        ("name", "", "a pin needs a name"),
+        *(("x", typed, "is no length") for typed in ("abc", "", "nan", "5 kg", "1e400", "[1, 2]")),
+    ):
+        field = studio.page.get_by_label(label, exact=True)
+        shown = field.input_value()
+        field.fill(typed)
+        studio.page.keyboard.press("Enter")
+        assert said in studio.status()
+        assert field.input_value() == shown and studio.document == before
+    for typed, written in (("5 cm", "5 cm"), ("1e3 mm", "1e3 mm"), ("7", 7)):
+        studio.page.get_by_label("x", exact=True).fill(typed)
+        studio.page.keyboard.press("Enter")
+        assert studio.document["pins"]["B"][0] == written
+
+
+@pytest.mark.slow
+def test_a_text_that_cannot_be_read_is_kept_and_not_saved(studio):
+    studio.link((40, 100), (60, 130))
+    studio.settle()
+    area, text = studio.page.locator("textarea"), studio.js("studio.state.text")
+    broken = text.replace("[[link]]", "[[link")
+    area.fill(broken)
+    studio.until("studio.source.isBroken")
+    studio.click(150, 150)  # which selects nothing
+    assert area.input_value() == broken and studio.document["link"]
+    area.focus()
+    studio.page.keyboard.press("Control+s")
+    studio.page.keyboard.press("Enter")
+    studio.until("studio.parts.status.textContent.includes('cannot be read')")
+    studio.page.locator("main canvas").focus()
+    studio.tool("v")
+    studio.drag((60, 130), (70, 130))
+    studio.until("studio.source.area.value === studio.state.text")
+    studio.page.get_by_role("button", name="Bring it back").click()
+    studio.until("studio.source.isBroken")
+    assert area.input_value() == broken
+    studio.page.get_by_role("button", name="Back to the text").click()
+    studio.until("!studio.source.isBroken && studio.source.area.value === studio.state.text")
+    assert studio.document["pins"]["B"] == [70, 130]

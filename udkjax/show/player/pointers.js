@@ -7,6 +7,7 @@ export function followPointers(player, canvas, liveRun) {
   let moved = 0, hand = null;  // the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   canvas.addEventListener("pointerdown", event => {
+    if (event.button > 1) return;
     canvas.setPointerCapture(event.pointerId);
     down.set(event.pointerId, point(event));
     moved = 0;

@@ -49,10 +49,12 @@ function section(document, size) {
   return {density: old?.density ?? STEEL.density, width, thickness: old?.thickness ?? tidy(niceBelow(size / 3) / unit)};
 }
 
+const isApart = (document, a, b) => { const [p, q] = [a, b].map(pin => placeOf(document, pin)); return p[0] !== q[0] || p[1] !== q[1]; };
+
 export function drawLink(document, from, to, {size}) {
   let [found, a] = pinFor(document, from), b;
   [found, b] = pinFor(found, to);
-  if (a === b) return {problem: "a link needs two pins: drag from one place to another"};
+  if (a === b || !isApart(found, a, b)) return {problem: "a link needs two pins: drag from one place to another"};
   if (list(document, "link").some(link => link.pins.length === 2 && link.pins.includes(a) && link.pins.includes(b))) {
     return {problem: `there is a link between ${a} and ${b} already`};
   }
@@ -215,7 +217,7 @@ function drawBetween(document, from, to, kind, law, turning) {
     if (isNew) found = toggleGround(found, pin);
     between.push(pin);
   }
-  if (between[0] === between[1]) return {problem: `a ${kind} needs two pins`};
+  if (between[0] === between[1] || !isApart(found, ...between)) return {problem: `a ${kind} needs two pins: drag from one place to another`};
   const shared = members(found, between[0]).filter(name => members(found, between[1]).includes(name));
   if (shared.length) return {problem: `both ends are on ${shared[0]}: their distance never changes`};
   found = withElement(found, kind, {between, ...law});

@@ -125,6 +125,7 @@ export class FileActions {
   async text() {
     const {studio} = this;
     if (studio.source.timer) await studio.source.take();
+    if (studio.source.isBroken) throw new Error("the text beside the drawing cannot be read: mend it, or go back to that of the drawing");
     if (studio.state.text === null) {
       const found = await ask("compile", {text: studio.state.base ?? "", document: studio.state.document});
       Object.assign(studio.state, {text: found.text});

@@ -39,10 +39,12 @@ export class Gestures {
   }
 
   down(event) {
-    if (event.button > 1) return;
+    if (event.button > 1) return undefined;
     const pixel = this.pixel(event);
     this.element.setPointerCapture(event.pointerId);
-    if (event.pointerType !== "mouse") this.element.focus({preventScroll: true});  // which a mouse does by itself
+    this.element.focus({preventScroll: true});  // now, so that a field gives what is typed in it before the gesture begins
+    if (this.studio.source.timer) return this.studio.say("the text is being read: try again");
+    this.studio.draw();
     this.pointers.set(event.pointerId, pixel);
     if (this.pointers.size > 1) return this.cancel();
     this.moved = false;
@@ -66,9 +68,10 @@ export class Gestures {
     const {studio} = this, touch = event.pointerType === "touch", pixel = this.pixel(event);
     const item = itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch);
     if (studio.tool === "pull" || (studio.isMoved && item)) {
-      this.now = item && studio.canPull(item) ? {kind: "pull", item} : {kind: "pan"};
+      const goesOn = studio.motion.playing;
+      this.now = item && studio.canPull(item) ? {kind: "pull", item, at: toMetres(studio.view, pixel), goesOn} : {kind: "pan"};
       if (item) studio.select([item]);
-      if (this.now.kind === "pull") studio.beginPull(item, toMetres(studio.view, pixel));
+      if (this.now.kind === "pull") studio.motion.pause();
       return;
     }
     if (!item) {
@@ -95,7 +98,10 @@ export class Gestures {
     const {kind} = this.now ?? {};
     if (kind === "pan") studio.pan(pixel[0] - before[0][0], pixel[1] - before[0][1]);
     else if (kind === "area") studio.preview = {area: [this.from, pixel]};
-    else if (kind === "pull") studio.pullTo(toMetres(studio.view, pixel));
+    else if (kind === "pull") {
+      if (first) studio.motion.beginPull(this.now.item, this.now.at);
+      studio.motion.pullTo(toMetres(studio.view, pixel));
+    }
     else if (kind === "drag") this.drag(event, pixel);
     else if (kind === "draw") this.stretch(event, first);
     studio.redraw();
@@ -141,7 +147,7 @@ export class Gestures {
     studio.preview = null;
     if (now.kind === "pan" && !this.moved && now.clears) studio.select([]);
     else if (now.kind === "area" && this.moved) studio.select(itemsWithin(studio.document, studio.canvas.places, this.from, this.pixel(event)));
-    else if (now.kind === "pull") studio.endPull();
+    else if (now.kind === "pull") this.letGo(now);
     else if (now.kind === "drag" && this.moved) this.drop(now);
     else if (now.kind === "draw") this.release(now, this.target(event));
     studio.redraw();
@@ -152,6 +158,11 @@ export class Gestures {
     if (onto) {
       studio.commit(settle(mergePins(before, pins[0], onto)), [{kind: "pin", name: onto}]);
     } else studio.commit(studio.document);
+  }
+
+  /** A pull ends; one that moved nothing was a click, and what played goes on. */
+  letGo({goesOn}) {
+    if (this.moved) this.studio.motion.endPull(); else if (goesOn) this.studio.motion.play();
   }
 
   /** A release with a drawing tool: one click of several, or all of it. */
@@ -213,7 +224,7 @@ export class Gestures {
   cancel() {
     const {studio, now} = this, was = Boolean(now || this.start || this.corners.length);
     if (now?.kind === "drag") studio.propose(now.before);
-    if (now?.kind === "pull") studio.endPull();
+    if (now?.kind === "pull") studio.motion.endPull();
     Object.assign(this, {now: null, start: null, corners: []});
     studio.preview = null;
     studio.redraw();

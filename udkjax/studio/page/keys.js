@@ -12,7 +12,7 @@ export function followKeys(studio) {
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, command = event.ctrlKey || event.metaKey;
     const action = command ? commands(studio, event)[key] : plain(studio)[key];
     if (!action || event.altKey || document.querySelector("dialog[open]")) return;
-    if (typing(event.target) && !(command && "sn".includes(key))) return;
+    if (typing(event.target) && !(command && "sno".includes(key))) return;
     if (key === " " && event.target.tagName === "BUTTON") return;  // a button takes the space bar itself
     event.preventDefault();
     action();

@@ -8,6 +8,9 @@ const ICONS = {
   fit: "M4 4h6v2H6v4H4zM14 4h6v6h-2V6h-4zM4 14h2v4h4v2H4zM18 14h2v6h-6v-2h4z", home: "M6 5h2.5v14H6zM19 5v14L9 12z",
 };
 
+// Templates that an empty page offers.
+const FIRST = [["four_bar", "Four-bar"], ["slider_crank", "Slider-crank"], ["parallelogram", "Five-bar"]];
+
 /** Build the page in an element; returns its parts by name. */
 export function buildPage(studio, root) {
   const parts = {};
@@ -52,7 +55,9 @@ export function buildPage(studio, root) {
       const tool = TOOLS.find(one => one.name === name);
       return make("li", {}, button(svgIcon(tool.icon, tool.stroke), `${tool.title} (${tool.key.toUpperCase()})`, () => studio.setTool(name), "icon"),
         make("span", {}, words, " ", make("kbd", {}, tool.key.toUpperCase())));
-    })), button("Open a file or a template", "open a file or a template (Ctrl+O)", () => studio.files.showOpen()));
+    })), make("p", {}, "or start from one that moves"),
+    make("div", {class: "group"}, ...FIRST.map(([name, words]) => button(words, `a drawing to start from: ${words}`, () => studio.files.openTemplate(name))),
+      button("More …", "open a file or a template (Ctrl+O)", () => studio.files.showOpen())));
   const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status);
   parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
   parts.home = button(svgIcon(ICONS.home), "as drawn (Home)", () => studio.rewind(), "icon");

@@ -14,7 +14,6 @@ export class Motion {
     this.motions = new Float64Array(0);
   }
 
-  get canMove() { return Boolean(this.mover); }
   get isMoved() { return this.t > 0 || this.playing || this.posed !== null; }
   get end() { return this.run?.count > 1 ? this.run.ts[this.run.count - 1] : 0; }
 
@@ -113,6 +112,7 @@ export class Motion {
   rewind() {
     this.pause();
     const wasPosed = this.posed !== null;
+    if (wasPosed) this.studio.say("");
     Object.assign(this, {t: 0, posed: null});
     this.studio.hand = null;
     this.still();
@@ -139,7 +139,7 @@ export class Motion {
   }
 
   pullTo(hand) {
-    if (!this.pulled || !this.mover.engine) return;
+    if (!this.pulled) return;
     const {link, place} = this.pulled, found = this.mover.pull(this.posed, link, place, hand);
     this.posed = {t: 0, q: found.q, v: new Float64Array(this.mover.size), closed: true, violation: found.violation};
     this.motions = this.mover.motions(found.q);

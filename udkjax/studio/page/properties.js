@@ -4,6 +4,7 @@ import {groundOf, list, nameOf, pinsOf, renameElement, renamePin, toggleGround, 
 import {readValue, valueText} from "./values.js";
 import {copy, remove} from "./keys.js";
 import {swapPair} from "./actions.js";
+import {length} from "./units.js";
 import {make} from "./player/elements.js";
 
 // Of each kind the keys that are offered: what they are called, and the kind of quantity they are.
@@ -55,7 +56,21 @@ export class PropertiesPanel {
     return make("label", {class: "field"}, make("span", {}, label), input, make("span", {class: "unit"}, unit));
   }
 
-  set(document, select = null) { this.studio.commit(document, select); }
+  set(document, select = null) {
+    this.studio.say("");
+    if (!this.studio.commit(document, select)) this.again();
+  }
+
+  /** Show the fields as they were, and say why nothing changed. */
+  refuse(words) {
+    this.studio.say(words, true);
+    this.again();
+  }
+
+  again() {
+    this.last = null;
+    this.show();
+  }
 
   general() {
     const {document} = this.studio, change = (key, value) => {
@@ -79,14 +94,20 @@ export class PropertiesPanel {
     const {studio} = this, {document} = studio, place = pinsOf(document)[name] ?? ["", ""], unit = unitOf(document, "length");
     const to = k => text => {
       const value = readValue(text), next = [...place];
+      if (!Number.isFinite(length(value, document))) return this.refuse(`"${text}" is no length: such as 12, or 12 mm`);
       next[k] = value;
-      if (value !== undefined) this.set({...document, pins: {...pinsOf(document), [name]: next}});
+      return this.set({...document, pins: {...pinsOf(document), [name]: next}});
+    };
+    const rename = to => {
+      const found = renamePin(document, name, to);
+      if (found === document && to !== name) return this.refuse(to ? `there is a pin ${to} already` : "a pin needs a name");
+      return this.set(found, [{kind: "pin", name: to}]);
     };
     const fixed = make("input", {type: "checkbox", "aria-label": "fixed to the ground"});
     fixed.checked = groundOf(document).includes(name);
     fixed.addEventListener("change", () => this.set(toggleGround(document, name)));
     return [make("h3", {}, `pin ${name}`),
-      this.field("name", name, "", value => this.set(renamePin(document, name, value), [{kind: "pin", name: value in pinsOf(document) || !value ? name : value}])),
+      this.field("name", name, "", rename),
       this.field("x", valueText(place[0]), unit, to(0)), this.field("y", valueText(place[1]), unit, to(1)),
       make("label", {class: "field check"}, make("span", {}, "fixed"), fixed, make("span", {class: "unit"}))];
   }
@@ -103,7 +124,12 @@ export class PropertiesPanel {
       return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ? `such as ${EXAMPLES[quantity]}` : "");
     });
     const extra = Object.keys(entry).filter(key => key !== "name" && !(KEYS[kind] ?? []).some(([path]) => path.split(".")[0] === key));
-    const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", value => this.set(renameElement(document, kind, index, value)), title), ...fields,
+    const rename = to => {
+      const found = renameElement(document, kind, index, to);
+      if (found === document && to !== title) return this.refuse(to ? `there is a ${kind} ${to} already` : `a ${kind} needs a name`);
+      return this.set(found);
+    };
+    const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", rename, title), ...fields,
       ...extra.map(key => this.field(key, valueText(entry[key]), "", text => this.set(withKey(document, kind, index, key, readValue(text)))))];
     if (Array.isArray(entry.of) && entry.of.length === 2) parts.push(make("button", {type: "button", onclick: () => this.set(swapPair(document, kind, index))}, "Turn the other link"));
     return parts;

@@ -49,7 +49,7 @@ class Studio {
     this.gestures = new Gestures(this, this.parts.canvas);
     followKeys(this);
     this.media.addEventListener("change", () => this.retheme());
-    new ResizeObserver(() => this.redraw()).observe(this.parts.canvas);
+    new ResizeObserver(() => (this.isFitted ? this.fit() : this.redraw())).observe(this.parts.canvas);
     this.retheme();
     this.shown();
   }
@@ -83,6 +83,7 @@ class Studio {
 
   /** Take a document as the next state, and tell whether it says anything new. `source` is its text, where that is known. */
   commit(document, select = null, source = null) {
+    this.gestures.cancel();  // one that is under way changes a drawing that is no more
     this.proposed = null;
     const base = this.state.text ?? this.state.base;
     const isNew = this.history.push({document, text: source, base}, (a, b) => text(a) === text(b));
@@ -138,8 +139,8 @@ class Studio {
 
   // The view
 
-  setView(view) {
-    this.view = view;
+  setView(view, isFitted = false) {
+    Object.assign(this, {view, isFitted});
     this.redraw();
   }
 
@@ -149,7 +150,7 @@ class Studio {
     const places = extentPoints(this.document);
     for (const {line} of this.paths) for (let k = 0; k < line.length; k += 2) places.push([line[k], line[k + 1]]);
     const {width, height} = this.canvas;
-    this.setView(fit(places, width || 800, height || 600, NEW_SIZE));
+    this.setView(fit(places, width || 800, height || 600, NEW_SIZE), true);
   }
 
   /** The distance (m) of places that are snapped to. */
@@ -192,11 +193,7 @@ class Studio {
 
   rewind() { this.motion.rewind(); }
 
-  canPull(item) { return this.motion.canMove && (item.kind === "link" || (item.kind === "pin" && members(this.document, item.name).some(name => name !== "ground") && this.canvas.carrier(this.document, item.name) >= 0)); }
-
-  beginPull(item, at) { this.motion.beginPull(item, at); }
-  pullTo(at) { this.motion.pullTo(at); }
-  endPull() { this.motion.endPull(); }
+  canPull(item) { return Boolean(this.motion.mover?.engine) && (item.kind === "link" || (item.kind === "pin" && members(this.document, item.name).some(name => name !== "ground") && this.canvas.carrier(this.document, item.name) >= 0)); }
 
   // What is shown
 
@@ -214,13 +211,17 @@ class Studio {
   }
 
   redraw() {
-    if (this.frame) return;
-    this.frame = requestAnimationFrame(() => {
-      this.frame = null;
-      this.canvas.draw(this);
-      this.curves.draw();
-      this.motion.showTime();
-    });
+    this.frame ??= requestAnimationFrame(() => this.draw());
+  }
+
+  /** Draw now what is to be drawn: places on the screen are those of the drawing as it is. */
+  draw() {
+    if (!this.frame) return;
+    cancelAnimationFrame(this.frame);
+    this.frame = null;
+    this.canvas.draw(this);
+    this.curves.draw();
+    this.motion.showTime();
   }
 }
 

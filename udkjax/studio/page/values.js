@@ -17,7 +17,7 @@ export function readValue(text, isName = false) {
   if (plain.startsWith("[") && plain.endsWith("]")) return parts(plain.slice(1, -1)).map(part => readValue(part, isName)).filter(x => x !== undefined);
   if (isName) return plain.includes(",") ? plain.split(",").map(x => x.trim()).filter(Boolean) : plain;
   if (plain === "true" || plain === "false") return plain === "true";
-  return /^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$/.test(plain) ? +plain : plain;
+  return /^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$/.test(plain) && Number.isFinite(+plain) ? +plain : plain;
 }
 
 /** The parts of a list, at commas outside of brackets. */
