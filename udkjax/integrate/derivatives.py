@@ -45,12 +45,12 @@ def _(primals, tangents):
         return _run(*primals), IntegratorOutput._make([None] * len(IntegratorOutput._fields))
     shapes = eqx.filter_eval_shape(_run, *primals)
 
-    def in_parts(at: Any, *directions: list[Array]) -> tuple[list[Any], ...]:
-        """The run, and linear maps of the directions."""
+    def in_parts(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
+        """The run, and a linear map of the direction."""
         raw, record = at[0].recorded(stop_gradients(at[1]), active)
         states = (raw.q, raw.v) if raw.q.shape[0] > 2 else ()  # of outputs between the first and the last alone
         linear = Linear(function=at[0], xs=at[1], run=(states, record), active=active)
-        return list(_as_run(*at, raw)), *(linear.applied(direction) for direction in directions)
+        return list(_as_run(*at, raw)), linear.applied(direction)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
         """Both by forward mode."""
@@ -59,7 +59,7 @@ def _(primals, tangents):
         return list(raw), change
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
-    raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], active), None, known)
+    raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], active), known)
     return IntegratorOutput(*raw), IntegratorOutput._make(
         change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))
     )

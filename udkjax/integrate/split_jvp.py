@@ -6,8 +6,7 @@ finds both at once need not hand on what it knows.
 """
 
 from collections.abc import Callable, Sequence
-from copy import copy
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,98 +20,56 @@ from jaxtyping import Array, PyTree
 from udkjax.expressions.numpy_program import expand_as
 
 Shapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its change
-Parts = Callable[..., tuple[list[Array], ...]]  # (at, *directions) -> value, *changes, each a list of arrays
+Parts = Callable[..., tuple[list[Array], list[Array]]]  # (at, direction) -> value, change, each a list of arrays
 
 
-def split_jvp(
-    seen: Parts, run: Parts, at: PyTree, direction: PyTree, few: int | None = 1, shapes: Shapes | None = None
-) -> tuple[list[Array], ...]:
+def split_jvp(seen: Parts, run: Parts, at: PyTree, direction: PyTree, shapes: Shapes) -> tuple[list[Array], list[Array]]:
     """The value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
 
-    A batch of up to `few` directions at one place is so many directions for `run`, and of any other `seen` is mapped; where it is
-    None, both are mapped over any batch. `shapes` are those of the value and of the change, where they are known.
+    Both are mapped over any batch. `shapes` are those of the value and of the change.
     """
     direction = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, direction)  # a tangent may be 1.0
     (place, way), static = eqx.partition((at, direction), eqx.is_array)
     (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
 
-    def function(parts: Parts) -> Callable[..., tuple[list[Array], ...]]:
-        return lambda at, *directions: parts(
-            eqx.combine(places.unflatten(at), static[0]), *(eqx.combine(form.unflatten(d), static[1]) for d in directions)
-        )
+    def flat(parts: Parts) -> Callable[..., list[Array]]:
+        def function(*xs: Array) -> list[Array]:
+            given = places.unflatten(xs[: len(start)]), form.unflatten(xs[len(start) :])
+            return [x for found in parts(*eqx.combine(given, static)) for x in found]
 
-    both = Both(function(seen), function(run), start, ways, few, shapes)
-    return both.split(along_p.bind(*start, *ways, both=both))
+        return function
+
+    both = Both(flat(seen), flat(run), len(start), shapes)
+    found = along_p.bind(*start, *ways, both=both)
+    return list(found[: both.values]), list(found[both.values :])
 
 
 class Both:
-    """The two forms as functions of lists of arrays: those of the place, then those of one direction after another."""
+    """The two forms as functions of arrays: those of the place, `start` of them, then those of the direction."""
 
-    def __init__(
-        self, seen: Parts, run: Parts, start: Sequence[Array], way: Sequence[Array], few: int | None, shapes: Shapes | None = None
-    ):
-        self.seen, self.run = partial(self._flat, seen), partial(self._flat, run)
-        self.start, self.way, self.few = len(start), len(way), few
-        if shapes is not None:
-            self.shapes = shapes
-        self._parts, self._examples = seen, [[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in xs] for xs in (start, way)]
-
-    def _flat(self, parts: Parts, *xs: Array) -> list[Array]:
-        ways = [xs[k : k + self.way] for k in range(self.start, len(xs), self.way)]
-        return [x for found in parts(xs[: self.start], *ways) for x in found]
-
-    def split(self, found: Sequence[Array]) -> tuple[list[Array], ...]:
-        """Split a tangent along one direction into the two forms."""
-        return list(found[: self.values]), list(found[self.values :])
-
-    @cached_property
-    def shapes(self) -> Shapes:
-        """The shapes of the value and of the change along a direction."""
-        value, change = jax.eval_shape(self._parts, *self._examples)
-        return value, change
-
-    @property
-    def values(self) -> int:
-        return len(self.shapes[0])
+    def __init__(self, seen: Callable[..., list[Array]], run: Callable[..., list[Array]], start: int, shapes: Shapes):
+        self.seen, self.run, self.start, self.shapes = seen, run, start, shapes
+        self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "Both":
         """Both forms of a batch."""
-        other = copy(self)
-        other.seen, other.run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
+        seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
-        other.shapes = value, change
-        return other
+        return Both(seen, run, self.start, (value, change))
 
 
 def _avals(*xs: Array, both: Both) -> list[jax.core.ShapedArray]:
-    value, change = both.shapes
-    directions = (len(xs) - both.start) // both.way
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in [*value, *change * directions]]
+    del xs
+    return [jax.core.ShapedArray(x.shape, x.dtype) for part in both.shapes for x in part]
 
 
 def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int | None]]:
     size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
-    directions, moved = (len(xs) - both.start) // both.way, any(axis is not None for axis in axes[: both.start])
-    if both.few is None:
-        found = along_p.bind(*xs, both=both.mapped(axes, size))
-        if moved:
-            return found, [0] * len(found)
-        value, changes = found[: both.values], found[both.values :]
-        return [*(x[0] for x in value), *changes], [*[None] * len(value), *[0] * len(changes)]
-    if moved or size * directions > both.few:
-        changes = [0] * (len(both.shapes[1]) * directions)
-        out = [*[0 if moved else None] * both.values, *changes]
-        return jax.vmap(both.seen, in_axes=tuple(axes), out_axes=out)(*xs), out
-
-    def way(k: int) -> list[Array]:
-        pairs = zip(xs[both.start :], axes[both.start :], strict=True)
-        return [x if axis is None else jax.lax.index_in_dim(x, k, axis, keepdims=False) for x, axis in pairs]
-
-    found = along_p.bind(*xs[: both.start], *(x for k in range(size) for x in way(k)), both=both)
-    value, changes = found[: both.values], found[both.values :]
-    each = len(changes) // size
-    stacked = [jnp.stack(changes[k::each]) for k in range(each)]
-    return [*value, *stacked], [*[None] * len(value), *[0] * each]
+    found = along_p.bind(*xs, both=both.mapped(axes, size))
+    if any(axis is not None for axis in axes[: both.start]):
+        return found, [0] * len(found)
+    value, change = found[: both.values], found[both.values :]
+    return [*(x[0] for x in value), *change], [*[None] * len(value), *[0] * len(change)]
 
 
 def _derivative(primals: Sequence[Array], tangents: Sequence[Array], both: Both) -> tuple[list[Array], list[Array | ad.Zero]]:
