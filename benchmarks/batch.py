@@ -17,7 +17,7 @@ from benchmarks import native
 from benchmarks.common import Compiled, at_equal_error, in_turn, machine, ratio, report
 from benchmarks.peers.peer import STARTS, coordinates
 from benchmarks.scripts import solve
-from udkjax.study.exact import pendulum
+from udkjax.study.accuracy import pendulum
 
 TARGETS = (1e-6, 1e-8)  # m and rad: the largest error of any coordinate of any member
 TOLERANCES = tuple(float(tol) for tol in 10 ** -np.arange(4.0, 10.01, 1.0))

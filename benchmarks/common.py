@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from udkjax.study.machine import processor
+from udkjax.study.members import processor
 
 
 class Compiled:

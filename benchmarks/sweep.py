@@ -16,7 +16,7 @@ import numpy as np
 import udkjax as udk
 from benchmarks.batch import MEMBERS, angles, states
 from benchmarks.common import Compiled, machine, report
-from udkjax.study.machine import cores
+from udkjax.study.members import cores
 
 LINKS = ("link1", "link2", "link3")
 END = 10.0  # s

@@ -28,7 +28,7 @@ import udkjax as udk
 from experiments.common import described, panels, tracked
 from experiments.parts.stepping import by_equal_steps
 from udkjax.show.style import COLOURS
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 RUNGE_KUTTA: dict[str, tuple[Callable[[], Any], int]] = {
     "Heun": (diffrax.Heun, 2),

@@ -28,7 +28,7 @@ import udkjax as udk
 from experiments.common import described, panels, tracked
 from udkjax.equations import prepare
 from udkjax.show.style import COLOURS
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 TREATMENTS: dict[str, tuple[Any, Any]] = {
     "projection": (udk.Auto(), udk.Projection()),

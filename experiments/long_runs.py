@@ -39,7 +39,7 @@ from experiments.parts.stepping import by_tolerance
 from udkjax.equations import prepare
 from udkjax.integrate.diffrax_engine import derivative
 from udkjax.show.style import COLOURS
-from udkjax.study.exact import pendulum
+from udkjax.study.accuracy import pendulum
 
 SOLVERS: dict[str, Any] = {
     "Dopri8": diffrax.Dopri8,

@@ -35,7 +35,7 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from experiments.common import described, panels, tracked
 from udkjax.show.style import COLOURS
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 METHODS: dict[str, Any] = {
     "Auto": udk.Auto,

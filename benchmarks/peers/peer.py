@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import udkjax as udk
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 STARTS = (-45.0, 60.0)  # degrees, at rest; from +60 it crosses singular configurations
 SPACING = 0.05  # s between outputs

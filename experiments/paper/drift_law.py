@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 from udkjax.scene import Mechanism
-from udkjax.study.exact import as_pendulum, parallelogram
+from udkjax.study.accuracy import as_pendulum, parallelogram
 
 ALIKE = 1e-8  # of a link's length: how equal and parallel links are that assembly has closed
 TOL = 1e-11  # of the law's own integration: ten digits of the rate

@@ -10,7 +10,7 @@ import numpy as np
 from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import versions
 from udkjax.scene import Mechanism, dumps
-from udkjax.study.machine import machine
+from udkjax.study.members import machine
 
 from .cases import FIRST_STEP, GAINS, METHODS, RANK_HELD, SMALL_GAINS, Case
 from .comparison import REMARKS, published_row, remark

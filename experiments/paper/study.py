@@ -24,8 +24,8 @@ from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, OneOf, Pseudoinverse, Varga
 from udkjax.scene import Mechanism
 from udkjax.scene.library import parallelogram
-from udkjax.study.exact import exact_coordinates
-from udkjax.study.machine import cores
+from udkjax.study.accuracy import exact_coordinates
+from udkjax.study.members import cores
 
 from . import vode
 from .cases import FIRST_STEP, FULL, RANK_HELD, Case, Program, Scope, plan

@@ -9,7 +9,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.pinv_accuracy import METHODS, SIZE, collection, padded
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 STARTS = (-45.0, 60.0)  # degrees, at rest; from +60 the linkage crosses singular configurations
 THRESHOLDS = {"default": (1e-4, 1e-6), "wide": (1e-2, 1e-3)}  # of the rank, and where `Auto` leaves elimination

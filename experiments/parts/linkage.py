@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 import udkjax as udk
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 OUTPUTS = 481  # of every run: 24 a second where it lasts 20 s; always as many, so that one compiled program serves all runs
 

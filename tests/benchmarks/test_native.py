@@ -8,7 +8,7 @@ benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 from benchmarks import native  # noqa: E402
 from benchmarks.batch import END, OMEGA, angles, exact  # noqa: E402
 from benchmarks.peers.peer import STARTS, problem  # noqa: E402
-from udkjax.study.exact import pendulum  # noqa: E402
+from udkjax.study.accuracy import pendulum  # noqa: E402
 
 
 @pytest.fixture(scope="module", autouse=True)

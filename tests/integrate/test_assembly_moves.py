@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.integrate.assembly_moves import AssemblyWarning
+from udkjax.integrate.assembly import AssemblyWarning
 
 MECH = udk.library.four_bar()
 

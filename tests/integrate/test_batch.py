@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from udkjax.equations.written_out import WrittenOut
 from udkjax.native import operations, primitive
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
 SOLVERS = {s.__name__: s() for s in (diffrax.Dopri8, diffrax.Tsit5, diffrax.Dopri5, diffrax.Bosh3, udk.Verner65)}

@@ -13,7 +13,7 @@ from udkjax.equations import equations_of
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.diffrax_engine import derivative
 from udkjax.study import exact_coordinates
-from udkjax.study.exact import pendulum
+from udkjax.study.accuracy import pendulum
 
 FORMULATIONS = {
     "Augmented": udk.Augmented(),
@@ -182,25 +182,37 @@ def test_plain_LU_on_redundant_rows():
 LONG = np.linspace(0.0, 20.0, 81)
 
 
+STARTS = {"ordinary": (-50, 0.0), "45": (45, 0.0), "in line": (0, 0.0), "up": (90, -1.0)}  # angle (deg), rate (rad/s)
+starts = pytest.mark.parametrize(("angle", "rate"), STARTS.values(), ids=STARTS)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("angle", "rate"), [(-50, 0.0), (45, 0.0), (0, 0.0), (90, -1.0)], ids=["ordinary", "45", "in line", "up"]
-)
-@every
-def test_twenty_seconds(formulation, angle, rate):
-    """The last three starts cross singular configurations. Plain LU gets stuck at the first of them, if not before: it depends on
-    the machine whether a pivot that should be zero is a rounding error. What it does is said, and right up to there."""
+@starts
+@pytest.mark.parametrize("name", [name for name in FORMULATIONS if name != "Augmented"])
+def test_twenty_seconds(name, angle, rate):
+    """The last three starts cross singular configurations."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
-    sol = udk.simulate(mech, LONG, rtol=1e-9, atol=1e-9, formulation=formulation, max_steps=5000, throw=False)
-    wrong = np.nanmax(np.abs(exact(mech, sol) - sol.q))
-    if isinstance(formulation, udk.Augmented) and angle != -50:
-        assert sol.result in (udk.Result.step_limit, udk.Result.step_too_small, udk.Result.not_finite)
-        assert sol.time < 11.0
-    elif isinstance(formulation, udk.Augmented):
-        assert sol.result != udk.Result.drift
-    else:
-        assert sol.result == udk.Result.successful
-    assert wrong < 2e-6
+    sol = udk.simulate(mech, LONG, rtol=1e-9, atol=1e-9, formulation=FORMULATIONS[name], max_steps=5000)
+    assert np.abs(exact(mech, sol) - sol.q).max() < 2e-6
+
+
+@pytest.mark.slow
+@starts
+def test_plain_LU_gets_stuck_where_it_begins(angle, rate):
+    """The pivot of the redundant row is a rounding error, zero or not, so steps shrink to nothing in the first instants.
+
+    Rounding decides: of starts that differ by it, one in twelve gets farther where no branches meet, to where it drifts or to the
+    end, and says so. None is wrong without a word.
+    """
+    mech = udk.library.parallelogram(np.deg2rad(angle), rate)
+    random, q = np.random.default_rng(0), np.asarray(mech.q0)
+    q = q + np.spacing(np.abs(q)) * random.choice([-1, 0, 1], (24, *q.shape))
+    choices = {"rtol": 1e-9, "atol": 1e-9, "formulation": udk.Augmented(), "max_steps": 5000, "throw": False}
+    sols = jax.jit(jax.vmap(lambda q: udk.simulate(mech, LONG, udk.State(q, mech.v0), **choices)))(q)
+    stuck = np.isin(sols.code, (udk.Result.step_limit, udk.Result.step_too_small, udk.Result.not_finite)) & (sols.time < 0.2)
+    assert stuck.mean() >= (0.75 if angle == -50 else 1.0)
+    for k in np.flatnonzero(sols.code == udk.Result.successful):
+        assert np.abs(exact(mech, jax.tree.map(lambda x, k=k: x[k], sols)) - sols.q[k]).max() < 2e-6
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import pytest
 import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations import prepare
-from udkjax.study.exact import pendulum
+from udkjax.study.accuracy import pendulum
 
 DATA = json.loads((Path(__file__).parents[1] / "data" / "seed_fivebar_parallelogram.json").read_text())
 EXACT = {name: float(value) for name, value in DATA["sensitivities_rest_minus50"]["2"].items()}

@@ -92,5 +92,7 @@ def test_what_is_no_array_is_handed_on():
         assert at["name"] == "sine"
         return parts([at["x"]], direction)
 
-    (value,), (change,) = jax.jit(lambda x, dx: split_jvp(named, named, {"name": "sine", "x": x}, [dx], shapes(x)))(X, jnp.ones(2))
+    (value,), (change,) = jax.jit(lambda x, dx: split_jvp(named, named, {"name": "sine", "x": x}, [dx], shapes(x)))(
+        X, jnp.ones(2)
+    )
     np.testing.assert_allclose([value, change], [np.sin(X), np.cos(X)])

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 import udkjax as udk
 from udkjax.scene import GROUND, Prismatic, Revolute, Slot
-from udkjax.study.exact import pendulum
+from udkjax.study.accuracy import pendulum
 
 COS, SIN = Fraction(3, 5), Fraction(4, 5)
 ANGLE = float(np.arctan2(4.0, 3.0))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.exact import exact_coordinates, pendulum
+from udkjax.study.accuracy import exact_coordinates, pendulum
 
 LINKAGE = json.loads((Path(__file__).parents[1] / "data" / "seed_fivebar_parallelogram.json").read_text())["cases"]
 

@@ -10,8 +10,8 @@ motion of the guess as it is and satisfies the drivers. D^+ is truncated, so red
 one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,6 @@ from udkjax.equations.scales import Scales, rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate import native_closing
-from udkjax.integrate.assembly_moves import moves_of_assembly
 from udkjax.integrate.causes.open_rows import explain_open
 from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
@@ -38,7 +37,7 @@ from udkjax.scene.description import poses_table
 from udkjax.scene.fields import is_traced, is_within_jit, number, number_called
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.suspicions import suspicions
+from udkjax.scene.suspicions import body_sizes, suspicions
 
 
 class State(PrintsTable):
@@ -251,3 +250,37 @@ def check_lines(found: Check) -> dict[str, str]:
 def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
     """Return texts by one title, counted where there are more than one."""
     return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
+
+
+# Of a body's size: what a drawing to scale, or numbers of three digits, leave open. A number that is mistyped closes silently.
+WORTH_SAYING = 0.01
+
+
+class AssemblyWarning(UserWarning):
+    """Assembly moved a body by more than a hundredth of its size from its initial guess."""
+
+
+def moves_of_assembly(mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> tuple[str, ...]:
+    """Return, in words, how far each body was moved from its initial guess to the assembled q, where that is worth saying."""
+    change = np.asarray(q) - np.asarray(mechanism.q0)
+    distance, angle = np.hypot(change[:, 0], change[:, 1]), np.abs(change[:, 2])
+    if not np.any(change):
+        return ()
+    return tuple(_moves(mechanism, distance, angle))
+
+
+def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> Iterator[str]:
+    sizes = body_sizes(mechanism)
+    for name, distance, angle in zip(mechanism.body_names, distances, angles, strict=True):
+        if distance + angle * sizes[name] > WORTH_SAYING * sizes[name]:
+            yield f"assembly moved {name} by {distance:.2g} m and {np.degrees(angle):.2g} deg"
+
+
+@cached_by_identity
+def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
+    """Return a warning where assembly moved a body of a mechanism of known numbers far, to the `Closure` at time t (s)."""
+    if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:
+        return ""  # at a later time it is the drivers' business where the bodies are
+    moves = moves_of_assembly(mechanism, closure.state.q)
+    cure = "if that is not meant, a number of these bodies or of their joints is wrong; udk.check says more"
+    return f"{'; '.join(moves)}: {cure}" if moves else ""

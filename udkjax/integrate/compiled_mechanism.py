@@ -18,7 +18,7 @@ from udkjax.equations.quantities import equations_of
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.held_rows import SampleRows
+from udkjax.integrate.packing import SampleRows
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.formulations import FormulationCode, formulation_code

@@ -19,9 +19,8 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import Closure, State, close, require_closed
-from udkjax.integrate.assembly_moves import AssemblyWarning, moves_from_guess
-from udkjax.integrate.causes.explained import explained
+from udkjax.integrate.assembly import AssemblyWarning, Closure, State, close, moves_from_guess, require_closed
+from udkjax.integrate.causes.find import explained
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients

@@ -9,7 +9,7 @@ from udkjax.scene.checks import SceneError, abbreviate
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.toml_text import is_xml, parse_toml
+from udkjax.scene.mechanism_tables import is_xml, parse_toml
 
 DRAWN_VERSION = 2  # of the format: drawings, of pins and links
 

@@ -1,13 +1,14 @@
 """Mechanisms as the tables of a TOML file, format 1, and back; reading gives the same numbers, bit by bit."""
 
 import re
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
+from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
 from udkjax.scene.fields import Table, is_traced, vector_as_angle
 from udkjax.scene.given_elements import name_elements
 from udkjax.scene.mechanism import Mechanism
@@ -130,3 +131,30 @@ def _string(text: str) -> str:
     """Return a TOML basic string."""
     escaped = re.sub(r'[\\"]', lambda match: "\\" + match[0], text)
     return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped) + '"'
+
+
+def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
+    """Return the tables of a text.
+
+    Args:
+        text: TOML; a byte order mark before it is passed over.
+        source: The file that it stands in, or empty.
+        error: The class of the error.
+
+    Returns:
+        The tables.
+
+    Raises:
+        Mistakes: `error`; the text is not TOML, nests too deeply, or holds a number of thousands of digits.
+    """
+    try:
+        return tomllib.loads(text.removeprefix("\ufeff"))
+    except RecursionError:
+        raise error(["not valid here: lists or tables nest too deeply to be read; three levels are enough"], source) from None
+    except ValueError as problem:  # not TOML, or a whole number of more digits than Python reads
+        raise error([f"not valid TOML: {problem}"], source) from None
+
+
+def is_xml(text: str) -> bool:
+    """Return whether a text is XML rather than TOML, or the name of a file."""
+    return text.removeprefix("\ufeff").lstrip().startswith("<")

@@ -15,7 +15,7 @@ from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
 from udkjax.native import code_cache, machine
 from udkjax.scene.library import double_pendulum
-from udkjax.study.machine import cores, processor
+from udkjax.study.members import cores, processor
 
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 

@@ -12,7 +12,7 @@ from udkjax.study.report import plural
 from udkjax.study.sweep.chunks import SweepCost
 from udkjax.study.sweep.dataset import bytes_per_member, variables_of
 from udkjax.study.sweep.plan import SweepPlan
-from udkjax.study.sweep.sweep_progress import duration
+from udkjax.study.sweep.sweep import duration
 
 if TYPE_CHECKING:
     import xarray

@@ -11,7 +11,7 @@ from tomlkit.items import AoT, Array, Item, Table
 
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing.drawing_tables import LISTS
-from udkjax.scene.toml_text import parse_toml
+from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]

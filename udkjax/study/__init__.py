@@ -1,3 +1,3 @@
 """Questions asked of trajectories."""
 
-from udkjax.study.exact import exact_coordinates as exact_coordinates
+from udkjax.study.accuracy import exact_coordinates as exact_coordinates

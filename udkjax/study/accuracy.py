@@ -5,13 +5,13 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
+from scipy.special import ellipj, ellipkinc
 
 from udkjax.equations import energy, violation
 from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
 from udkjax.integrate.events.conditions import frames_of
-from udkjax.scene import Mechanism
-from udkjax.study.exact import exact_coordinates
+from udkjax.scene import GROUND, Mechanism, Revolute
 
 N_SAMPLES = 5  # times at which it is asked whether drivers move and potentials change
 
@@ -70,3 +70,110 @@ def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
 def largest_violation(violated: Float[ArrayLike, "T m"]) -> Float[np.ndarray, " T"]:
     """Return the largest violation of any constraint at each time (m or rad), from what `udkjax.violation` returns."""
     return np.abs(np.asarray(violated)).max(axis=1, initial=0.0)
+
+
+class Parallelogram(NamedTuple):
+    """A parallelogram linkage as it stands at the start, in ground axes.
+
+    Links that are equal and parallel, pinned to the ground and to one coupler at the same spacing, turn as one; the coupler only
+    translates. With c_i the centre of mass of link i seen from its ground pivot, p the arm from there to the coupler's pin, and
+    R(theta) the turn since the start, the energies are
+
+        T = J theta'^2 / 2,     J = sum(I_i + m_i |c_i|^2) + m_c |p|^2
+        V = -g . R(theta) w,    w = sum(m_i c_i) + m_c p
+
+    so J phi'' = -|g| |w| sin(phi), phi the angle from g to R w: a pendulum, solved by Jacobi's elliptic functions. The linkage of
+    de Falco, Pennestri and Vita (2005), section 6, is one: 3.05 theta'' = -3.5 g cos(theta), theta the angle of its links.
+    """
+
+    links: list[int]  # places in the order of the bodies
+    coupler: int
+    pivots: Float[np.ndarray, "links 2"]  # m
+    centres: Float[np.ndarray, "links 2"]  # c_i, m
+    arm: Float[np.ndarray, "2"]  # p, m
+
+
+def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[np.ndarray, "T bodies 3"] | None:
+    """Return the exact x, y (m) and angle (rad) of all bodies at the times `ts` (s), or None: this is no parallelogram.
+
+    It starts at `ts[0]` from `q0`, `v0`, both (bodies, 3). Links count as equal and parallel within `tol` times their length,
+    since assembly closes the loops only to rounding.
+    """
+    ts, q0, v0 = (np.asarray(array, float) for array in (ts, q0, v0))
+    linkage = parallelogram(mech, q0, tol)
+    if linkage is None:
+        return None
+    links, coupler, pivots, centres, arm = linkage
+    angle, omega = as_pendulum(mech, linkage)
+    turn = pendulum(ts - ts[0], angle, v0[links[0], 2], omega)
+
+    q = np.repeat(q0[None], len(ts), axis=0)
+    for link, pivot, centre in zip(links, pivots, centres, strict=True):
+        q[:, link, :2] = pivot + _rotate(centre, turn)
+        q[:, link, 2] += turn
+    q[:, coupler, :2] += _rotate(arm, turn) - arm
+    return q
+
+
+def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
+    """Return phi (rad) of a linkage as it stands, its angle from hanging, and omega (1/s) of its small oscillations."""
+    bodies, gravity = list(mech.bodies.values()), np.asarray(mech.gravity, float)
+    masses = np.array([float(bodies[link].mass) for link in linkage.links])
+    load, arm = float(bodies[linkage.coupler].mass), linkage.arm
+    inertia = sum(float(bodies[link].inertia) for link in linkage.links)
+    inertia += masses @ (linkage.centres**2).sum(1) + load * arm @ arm
+    moment = masses @ linkage.centres + load * arm
+    angle = np.arctan2(moment[1], moment[0]) - np.arctan2(gravity[1], gravity[0])
+    return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi), float(np.sqrt(np.hypot(*gravity) * np.hypot(*moment) / inertia))
+
+
+def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, " T"]:
+    """Return by how much phi has turned (rad) at `ts`, where phi'' = -omega^2 sin(phi) starts from `angle` with `rate` (rad/s).
+
+    Below the top it swings, sin(phi / 2) = k sn(omega t + u, k); above it turns over, phi / 2 = am(k omega t + u, 1 / k). The
+    first amplitude comes from atan2: asin would lose half of the digits at a release from rest.
+    """
+    if omega == 0:
+        return rate * ts
+    angle = np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+    half, speed = np.sin(angle / 2), rate / (2 * omega)
+    k = np.hypot(half, speed)
+    if k <= 1:
+        start = ellipkinc(np.arctan2(half, speed), k**2)
+        if np.isinf(start):  # upside down, at rest
+            return np.zeros_like(ts)
+        sn, _, dn, _ = ellipj(omega * ts + start, k**2)
+        return 2 * np.arctan2(k * sn, dn) - angle
+    u = np.copysign(k, rate) * omega * ts + ellipkinc(angle / 2, 1 / k**2)
+    return 2 * ellipj(u, 1 / k**2)[3] - angle
+
+
+def parallelogram(mech: Mechanism, q0, tol: float) -> Parallelogram | None:
+    """Recognize a parallelogram linkage that moves under gravity alone, in the configuration `q0`, (bodies, 3)."""
+    if mech.drivers or mech.forces or not all(type(joint) is Revolute for joint in mech.joints.values()):
+        return None
+    pins = [dict(zip(joint.bodies, np.asarray(joint.points), strict=True)) for joint in mech.joints.values()]
+    below = {body: pin for pin in pins if GROUND in pin for body in pin if body != GROUND}
+    above = [pin for pin in pins if GROUND not in pin]
+    shared = set(mech.bodies).intersection(*above)
+    if len(shared) != 1 or len(pins) != 2 * len(below) or len(below) + 1 != len(mech.bodies):
+        return None
+    (coupler,) = shared
+    above = {body: pin for pin in above for body in pin if body != coupler}
+    if set(above) != set(below):
+        return None
+
+    place = {name: number for number, name in enumerate(mech.bodies)}
+    angle = {name: q0[number, 2] for name, number in place.items()}
+    pivots = np.array([pin[GROUND] for pin in below.values()])
+    arms = np.array([_rotate(above[link][link] - below[link][link], angle[link]) for link in below])
+    spacing = np.array([_rotate(above[link][coupler], angle[coupler]) for link in below]) - pivots
+    if np.abs(arms - arms[0]).max() + np.abs(spacing - spacing[0]).max() > tol * np.hypot(*arms[0]):
+        return None
+    centres = np.array([_rotate(-below[link][link], angle[link]) for link in below])
+    return Parallelogram([place[link] for link in below], place[coupler], pivots, centres, arms[0])
+
+
+def _rotate(vector, angle):
+    x, y = vector
+    return np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y], axis=-1)

@@ -5,17 +5,17 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Scalar
-from udkjax.equations.analysis import Analysis
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.scales import Scales
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import State, close
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Drive, drive
-from udkjax.study.positions import distinct_positions, random_positions
 
 
 @checked
@@ -62,3 +62,30 @@ def _close(
         return found.state.q, jnp.asarray(found.is_closed)
 
     return jax.vmap(one)(guesses)
+
+
+SAME_POSITION = 1e-5  # of the characteristic length, or rad: positions nearer to each other are one
+
+
+def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
+    """Return the given position, and others with random angles and places of all bodies, spread over the mechanism's size."""
+    rng = np.random.default_rng(seed)
+    q = np.asarray(mechanism.q0 if state is None else state.q)
+    found = np.tile(q, (count, 1, 1))
+    spread = max(float(np.ptp(q[:, :2], axis=0).max()), float(analyse(mechanism).length))
+    found[1:, :, 2] += rng.uniform(-np.pi, np.pi, (count - 1, len(q)))
+    found[1:, :, :2] += rng.uniform(-0.5, 0.5, (count - 1, len(q), 2)) * spread
+    return jnp.asarray(found)
+
+
+def distinct_positions(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
+    """Return which of the positions that count differ from all before them; whole turns make no difference."""
+    points = np.asarray(q, float)
+    length, different = float(scales.length), []
+    for k in np.flatnonzero(np.asarray(counts)):
+        d = points[k] - points[different]
+        d[..., 2] = 2 * np.abs(np.sin(d[..., 2] / 2))
+        d[..., :2] /= length
+        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME_POSITION:
+            different.append(int(k))
+    return different

@@ -21,11 +21,11 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.branches import distinct_positions, random_positions
 from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize, with_unit_mass
-from udkjax.study.positions import distinct_positions, random_positions
 
 MAX_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
 FORCE_TOL = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
-from udkjax.scene.drawing.shapes import bar, disc, polygon
+from udkjax.scene.drawing.link import bar, disc, polygon
 
 
 def integrate_slices(length, width):

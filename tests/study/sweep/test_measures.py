@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.exact import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 from udkjax.study.sweep.measures import RANK_NOT_REACHED, guess_label, measures_of
 
 TS = np.linspace(0.0, 1.0, 6)

@@ -1,13 +1,14 @@
 """What is said of a sweep while it runs."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 
 from udkjax.integrate import Result
 from udkjax.study.progress import report_progress
-from udkjax.study.sweep import sweep_progress
 from udkjax.study.sweep.plan import Chunk
-from udkjax.study.sweep.sweep_progress import SweepProgress, Watch, duration
+from udkjax.study.sweep.sweep import SweepProgress, Watch, duration
 
 CHUNKS = [Chunk(k, 0, np.arange(4 * k, 4 * k + 4), 2.0 if k == 3 else 1.0) for k in range(5)]
 
@@ -27,7 +28,7 @@ def clock(monkeypatch):
             return self.now
 
     clock = Clock()
-    monkeypatch.setattr(sweep_progress, "time", clock)
+    monkeypatch.setattr(import_module("udkjax.study.sweep.sweep"), "time", clock)
     return clock
 
 

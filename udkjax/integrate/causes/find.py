@@ -1,14 +1,19 @@
 """Find why a run failed, and say it with the place, the time and the cure."""
 
 from collections.abc import Hashable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from udkjax.equations.analysis import Analysis
 from udkjax.integrate.causes.element_loads import ElementLoads, element_loads
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.integrate.causes.open_rows import MOST_NAMED, explain_open, name_not_finite
 from udkjax.integrate.causes.reach import explain_reach
-from udkjax.integrate.solution import Result
+from udkjax.integrate.solution import Result, Solution
+from udkjax.integrate.solvers import is_explicit
+from udkjax.scene.mechanism import Mechanism
 
 BESIDE = 1e-9  # of the span: between two instants so close only what jumps changes much
 # Of the span: where the integrator, which tries steps ten times as long as those before, may have met what is not finite.
@@ -228,3 +233,44 @@ def _rank(run: FailedRun) -> int:
 
 def _loads(run: FailedRun, states: list) -> ElementLoads:
     return element_loads(run.mechanism, float(run.analysis.scales.length), states)
+
+
+def explained(
+    solution: Solution, mechanism: Mechanism, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
+) -> Solution:
+    """Return a failed solution of a single run that can say why it failed.
+
+    Args:
+        solution: the solution, of known numbers.
+        mechanism: what moved.
+        analysis: that of the run.
+        drift_tol: that of the run.
+        solver: that of the run; None is the default.
+        end: the last state (t, (q, v)) of the integrator, if it is known.
+    """
+    assert analysis is not None  # a mechanism has one
+    q, v = (np.asarray(x).reshape(len(solution.ts), -1) for x in (solution.q, solution.v))
+    chosen = solution.settings
+    last = None
+    if end is not None:
+        t, y = (np.asarray(x) for x in end)
+        last = float(t), y[: q.shape[1]], y[q.shape[1] :]
+    run = FailedRun(
+        mechanism=mechanism,
+        analysis=analysis,
+        result=solution.result,
+        time=float(solution.time),
+        ts=np.asarray(solution.ts),
+        q=q,
+        v=v,
+        end=last,
+        steps=int(solution.stats["steps"]),
+        rtol=float(solution.rtol),
+        atol=float(solution.atol),
+        drift_tol=float(drift_tol),
+        is_projected=chosen["stabilization"] == "Projection",
+        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # whose corrector is not solved, but applied once
+        drops_rows=chosen["method"] in ("Auto", "Elimination"),
+        formulation=chosen["formulation"],
+    )
+    return replace(solution, found_cause=FoundCause(run))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
-from udkjax.integrate.held_rows import SampleRows
+from udkjax.integrate.packing import SampleRows
 from udkjax.native.ir import Function
 from udkjax.native.program import consecutive, write
 from udkjax.scene.mechanism import Mechanism

@@ -7,13 +7,12 @@ import numpy as np
 
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import SceneEntry, abbreviate, check_table, gravity_mistakes, quote, suggestion
-from udkjax.scene.drawing.drawn_element import DrawnElement
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
 from udkjax.scene.drawing.link import Link, Pin, with_known_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
-from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import is_traced
 from udkjax.scene.forces import ForceElement

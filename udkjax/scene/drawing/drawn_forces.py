@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote
-from udkjax.scene.drawing.drawn_element import DrawnElement, Parts, pair_mistakes
-from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, pair_mistakes
 from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
 from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, Number, array_namespace, given_names, given_number, given_or_none
 from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring

@@ -5,8 +5,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote
-from udkjax.scene.drawing.drawn_element import DrawnElement, Parts, line_mistakes
-from udkjax.scene.drawing.placement import PinLayout, Placement
+from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
 from udkjax.scene.fields import (
     LINK,
     PIN,

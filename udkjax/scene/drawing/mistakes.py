@@ -8,11 +8,9 @@ import numpy as np
 
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote
-from udkjax.scene.drawing.drawn_element import DrawnElement
 from udkjax.scene.drawing.drawn_joints import GearPair, PinInSlot
-from udkjax.scene.drawing.link import Link
-from udkjax.scene.drawing.placement import PinLayout, Placement
-from udkjax.scene.drawing.shapes import Points, twice_area
+from udkjax.scene.drawing.link import Link, Points, twice_area
+from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 
 Groups = Mapping[str, Mapping[str, Any]]
 

@@ -1,14 +1,19 @@
 """Pins of a drawing, their places, and the links that meet at them: other elements are attached to these."""
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple, Protocol
 
 from jaxtyping import Array, Float
 
+from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
-from udkjax.scene.drawing.link import DrawnBody, Link
-from udkjax.scene.drawing.shapes import Points
+from udkjax.scene.checks import quote
+from udkjax.scene.drawing.link import DrawnBody, Link, Points
+from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Number, array_namespace
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.joints import Joint
 
 
 class SlidingLink(Protocol):
@@ -87,3 +92,61 @@ class Placement(PinLayout):
             direction = array_namespace(way).arctan2(way[1], way[0])
         assert direction is not None  # one of them is given
         return direction - self.angle(on)
+
+
+class Parts(NamedTuple):
+    """Parts of the mechanism that an element of a drawing becomes, under its own name."""
+
+    joint: Joint | None = None
+    driver: Driver | None = None
+    force: ForceElement | None = None
+
+
+class DrawnElement(PrintsLine):
+    """An element of a drawing besides pins and links, attached to these by name.
+
+    It becomes a joint, a driver or a force element of the mechanism when the drawing is made one: `parts`, whose numbers are
+    NumPy's or traced. Motions, and free angles of springs, count from the drawn position.
+    """
+
+    @abstractmethod
+    def mistakes(self, layout: PinLayout) -> Iterator[str]:
+        """Iterate over what is wrong with it in a layout, each a key and a text; all names are known."""
+
+    @abstractmethod
+    def parts(self, placement: Placement) -> Parts:
+        """Return what it becomes in the mechanism."""
+
+    @property
+    def measured_as(self) -> str:
+        """The name of the class whose numbers are measured in the same units."""
+        return type(self).__name__
+
+    @property
+    def anchors(self) -> tuple[str, ...]:
+        """The pins that it needs, which may then be on the ground without a link."""
+        return ()
+
+
+def line_mistakes(along: tuple[str, ...], direction: Number | None) -> Iterator[str]:
+    """Iterate over what is wrong with a line, which two pins or a direction give."""
+    if bool(along) == (direction is not None):
+        yield "along: give two pins, or a direction"
+    elif along and (len(along) != 2 or along[0] == along[1]):
+        yield "along: must name two pins"
+
+
+def pair_mistakes(layout: PinLayout, pin: str, of: tuple[str, ...]) -> Iterator[str]:
+    """Iterate over what is wrong with an element between two links that meet at a pin."""
+    members = layout.members(pin)
+    listed = ", ".join(members) or "none"
+    if not of and len(members) != 2:
+        yield f"pin: at {quote(pin)} there must meet two links, or one and the ground; there are {listed}" + (
+            "; say which two, such as of = [" + ", ".join(map(quote, members[:2])) + "]" if len(members) > 2 else ""
+        )
+    elif of and (len(of) != 2 or of[0] == of[1]):
+        yield "of: must name two links"
+    else:
+        yield from (
+            f"of: {quote(name)} is not at pin {quote(pin)}, where there are {listed}" for name in of if name not in members
+        )

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 from udkjax.scene.mjcf.body_tree import TreeJoint, unique_name
 from udkjax.scene.mjcf.model_settings import merge_parts
-from udkjax.scene.mjcf.motion_plane import AXES_TOL
-from udkjax.scene.mjcf.plane_model import Ends, PlaneModel, gap_of
+from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
 EVEN = 1e-12  # of the largest term: what angles that cancel leave

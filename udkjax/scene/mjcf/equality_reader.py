@@ -9,8 +9,7 @@ from udkjax.scene.joints import Angle, Distance, Gear, Joint, Revolute, Weld
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts
-from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion
-from udkjax.scene.mjcf.plane_model import Ends
+from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneMotion
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
 MESHED = 1e-9  # rad; what rounding leaves between gears

@@ -11,17 +11,15 @@ from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneError, abbreviate, suggestion
 from udkjax.scene.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.mechanism_tables import is_xml
 from udkjax.scene.mjcf.body_tree import BodyTree, TreeJoint, unique_name
-from udkjax.scene.mjcf.contact_pairs import contact_pairs
 from udkjax.scene.mjcf.coupled_lengths import CoupledLengths
 from udkjax.scene.mjcf.equality_reader import EqualityReader
 from udkjax.scene.mjcf.force_reader import LEFT_OUT, ForceReader
 from udkjax.scene.mjcf.model_settings import ModelSettings, merge_parts
-from udkjax.scene.mjcf.motion_plane import AXES_TOL, PlaneMotion, plane_of
-from udkjax.scene.mjcf.plane_model import PlaneModel
+from udkjax.scene.mjcf.plane_model import AXES_TOL, PlaneModel, PlaneMotion, contact_pairs, plane_of
 from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
-from udkjax.scene.toml_text import is_xml
 
 INITIAL = "initial"  # the keyframe that `mjcf_text` writes velocities and controls into
 CLOSED = 1e-9  # of the model's size: what rounding leaves open of a loop

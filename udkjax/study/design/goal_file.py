@@ -9,7 +9,7 @@ from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import load
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.toml_text import parse_toml
+from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.study.design.design import DesignSearch
 from udkjax.study.design.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.study.design.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal

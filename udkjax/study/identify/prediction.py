@@ -22,8 +22,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.channels import Channel, Quantity
 from udkjax.study.identify.unknowns import Target, apply_values
-from udkjax.study.machine import CHUNKED_PLATFORMS, PIECE_MEMBERS
-from udkjax.study.members import MOST_PROGRAMS, Program
+from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Program
 
 # Tolerances of the integration, relative and absolute: of final estimates (parameters are known to that much where there is no
 # noise); where singular values or the continuity of pieces are all that is asked for; and on the way to a fit.

@@ -6,7 +6,7 @@ plan, groups                members and their groups; what is computed of those 
 chunks, executors           members that take a few seconds together, computed on devices or on a cluster
 store, fingerprint          finished chunks on disk; what decides the results
 dataset                     all results, labelled
-sweep, sweep_progress       what users call, and how far it is
+sweep                       what users call, and how far it is
 """
 
 from udkjax.study.sweep.axes import Axis as Axis

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from udkjax.study.machine import concurrent_chunks
+from udkjax.study.members import concurrent_chunks
 from udkjax.study.sweep.dataset import bytes_per_member
 from udkjax.study.sweep.executors import Done, Engine, run
 from udkjax.study.sweep.groups import group_run

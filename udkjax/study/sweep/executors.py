@@ -13,7 +13,7 @@ import numpy as np
 from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
-from udkjax.study.machine import concurrent_chunks, cores
+from udkjax.study.members import concurrent_chunks, cores
 from udkjax.study.sweep.groups import RESULT, GroupRun, group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from udkjax.extras import OptionalImport
 from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
-from udkjax.scene.toml_text import parse_toml
+from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.study.choices import CHOICES, Choice, choice
 from udkjax.study.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped

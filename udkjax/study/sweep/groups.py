@@ -23,8 +23,7 @@ from udkjax.pinv import Auto, Elimination
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import NUMBERS
-from udkjax.study.machine import CHUNKED_PLATFORMS, PIECE_MEMBERS
-from udkjax.study.members import MOST_PROGRAMS, Outputs, Program
+from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
 from udkjax.study.quantities import parameter_value
 from udkjax.study.sweep.plan import SweepPlan, stack_choices
 
