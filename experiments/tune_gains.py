@@ -51,8 +51,8 @@ from experiments.parts.tuning import (
 from udkjax.show.style import COLOURS
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
-# alpha = beta, 1/s: those of gains.py around what is tuned. The first takes the fewest right-hand sides, fewer than what is tuned:
-# without it, nothing in the grid would be as cheap, and nothing compared.
+# alpha = beta, 1/s: those of gains.py around what is tuned. The first takes fewer right-hand sides than what is tuned: without it
+# nothing in the grid would be as cheap, and nothing compared.
 GRID = (1.0, 1.5, 2.0, 2.5, 3.0, 5.0, 7.0, 10.0, 20.0)
 MORE = 1.02  # times the right-hand sides: not more, but for a step or two
 SCAN = 2.0, 20.0  # alpha = beta, 1/s: neighbours 5 % apart

@@ -37,22 +37,16 @@ def inverse(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.show.summary import format_error, format_peak, table
     from udkjax.study.drive import element_of
 
     found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
     efforts = {name: np.asarray(x) for name, x in found.efforts.items()}
-    power = np.asarray(found.power)
-    lines: dict[str, str] = {}
     results: dict[str, Any] = {"time": ts, "efforts": efforts, "powers": found.powers, "residual": found.residual, "peaks": {}}
     for name, x in efforts.items():
         good = np.isfinite(x)
         k = int(np.nanargmax(np.abs(x))) if good.any() else 0
         rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
         results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms}
-        lines[name] = format_peak(ts, x, element_of(mech, name).coordinate)
-    lines["power"] = f"{np.nanmin(power):.6g} to {np.nanmax(power):.6g} W"
-    lines["left over"] = f"{format_error(float(np.nanmax(np.asarray(found.residual))), 1.0)} of the loads"
     variables = {
         "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), "N m or N"),
         "power": (("time", "driver"), np.stack([np.asarray(x) for x in found.powers.values()], 1), "W"),
@@ -65,7 +59,7 @@ def inverse(
         shown |= {f"power of {name}": (np.asarray(x), "W") for name, x in found.powers.items()}
         channels_figure(ts, shown, title=mech.name).savefig(plot, dpi=150)
     write(out, text, variables, {"time": ts, "driver": list(efforts)}, {})
-    show(results, table(f"{mech.name or 'mechanism'}, {t0:g} to {t1:g} s", lines), json)
+    show(results, f"{mech.name or 'mechanism'}, {found}", json)
     determined = np.asarray(found.determined)
     if not determined.all():
         k = int(np.argmin(determined))

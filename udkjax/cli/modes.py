@@ -1,6 +1,5 @@
 """`udkjax modes`."""
 
-import math
 from pathlib import Path
 
 from udkjax.cli.common import Json, Scene, fail, show
@@ -21,18 +20,9 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
     import numpy as np
 
     import udkjax as udk
-    from udkjax.show.summary import table
 
     rest = udk.equilibrium(mech, t=t, stable=stable)
     found = udk.modes(mech, rest.state, t)
-    lines = {}
-    for k, x in enumerate(np.asarray(found.omega2)):
-        omega = math.sqrt(abs(float(x)))
-        kind = f"{omega:.8g} rad/s, {omega / (2 * math.pi):.8g} Hz" if x >= 0 else f"grows as exp({omega:.8g} t)"
-        biggest = np.argmax(np.abs(np.asarray(found.shapes)[k, :, 2]))
-        lines[f"mode {k + 1}"] = f"{kind}; mostly {mech.body_names[biggest]}"
-    damped = ", ".join(f"{complex(s):.6g}" for s in np.asarray(found.s))
-    lines["s, damped"] = f"{damped} 1/s" if damped else "none: no degree of freedom is left"
     results = {
         "bodies": mech.body_names,
         "omega2": found.omega2,
@@ -49,6 +39,6 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
         "q": (("body", "coordinate"), found.q, "m, m, rad"),
     }
     write(out, text, variables, {"body": list(mech.body_names)}, {"t": t})
-    show(results, table(f"{mech.name or 'mechanism'}, about its position of rest", lines), json)
+    show(results, f"{mech.name or 'mechanism'}, {found}", json)
     if not rest.balanced:
         fail("it does not rest: no equilibrium was found near the initial guess")

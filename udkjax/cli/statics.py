@@ -33,16 +33,9 @@ def statics(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.show.summary import table
 
     one = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
     found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)
-    lines = {}
-    for k, e in enumerate(found):
-        omega2 = ", ".join(f"{float(x):.6g}" for x in np.asarray(e.omega2))
-        angles = ", ".join(f"{name} {float(a):.6g}" for name, a in zip(mech.body_names, np.asarray(e.q)[:, 2], strict=True))
-        free = f"omega2 {omega2} 1/s2" if omega2 else "no degree of freedom is left"
-        lines[f"{k + 1}, {e.kind}"] = f"{free}; angles {angles}"
     results = {
         "bodies": mech.body_names,
         "equilibria": [
@@ -57,6 +50,6 @@ def statics(
             "multiplier": (("equilibrium", "row"), np.stack([np.asarray(e.multipliers) for e in found]), "N, N m"),
         }
         write(out, text, variables, {"body": list(mech.body_names)}, {"t": t, "starts": starts})
-    show(results, table(f"{mech.name or 'mechanism'}, at rest", lines), json)
+    show(results, "\n".join(f"{mech.name or 'mechanism'}, {e}" for e in found), json)
     if not found:
         fail("no position of rest was found near the initial guess; try --stable, or --starts 64")

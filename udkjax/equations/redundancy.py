@@ -28,6 +28,11 @@ HEADING_NOISE = 0.3  # share of the direction of the random motion that is new a
 ORDINARY_TOL = 0.05  # of the largest singular value: a position whose smallest one is above decides on the rows
 
 
+def dense(matrix: Any) -> np.ndarray:
+    """Return a matrix of NumPy or of SciPy as one of NumPy."""
+    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
+
+
 class ClosedPosition(Protocol):
     """A closed position, with the rank of D there: a `DensePosition` or a `SparsePosition`."""
 
@@ -189,3 +194,13 @@ def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
         chosen.append(row)
         null_spaces = [N @ np.linalg.svd(N[row : row + 1])[2][1:].T for N in null_spaces]
     return tuple(sorted(chosen))
+
+
+def owners_of_row(rows: PositionRows, t: Time, q: np.ndarray, name: str) -> set[str] | None:
+    """Return the constraints of whose rows the first one of a constraint is made at a position; None where it is independent."""
+    D, owners = dense(rows.at(t, q)[2]), np.array([owner for owner, _ in rows.names])  # D has rows of length one
+    own, others = D[owners == name][0], D[owners != name]
+    shares = np.linalg.lstsq(others.T, own, rcond=NEGLIGIBLE_SHARE)[0]
+    if np.linalg.norm(own - others.T @ shares) > NEGLIGIBLE_SHARE:
+        return None
+    return set(owners[owners != name][np.abs(shares) > NEGLIGIBLE_SHARE])

@@ -20,10 +20,10 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseTerms
 from udkjax.printing import PrintsLine
-from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import Numbers, array_namespace, is_traced, names, number, number_called
+from udkjax.scene.fields import Numbers, is_traced, names, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of, point_of_pin
@@ -31,7 +31,6 @@ from udkjax.study.holding import require_free
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
-FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # the ground
 
 
 class Coordinate(PrintsLine):
@@ -138,7 +137,7 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
 
     def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
         rows = q if isinstance(q, Tracer) else np.asarray(q)  # of which JAX would compile a program to take a row
-        return coordinate_value(element, *(FRAME_AT_REST if k is None else _frame(rows[k]) for k in places))
+        return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
 
     return value
 
@@ -148,12 +147,6 @@ def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | N
     with jax.ensure_compile_time_eval():
         origin = mechanism.origin and Origin(with_drivers(mechanism.origin.mechanism, {}))
     return with_drivers(mechanism, {}, forces, origin)
-
-
-def _frame(q: Float[Array, "3"]) -> Frame:
-    xp = array_namespace(q)
-    x, y, angle = q
-    return Frame(x, y, angle, xp.cos(angle), xp.sin(angle))
 
 
 def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:

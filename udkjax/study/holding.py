@@ -2,10 +2,7 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
-from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE
-from udkjax.equations.redundancy import kinematic_rows, ordinary_position
+from udkjax.equations.redundancy import kinematic_rows, ordinary_position, owners_of_row
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.report import join_names
@@ -26,17 +23,10 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
     Raises:
         SceneError: it names the drivers that hold the coordinate.
     """
-    rows, q = kinematic_rows(driven), ordinary_position(bare)
-    if q is None:
+    q = ordinary_position(bare)
+    involved = None if q is None else owners_of_row(kinematic_rows(driven), 0.0, q, name)
+    if involved is None:
         return
-    D = rows.at(0.0, q)[2]
-    D = np.asarray(D if isinstance(D, np.ndarray) else D.toarray())  # its rows have length one
-    owners = np.array([owner for owner, _ in rows.names])
-    own, others = D[owners == name][0], D[owners != name]
-    shares = np.linalg.lstsq(others.T, own, rcond=NEGLIGIBLE_SHARE)[0]
-    if np.linalg.norm(own - others.T @ shares) > NEGLIGIBLE_SHARE:
-        return
-    involved = set(owners[owners != name][np.abs(shares) > NEGLIGIBLE_SHARE])
     holding = [names.get(other, f"driver {quote(other)}") for other in driven.driver_names if other in involved]
     if not holding:
         raise SceneError([f"{driver} cannot be driven: the joints leave it no motion"], driven.name)

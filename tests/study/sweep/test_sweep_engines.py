@@ -174,9 +174,9 @@ def test_the_papers_table_is_one_sweep():
     member = data.sel({"method": "Varga", "tol": 1e-8, "stabilization": gains[0]})  # sel has a method of its own
     assert int(member.steps) == int(alone.stats["steps"])
 
-    # A batch and a single run round differently. From rest the first estimates of errors are rounding themselves, so where steps end
-    # is up to it: the error is that of another run at the same tolerance. A unit of rounding in the initial angles does the
-    # same, and a thousand units no more: they change an error of 4e-12 by up to 1.5e-12, whatever the method is.
+    # A batch and a single run round differently. From rest the first estimates of errors are rounding themselves, and say where
+    # steps end: the error is that of another run at the same tolerance. A unit of rounding in the initial angles does the same, a
+    # thousand units no more: they change an error of 4e-12 by up to 1.5e-12, whatever the method is.
     def error_from(q):
         given = linkage, ts, udk.State(q, linkage.v0), 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0)
         return np.abs(udk.simulate(*given, **settings).q - exact)[..., 2].max()

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE
-from udkjax.equations.redundancy import kinematic_rows, ordinary_position
+from udkjax.equations.redundancy import dense, kinematic_rows, ordinary_position, owners_of_row
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
@@ -98,7 +97,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
     """Return the constraints that ask, after a time, for what no displacement gives: the part of their demand outside of D."""
     rows = run.rows
     psi, length, D = rows.at(t, q)
-    u, sigma, _ = np.linalg.svd(_dense(D))
+    u, sigma, _ = np.linalg.svd(dense(D))
     null = np.ones(len(u), bool)
     null[: len(sigma)] = sigma <= NEW * sigma[0]
     N = u[:, null]
@@ -110,13 +109,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
 def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
     """Return whether the rows of drivers depend on the others in an ordinary position, too."""
     q = ordinary_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
-    if q is None:
-        return False
-    rows = kinematic_rows(mechanism)
-    D = _dense(rows.at(0.0, q)[2])
-    own = np.array([owner in names[-1:] for owner, _ in rows.names])
-    left = D[own][0] - D[~own].T @ np.linalg.lstsq(D[~own].T, D[own][0], rcond=None)[0]
-    return float(np.linalg.norm(left)) < NEGLIGIBLE_SHARE  # rows have length one
+    return q is not None and owners_of_row(kinematic_rows(mechanism), 0.0, q, names[-1]) is not None
 
 
 def _dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
@@ -154,7 +147,3 @@ def _dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
 
 def _value(driver: Driver, t: float) -> str:
     return f"{float(driver.motion(t)):.6g} {'rad' if driver.coordinate == 'angle' else 'm'}"
-
-
-def _dense(D) -> np.ndarray:
-    return np.asarray(D if isinstance(D, np.ndarray) else D.toarray())

@@ -17,10 +17,9 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 import jax
 import numpy as np
 from jaxtyping import Array
-from scipy.sparse import csr_array
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, kinematic_rows, sample_positions
+from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
 from udkjax.equations.scales import known_scales
 from udkjax.integrate.assembly import close, require_closed
 from udkjax.scene.checks import SceneError, quote
@@ -148,7 +147,7 @@ class RedundantLoops:
             columns.append(np.array(moved) / (2 * step.sum()))
         slope = np.stack(columns, -1)  # (positions, rows, P)
         # The natural size of a row: the longest arm at which it turns a body, which is 1 for rows of angles.
-        arms = np.max([length * np.abs(_dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
+        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
         most = np.abs(slope / np.where(arms > 0.0, arms, length_scale)[:, None]).max((0, 1))
         by_effect = 1.0 / np.where(most > 0.0, most, np.inf)
         own = np.abs(self.x)
@@ -157,7 +156,7 @@ class RedundantLoops:
         total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
         self._unit = 1.0 / np.where(total > 0, total, 1.0)  # of each parameter, in which it has an effect of one
         self._effect = effect * self._unit
-        null_spaces = [_dense(p.null_space) for p in self._positions]
+        null_spaces = [dense(p.null_space) for p in self._positions]
         self._unclosed = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
         # One combination of rows for each redundant row: that row as the others make it up.
         self._circuits = np.array([N @ np.linalg.inv(N[self._redundant_rows]) for N in null_spaces])
@@ -253,10 +252,6 @@ class RedundantLoops:
         constraints = list(dict.fromkeys(name for name, there in zip(self._names, involved, strict=True) if there))
         what = "constraints" if set(constraints) & set(self._drivers) else "joints"
         return f"{what} {join_names([quote(name) for name in constraints])} close a loop"
-
-
-def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:
-    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
 def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:

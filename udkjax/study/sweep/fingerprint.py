@@ -71,7 +71,7 @@ def _function(function: Callable, *arguments: PyTree) -> dict[str, Json]:
     text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
     constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
     name = getattr(function, "__qualname__", None) or repr(function)
-    return {"name": name, "operations": _digest(text.encode()), "constants": _digest(constants)}
+    return {"name": name, "operations": digest(text.encode()), "constants": digest(constants)}
 
 
 def _mechanism(mechanism: Mechanism) -> dict[str, Json]:
@@ -94,19 +94,20 @@ def _value(value: PyTree) -> Json:
             "shape": list(array.shape),
             "first": first,
             "last": last,
-            "digest": _digest(np.ascontiguousarray(array).tobytes()),
+            "digest": digest(np.ascontiguousarray(array).tobytes()),
         }
     leaves = jax.tree_util.tree_leaves_with_path(value)
     static = re.sub(r"0x[0-9a-f]+", "", str(jax.tree.structure(value)))
     return {
         "type": type(value).__name__,
-        "digest": _digest(static.encode()),
+        "digest": digest(static.encode()),
         **{jax.tree_util.keystr(path).lstrip("."): _value(x) if eqx.is_array(x) else repr(x) for path, x in leaves},
     }
 
 
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:16]
+def digest(content: bytes) -> str:
+    """Return the first 64 bits of the SHA-256, as text."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 # --- differences

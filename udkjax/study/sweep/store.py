@@ -5,7 +5,6 @@ its name only when all of it is on the disk; the name ends with digests of the s
 damaged, the chunks tell whether they are of the same sweep. No list says what is finished: the files are the list.
 """
 
-import hashlib
 import io
 import json
 import os
@@ -18,7 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from udkjax.scene.checks import abbreviate
-from udkjax.study.sweep.fingerprint import Json, differences
+from udkjax.study.sweep.fingerprint import Json, differences, digest
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 2  # of what a folder holds: another one is another sweep
@@ -162,11 +161,6 @@ def read_variable(store: MemoryStore | FolderStore, name: str) -> tuple[np.ndarr
     parts = [(members, data[name]) for members, data in store.read_chunks()] or [(np.empty(0, int), np.empty(0, int))]
     members, values = zip(*parts, strict=True)
     return np.concatenate(members), np.concatenate(values)
-
-
-def digest(content: bytes) -> str:
-    """Return the first 64 bits of the SHA-256, as text."""
-    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _cannot_use(folder: Path, error: OSError) -> str:
