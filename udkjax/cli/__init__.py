@@ -33,7 +33,7 @@ COMMANDS = (
 )
 
 
-MOST_STORED = 200_000_000  # bytes of programs of JAX; those that were used longest ago make room
+PROGRAM_CACHE_BYTES = 200_000_000  # bytes of programs of JAX; those that were used longest ago make room
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -61,6 +61,6 @@ def store_compiled_programs() -> None:
     folder = cache_folder()
     if folder is None or "jax" in sys.modules:
         return
-    for name, value in {"DIR": f"{folder / 'jax'}", "MAX_SIZE": f"{MOST_STORED}"}.items():
+    for name, value in {"DIR": f"{folder / 'jax'}", "MAX_SIZE": f"{PROGRAM_CACHE_BYTES}"}.items():
         os.environ.setdefault(f"JAX_COMPILATION_CACHE_{name}", value)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

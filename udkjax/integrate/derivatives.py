@@ -45,15 +45,15 @@ def _(primals, tangents):
         return _run(*primals), IntegratorOutput._make([None] * len(IntegratorOutput._fields))
     shapes = eqx.filter_eval_shape(_run, *primals)
 
-    def in_parts(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
-        """The run, and a linear map of the direction."""
+    def in_parts(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
+        """Return the run, and a linear map of the direction."""
         raw, record = at[0].recorded(stop_gradients(at[1]), active)
         states = (raw.q, raw.v) if raw.q.shape[0] > 2 else ()  # of outputs between the first and the last alone
         linear = Linear(function=at[0], xs=at[1], run=(states, record), active=active)
         return list(_as_run(*at, raw)), linear.applied(direction)
 
-    def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], ...]:
-        """Both by forward mode."""
+    def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
+        """Return both by forward mode."""
         function, xs = at
         raw, change = function.run_and_jvp(xs, active, direction)
         return list(raw), change
@@ -94,7 +94,7 @@ class DifferentiableRun(DifferentiableFunction):
         return replace(self, native=False)
 
     def fast(self, xs: list[Array]) -> IntegratorOutput:
-        """By machine code, which has no derivatives, if that serves."""
+        """Return the run by machine code, which has no derivatives, if that serves."""
         problem = self.problem(xs)
         return native_engine.integrate(problem) if self.native else _integrate_by_diffrax(problem)
 
@@ -118,7 +118,7 @@ class DifferentiableRun(DifferentiableFunction):
         return jax.vjp(function, select(xs, active))[1](ws)[0]
 
     def run_and_jvp(self, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
-        """The run, and the change of its states along v, of those of x that are active: by machine code, if that serves."""
+        """Return the run, and the change of its states along v of those of x that are active: by machine code, if that serves."""
         if self._is_native(xs, active):
             change = self.problem.changes(active, vs)
             raw, found = native_engine.jvp(self.problem(xs), self.problem.marks(active), change)
@@ -127,7 +127,7 @@ class DifferentiableRun(DifferentiableFunction):
         return raw, [change[k] for k in SMOOTH]
 
     def recorded(self, xs: list[Array], active: Mask) -> tuple[IntegratorOutput, Array | None]:
-        """The run and its record, by the machine code of its reverse mode, if that serves: no other is compiled."""
+        """Return the run and its record, by the machine code of its reverse mode, if that serves: no other is compiled."""
         if self._is_native(xs, active):
             return native_engine.integrate_for_vjp(self.problem(xs), self.problem.marks(active))
         return _integrate_by_diffrax(self.problem(xs)), None

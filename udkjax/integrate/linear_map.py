@@ -34,10 +34,10 @@ class DifferentiableFunction(eqx.Module):
 
     @abstractmethod
     def __call__(self, xs: list[Array]) -> list[Array]:
-        """f(x)."""
+        """Return f(x)."""
 
     def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        """J^T w, of those of x that are active: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
+        """Return J^T w, of those of x that are active: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
         some = select(xs, active)
         units = jnp.eye(sum(x.size for x in some))
         shapes = [x.shape for x in some]
@@ -46,15 +46,15 @@ class DifferentiableFunction(eqx.Module):
 
     @abstractmethod
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        """The shapes of f(x)."""
+        """Return the shapes of f(x)."""
 
     def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
-        """J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""
+        """Return J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""
         del run
         return change_along(self, xs, active, vs)[1]
 
     def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
-        """J^T w, of those of x that are active, in the same way."""
+        """Return J^T w, of those of x that are active, in the same way."""
         del run
         return self.pull(xs, active, ws)
 
@@ -112,7 +112,7 @@ class Back(Along):
 
 
 def change_along(function: Callable, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[Any, Any]:
-    """f(x), and its change along v, of those of x that are active, by forward mode."""
+    """Return f(x), and its change along v, of those of x that are active, by forward mode."""
     return jax.jvp(lambda *some: function(replaced(xs, active, some)), select(xs, active), vs)
 
 

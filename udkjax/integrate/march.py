@@ -52,7 +52,7 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: 
 
 
 def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
-    """March with known numbers, by NumPy: nothing is traced or compiled for it."""
+    """Follow the positions with known numbers, by NumPy: nothing is traced or compiled for it."""
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
@@ -78,13 +78,13 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:
-    """Loads that have samples are zero: positions do not depend on them."""
+    """Return a mechanism whose loads with samples are zero: positions do not depend on them."""
     loads = {place: x for place, x in mechanism.samples.items() if place[0] == "_forces"}
     return mechanism.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in loads.items()})
 
 
 def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mechanism:
-    """Bodies of 1 kg with the characteristic length for radius of gyration: positions do not depend on masses."""
+    """Return bodies of 1 kg and the characteristic length for radius of gyration: positions do not depend on masses."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
     one = xp.ones_like(length)
     return eqx.tree_at(bodies, mechanism, [one, length**2] * len(mechanism.body_names))

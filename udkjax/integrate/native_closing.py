@@ -29,7 +29,7 @@ def can_close(mechanism: Mechanism) -> bool:
 
 
 def close(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:
-    """q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, from a guess at time t."""
+    """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, at time t."""
     return _unpack(native_p.bind(*_inputs(mechanism, scales, tol, t, q, v), operation=_close(mechanism), times=2), len(q))
 
 
@@ -45,7 +45,7 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 
 
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
-    """The changes of q and v along a `change` of what is active of (mechanism, scales, tol, t, q, v)."""
+    """Return the changes of q and v along a `change` of what is active of (mechanism, scales, tol, t, q, v)."""
     (mechanism, *_, q, _), (*_, dq, dv) = guess, change
     n, operation = len(q), CloseTangents(_close(mechanism).code, active_numbers(mechanism, active[0]))
     numbers = jnp.asarray(numbers_as_vector(number_tangents(mechanism, active[0], change[0])))
@@ -55,7 +55,7 @@ def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
 
 
 def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
-    """The cotangents of what is active, from those of q and v."""
+    """Return the cotangents of what is active, from those of q and v."""
     mechanism = guess[0]
     operation = CloseCotangents(_close(mechanism).code, active_numbers(mechanism, active[0]))
     bars = jnp.concatenate([qbar, vbar])[None]

@@ -65,7 +65,7 @@ def serves_derivatives(active: Problem) -> bool:
 
 
 def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
-    """The numbers of a run, or a change of them; zeros stand for one row of what has samples."""
+    """Return the numbers of a run, or a change of them; zeros stand for one row of what has samples."""
     of = problem if change is None else change
     return problem.compiled.samples.stand_in(of.textbook.mechanism), of.textbook.baumgarte, of.marks
 
@@ -91,7 +91,7 @@ def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, t
 
 
 def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: Array, end: Array) -> Problem:
-    """The cotangents of what is `active`, from those of the states at the output times (T, 2n) and of the end (2n,).
+    """Return the cotangents of what is `active`, from those of the states at the outputs (T, 2n) and of the end (2n,).
 
     `run` is what `integrate_for_vjp` has left: q and v (T, n), if there are outputs between the first and the last; the record.
     """

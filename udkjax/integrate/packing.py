@@ -54,19 +54,19 @@ def pack(
 
 
 def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:
-    """Of the numbers of a tree and two thresholds: which are marked as active, that is have derivatives."""
+    """Tell which numbers of a tree, and of two thresholds behind them, are marked as active, that is have derivatives."""
     leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active)), strict=True)
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
 
 def number_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array]) -> list[Any]:
-    """The tangents of all numbers and of two thresholds, in order: zeros of those that are not active."""
+    """Return the tangents of all numbers and of two thresholds, in order: zeros of those that are not active."""
     leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active, change)), strict=True)
     return [*(dx if m is True else np.zeros(np.shape(x)) for x, m, dx in leaves if x is not None), np.zeros(2)]
 
 
 def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool]) -> PyTree[Array]:
-    """The tree of the cotangents of what is active, from those of all numbers, in order."""
+    """Return the tree of the cotangents of what is active, from those of all numbers, in order."""
     leaves, tree = jax.tree.flatten(numbers, is_leaf=lambda x: x is None)
     parts, place = [], 0
     for x, m in zip(leaves, leaves_and_none(active), strict=True):
@@ -77,7 +77,7 @@ def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool]) ->
 
 
 def leaves_and_none(tree: PyTree) -> list[Any]:
-    """The leaves of a tree, None among them."""
+    """Return the leaves of a tree, None among them."""
     return jax.tree.leaves(tree, is_leaf=lambda x: x is None)
 
 

@@ -183,7 +183,7 @@ def _has_failed(solution: Solution) -> bool:
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
-    """A solution; raise what a run that failed raises."""
+    """Return a solution; raise what a run that failed raises."""
     if throw and _has_failed(solution):
         raise SimulationError(solution.cause, solution)
     return solution
@@ -291,7 +291,7 @@ def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
 
 
 def _adjoint(adjoint: Any) -> Any:
-    """An adjoint of diffrax's; None where derivatives are those of JAX, which `ForwardMode` leaves them to."""
+    """Return an adjoint of diffrax's; None where derivatives are those of JAX, which `ForwardMode` leaves them to."""
     import diffrax
 
     return None if type(adjoint) is diffrax.ForwardMode else adjoint

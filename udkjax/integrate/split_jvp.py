@@ -24,7 +24,7 @@ Parts = Callable[..., tuple[list[Array], list[Array]]]  # (at, direction) -> val
 
 
 def split_jvp(seen: Parts, run: Parts, at: PyTree, direction: PyTree, shapes: Shapes) -> tuple[list[Array], list[Array]]:
-    """The value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
+    """Return the value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
 
     Both are mapped over any batch. `shapes` are those of the value and of the change.
     """
@@ -52,7 +52,7 @@ class Both:
         self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "Both":
-        """Both forms of a batch."""
+        """Return both forms of a batch."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
         return Both(seen, run, self.start, (value, change))
@@ -97,7 +97,7 @@ def _part(trace: Any, *xs: Array, both: Both) -> list[Array]:
 
 
 def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
-    """Under `jax.checkpoint`: the value is known where only directions are not; both are found again on the way back."""
+    """Divide under `jax.checkpoint`: the value is known where only directions are not; both are found again on the way back."""
     del saveable
     both: Both = eqn.params["both"]
     inputs = [x for x, t in zip(eqn.invars, there, strict=True) if not t and not isinstance(x, Literal)]

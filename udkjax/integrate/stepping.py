@@ -26,8 +26,8 @@ from udkjax.scene.fields import is_within_jit, make_module, number
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
-POINTS = 6  # accepted steps of one interval that reverse mode has stored; of more than that it runs again
-MAX_STEPS = 1_000  # within one interval
+STORED_POINTS = 6  # accepted steps of one interval that reverse mode has stored; of more than that it runs again
+MOST_STEPS_OF_INTERVAL = 1_000  # within one interval
 
 
 @checked
@@ -39,7 +39,7 @@ def step(
     t: Scalar = 0.0,
     rtol: Scalar = 1e-8,
     atol: Scalar = 1e-8,
-    max_steps: int = MAX_STEPS,
+    max_steps: int = MOST_STEPS_OF_INTERVAL,
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax"] = "auto",
 ) -> State:
@@ -103,7 +103,7 @@ def _advance(
     choices = Choices(rtol, atol, DRIFT_PROJECTED, dt, AUTO, Projection(), max_steps=max_steps, engine=engine)
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)
-    raw = differentiable(replace(run.problem, points=POINTS))
+    raw = differentiable(replace(run.problem, points=STORED_POINTS))
     good = stop_gradients(run.is_usable & raw.reached[-1] & (jnp.max(raw.violation) <= DRIFT_PROJECTED))
     failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))

@@ -42,12 +42,12 @@ class TreeOfNumbers(eqx.Module):
         return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
 
     def marks(self, active: Mask) -> Any:
-        """The tree with True in place of the arrays that are active, and False in place of the others."""
+        """Return the tree with True in place of the arrays that are active, and False in place of the others."""
         traced = iter(active)
         return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.known.arrays])
 
     def changes(self, active: Mask, some: Sequence[Array]) -> Any:
-        """The tree with some arrays in place of those that are active, and None in place of the others."""
+        """Return the tree with some arrays in place of those that are active, and None in place of the others."""
         marks, rest = jax.tree.leaves(self.marks(active)), iter(some)
         return jax.tree.unflatten(self.structure, [next(rest) if m else None for m in marks])
 
@@ -66,6 +66,6 @@ def select(xs: Sequence[Any], which: Mask) -> list[Any]:
 
 
 def replaced(xs: Sequence[Array], active: Mask, some: Sequence[Array]) -> list[Array]:
-    """The same, with others in place of those that are active."""
+    """Return the same, with others in place of those that are active."""
     rest = iter(some)
     return [next(rest) if m else x for x, m in zip(xs, active, strict=True)]

@@ -28,12 +28,12 @@ from udkjax.study.control_flow import ControlFlow, sequential
 from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing
 from udkjax.study.curve import AbstractCurve
 
-FIRST, LONGEST, SHORTEST = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
+FIRST_STEP, LONGEST_ARC, SHORTEST_ARC = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
 LARGEST_BEND = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more
 PREDICTION_TOL = 0.3  # of a step: how far its end may lie from the prediction
 MAX_SECANTS = 60  # until a root is rounding; ten are usual
 MAX_TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
-SAME_VALUE = 8.0  # units of rounding within which a value is that of a toggle
+AT_TOGGLE = 8.0  # units of rounding within which a value is that of a toggle
 
 
 class Reached(PrintsWords):
@@ -108,7 +108,7 @@ def _follow(
     X, closed = curve.correct(xp.append(q, s) / curve.units, fixed=True)
     targets = values / curve.units[-1]
     tau = curve.tangent(X, xp.append(xp.zeros_like(X[:-1]), 1.0))
-    one, k = xp.asarray(FIRST, X.dtype), xp.asarray(first)
+    one, k = xp.asarray(FIRST_STEP, X.dtype), xp.asarray(first)
     start = xp.where(closed, _LANDS, Reached.open)  # where branches meet, one of them is taken
     state = _State(X, tau, one, k, xp.asarray(0), start, points)
 
@@ -153,8 +153,8 @@ def _step(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) -> _S
     counts = good & ~folds & ~passed
     lands = lands & counts
     shorter = xp.where(passed, 0.5 * eta, xp.where(good, h, 0.5 * eta))
-    longer = xp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), xp.minimum(1.5 * h, LONGEST), h)
-    lost = ~good & (0.5 * eta < SHORTEST)
+    longer = xp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), xp.minimum(1.5 * h, LONGEST_ARC), h)
+    lost = ~good & (0.5 * eta < SHORTEST_ARC)
     return _State(
         X=xp.where(counts, at, X),
         tau=xp.where(counts, turned, tau),
@@ -220,7 +220,7 @@ def _find_fold(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) 
         return sigma, (sigma, *point_at(sigma))
 
     _, (sigma, (fold, landed), (_, turned)) = by.scan(find, h, xp.array([False, True]))
-    room = SAME_VALUE * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.abs(fold[-1]))
+    room = AT_TOGGLE * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.abs(fold[-1]))
     before = (target - fold[-1]) * way <= room
     x = fold * curve.units
     landed = xp.where(xp.abs(target - fold[-1]) <= room, fold, landed)  # which is known to rounding, and not to its root
@@ -231,7 +231,7 @@ def _find_fold(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) 
     return state._replace(
         X=xp.where(before, landed, X),
         tau=xp.where(before, turned, tau),
-        h=xp.maximum(h - sigma[1], SHORTEST),
+        h=xp.maximum(h - sigma[1], SHORTEST_ARC),
         event=xp.where(before, _LANDS, Reached.beyond_limit),
         points=points,
     )

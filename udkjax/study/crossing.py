@@ -23,26 +23,26 @@ CLOSE_DISTANCE = 0.02  # scaled: how far the point before may lie, whose tangent
 SPACINGS = (0.04, 0.015, 0.005)
 # Steps h from the point to the nearest and to the farthest of the others, twelve in all: they multiply errors by 13. With fewer
 # the polynomials err more, with more or nearer ones rounding does.
-FIRST, LAST = 2, 7
+NEAREST_NODE, FARTHEST_NODE = 2, 7
 # How far the polynomials through twelve and through ten values may differ in q, q' and q'', scaled: a hundred times their error.
-ACCEPTED = (1e-9, 1e-7, 1e-5)
+ACCEPTED_DIFFERENCES = (1e-9, 1e-7, 1e-5)
 
 
 def weights(last: int) -> np.ndarray:
-    """Return Lagrange's weights at zero of the nodes -last..-FIRST and FIRST..last."""
+    """Return Lagrange's weights at zero of the nodes -last..-NEAREST_NODE and NEAREST_NODE..last."""
     steps = nodes(last)
     return np.array([np.prod([-m / (k - m) for m in steps if m != k]) for k in steps])
 
 
 def _slope_weights() -> np.ndarray:
     """Return the weights with which values at the nodes, a unit apart, make the derivative at zero."""
-    steps = nodes(LAST)
-    return weights(LAST) * np.array([sum(-1 / m for m in steps if m != k) for k in steps])
+    steps = nodes(FARTHEST_NODE)
+    return weights(FARTHEST_NODE) * np.array([sum(-1 / m for m in steps if m != k) for k in steps])
 
 
 def nodes(last: int) -> np.ndarray:
     """Return the numbers of steps from the point to the others, up to the `last` one on either side."""
-    side = np.arange(FIRST, last + 1)
+    side = np.arange(NEAREST_NODE, last + 1)
     return np.concatenate([-side[::-1], side])
 
 
@@ -85,7 +85,7 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
     """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
     by, xp = curve.by, curve.by.xp
     slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)
-    ends, closed = by.map(lambda k: curve.correct(X + FIRST * h * k * slope, fixed=True), xp.array([-1.0, 1.0]))
+    ends, closed = by.map(lambda k: curve.correct(X + NEAREST_NODE * h * k * slope, fixed=True), xp.array([-1.0, 1.0]))
 
     def side(way: Array, nearest: Array) -> tuple[Array, Array]:
         def onward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -95,8 +95,8 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
             return (last, at), (at, is_closed)
 
         middle = (ends[0] + ends[1]) / 2
-        inner = nearest + (middle - nearest) / FIRST  # a step h before the nearest
-        (_, _), (found, are_closed) = by.scan(onward, (inner, nearest), xp.arange(FIRST + 1.0, LAST + 1.0))
+        inner = nearest + (middle - nearest) / NEAREST_NODE  # a step h before the nearest
+        (_, _), (found, are_closed) = by.scan(onward, (inner, nearest), xp.arange(NEAREST_NODE + 1.0, FARTHEST_NODE + 1.0))
         return xp.concatenate([nearest[None], found]), xp.all(are_closed)
 
     (down, up), good = by.map(lambda x: side(*x), (xp.array([-1.0, 1.0]), ends))
@@ -109,10 +109,12 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
 
     slopes = by.map(at_point, points)
     scaled = points[:, :-1], slopes[0] * units[-1] / units[:-1], slopes[1] * units[-1] ** 2 / units[:-1]
-    all_of, fewer = weights(LAST), np.pad(weights(LAST - 1), 1)
+    all_of, fewer = weights(FARTHEST_NODE), np.pad(weights(FARTHEST_NODE - 1), 1)
     q, dq, ddq = (xp.asarray(all_of @ x) for x in scaled)
     dddq = xp.asarray(_slope_weights() @ scaled[2]) / h
-    doubts = [xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED, strict=True)]
+    doubts = [
+        xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)
+    ]
     at = xp.append(q, X[-1])
     E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
     at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding

@@ -6,7 +6,7 @@ Psi_dot = 0 gives dq/ds, and Psi_q a = gamma gives d2q/ds2, by the equations tha
 
 from collections.abc import Callable, Container, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import equinox as eqx
 import jax
@@ -136,7 +136,7 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
     def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        rows = q if isinstance(q, Tracer) else np.asarray(q)  # of which JAX would compile a program to take a row
+        rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # of which JAX would compile a program to take a row
         return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
 
     return value

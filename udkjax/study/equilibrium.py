@@ -27,7 +27,7 @@ from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize, with_unit_mass
 
-MAX_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
+MOST_NEWTON_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
 FORCE_TOL = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
 FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: what is left is rounding, which no step makes less
 NEUTRAL_STIFFNESS = 1e-10  # of the largest stiffness: one below it resists nothing
@@ -64,7 +64,7 @@ class Equilibrium(PrintsTable):
         frequencies = ", ".join(_format_rate(float(x)) for x in np.asarray(self.omega2))
         rows = [
             ("omega²", format_numbers(self.omega2, "(rad/s)²")),
-            ("frequency", frequencies or "no degree of freedom"),
+            ("frequency", frequencies or "no degree of freedom is left"),
             ("loads left over", f"{format_number(self.residual, scale=1.0)} of them"),
         ]
         poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
@@ -237,7 +237,7 @@ def _settle(
         return new, there, k + 1, better
 
     start = q, at(q), xp.asarray(0), xp.asarray(True)
-    return by.while_loop(lambda s: (s[2] < MAX_STEPS) & s[3], body, start)[0]
+    return by.while_loop(lambda s: (s[2] < MOST_NEWTON_STEPS) & s[3], body, start)[0]
 
 
 def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:

@@ -42,7 +42,7 @@ class Modes(PrintsTable):
     def _table(self) -> PrintedTable:
         if np.ndim(self.omega2) > 1:
             return fields_table(self, self._units, f"modes of {np.shape(self.omega2)[0]} members")
-        rows = []
+        rows = [] if len(self.omega2) else [("frequency", "no degree of freedom is left")]
         for k, x in enumerate(np.asarray(self.omega2)):
             omega, turns = math.sqrt(abs(float(x))), np.abs(np.asarray(self.shapes)[k, :, 2])
             kind = f"{omega:.6g} rad/s, {omega / (2 * math.pi):.6g} Hz" if x >= 0 else f"grows as exp({omega:.6g} t)"

@@ -25,12 +25,14 @@ from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.study.continuation import Points
 from udkjax.study.control_flow import sequential
-from udkjax.study.crossing import LAST, nodes, weights
+from udkjax.study.crossing import FARTHEST_NODE, nodes, weights
 from udkjax.study.curve import Curve
 
 # Of the largest (s - s*) dq/dp beside it: a residue below that is of rounding, which E^+ multiplies by a hundred at most there.
 RESIDUE = 1e-6
-MOST = 8  # values of one call where branches meet: at others, derivatives by numbers that move the constraints are not numbers
+MOST_MEETINGS = (
+    8  # values of one call where branches meet: at others, derivatives by numbers that move the constraints are not numbers
+)
 
 Rows = Float[Array, "T n"]
 Three = tuple[Rows, Rows, Rows]  # of q, q' and q''
@@ -77,7 +79,7 @@ def _by_numbers(
     if not changes:
         return zero, zero, zero
     active = jax.tree.map(lambda x: x is not None, _constraints(moved.mechanism), is_leaf=lambda x: x is None)
-    which = jnp.flatnonzero(~regular, size=min(MOST, len(values)), fill_value=0)
+    which = jnp.flatnonzero(~regular, size=min(MOST_MEETINGS, len(values)), fill_value=0)
     given = curve, values[which], tuple(x[which] for x in found), spacing[which], ~regular[which]
     operator = sequential(_matrices, *stop_gradients(given), active)
     change = jnp.concatenate([jnp.ravel(x) for x in changes])
@@ -104,7 +106,7 @@ def _matrices(
         counts: which of the values are of interest.
         active: which leaves of joints and drivers are the P numbers.
     """
-    W, unit, steps = curve.units[:-1], curve.units[-1], nodes(LAST)
+    W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
     chosen, rest = eqx.partition(_constraints(curve.mechanism), active)
     numbers, unravel = ravel_pytree(chosen)
     K, n, P = len(values), len(W), len(numbers)
@@ -127,9 +129,9 @@ def _matrices(
 
         changes = jax.jacfwd(moved)(numbers)  # (K, 12, n, P) each
         ends = offset[:, :, None, None] * changes[0]
-        size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(LAST), ends)
+        size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(FARTHEST_NODE), ends)
         residue = jnp.where(jnp.abs(residue) > RESIDUE * size[..., None], residue, 0.0)
-        smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(LAST), x) / unit**k for k, x in enumerate(changes)], 1)
+        smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(FARTHEST_NODE), x) / unit**k for k, x in enumerate(changes)], 1)
         known = jnp.all(is_closed, 1) & (spacing > 0)
         return jnp.where(known[:, None, None, None], smooth * W[:, None], jnp.nan), residue
 

@@ -55,11 +55,11 @@ class FailedRun:
         return [self.end, *listed]
 
     def psi(self, t: float, q: np.ndarray) -> np.ndarray:
-        """Psi (m,), in m or rad."""
+        """Return Psi (m,), in m or rad."""
         return self.rows.at(t, q)[0]
 
     def psi_dot(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Psi_dot (m,), in m/s or rad/s."""
+        """Return Psi_dot (m,), in m/s or rad/s."""
         return np.asarray(constraints.psi_dot(self.mechanism.without_origin, t, q, v))
 
     def decomposed(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

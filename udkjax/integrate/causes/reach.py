@@ -16,13 +16,15 @@ from udkjax.scene.drivers import Driver
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
-STEPS = 32  # from the last good state to the time of the failure
-HALVINGS = 34  # of the last of them: 1e-12 of it
-NEW = 1e-2  # of the largest singular value of D: those below belong to the dead point; the position is known to 1e-5 or so
-SHARE = 1e-3  # of the largest row of a combination: a row below has no part in it
+REACH_STEPS = 32  # from the last good state to the time of the failure
+REACH_HALVINGS = 34  # of the last of them: 1e-12 of it
+DEAD_POINT_TOL = (
+    1e-2  # of the largest singular value of D: those below belong to the dead point; the position is known to 1e-5 or so
+)
+INVOLVED_SHARE = 1e-3  # of the largest row of a combination: a row below has no part in it
 IN_LINE = 1e-3  # rad
-TRIED = 4  # states from which one looks
-FARTHEST = 1.0  # rad, characteristic lengths: a position farther from the one before is on another branch
+STATES_TRIED = 4  # states from which one looks
+SAME_BRANCH = 1.0  # rad, characteristic lengths: a position farther from the one before is on another branch
 
 
 class Reach(NamedTuple):
@@ -60,7 +62,7 @@ def explain_reach(run: FailedRun, until: float) -> str:
 def _find_reach(run: FailedRun, until: float) -> Reach | None:
     """Return where the constraints stop closing before a time, or None where they close all the way or nowhere."""
     rows, size = run.rows, run.rows.scales.size
-    first = next((p for p in (rows.close(t, q) for t, q, _ in run.states[:TRIED] if t < until) if p is not None), None)
+    first = next((p for p in (rows.close(t, q) for t, q, _ in run.states[:STATES_TRIED] if t < until) if p is not None), None)
     if first is None:
         return None
     t, q, before = first.t, first.q, None
@@ -69,12 +71,12 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
         guess = q if before is None else q + (q - before[1]) * (at - t) / (t - before[0])
         for start in (guess, q):
             p = rows.close(at, start)
-            if p is not None and size(p.q - q, np) < FARTHEST:
+            if p is not None and size(p.q - q, np) < SAME_BRANCH:
                 return p.q
         return None
 
     high = None
-    for at in np.linspace(t, until, STEPS + 1)[1:]:
+    for at in np.linspace(t, until, REACH_STEPS + 1)[1:]:
         there = close(float(at))
         if there is None:
             high = float(at)
@@ -83,7 +85,7 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
     if high is None:
         return None
     before = None  # beside a dead point the way behind leads astray
-    for _ in range(HALVINGS):
+    for _ in range(REACH_HALVINGS):
         middle = 0.5 * (t + high)
         there = close(middle) if t < middle < high else None
         if there is None:
@@ -99,10 +101,10 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
     psi, length, D = rows.at(t, q)
     u, sigma, _ = np.linalg.svd(dense(D))
     null = np.ones(len(u), bool)
-    null[: len(sigma)] = sigma <= NEW * sigma[0]
+    null[: len(sigma)] = sigma <= DEAD_POINT_TOL * sigma[0]
     N = u[:, null]
     demand = N @ (N.T @ ((rows.at(until, q)[0] - psi) / length))
-    involved = np.abs(demand) > SHARE * np.abs(demand).max(initial=0.0)
+    involved = np.abs(demand) > INVOLVED_SHARE * np.abs(demand).max(initial=0.0)
     return frozenset(name for (name, _), part in zip(rows.names, involved, strict=True) if part)
 
 

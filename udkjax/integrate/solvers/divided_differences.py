@@ -30,7 +30,7 @@ POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.
 
 
 def _adams_moulton(count: int) -> np.ndarray:
-    """|gamma*_0|, |gamma*_1|, ...: of Adams-Moulton methods with a constant step, in terms of backward differences."""
+    """Return |gamma*_0|, |gamma*_1|, ... of Adams-Moulton methods with a constant step, in terms of backward differences."""
     gamma = np.zeros(count)
     for i in range(count):
         gamma[i] = (i == 0) - sum(gamma[j] / (i + 1 - j) for j in range(i))

@@ -22,7 +22,7 @@ from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
 
 INITIAL = "initial"  # the keyframe that `mjcf_text` writes velocities and controls into
-CLOSED = 1e-9  # of the model's size: what rounding leaves open of a loop
+OPEN_LOOP = 1e-9  # of the model's size: what rounding leaves open of a loop
 ROTOR_MASS = 0.01  # of the mass of the body that carries it
 
 
@@ -216,5 +216,5 @@ def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str
             for body in joint.frame_names
         ]
         gap = float(np.max(np.abs(np.asarray(joint.residual(0.0, *frames)))))
-        found += [(name, gap)] if gap > CLOSED * max(size, 1.0) else []
+        found += [(name, gap)] if gap > OPEN_LOOP * max(size, 1.0) else []
     return found

@@ -19,7 +19,7 @@ from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import EVEN
-from udkjax.scene.mjcf.mjcf_reader import CLOSED, INITIAL
+from udkjax.scene.mjcf.mjcf_reader import INITIAL, OPEN_LOOP
 from udkjax.scene.mjcf.spanning_tree import spanning_tree
 from udkjax.scene.reshaping import attachments
 from udkjax.scene.suspicions import body_sizes
@@ -142,7 +142,7 @@ class _Writer:
             return found
         joint = self.mechanism.joints[held]
         gap = float(np.max(np.abs(joint.residual(0.0, *(self.frames[body] for body in joint.bodies)))))
-        if gap > CLOSED * max(self.size, 1.0):
+        if gap > OPEN_LOOP * max(self.size, 1.0):
             cure = "MJCF takes bodies where they stand: start them from `udk.assemble`"
             self.problems.append(f"joint {quote(held)}: is open by {gap:.3g} (m, rad), and {cure}")
         first, second = (self.frames[body] for body in joint.bodies)

@@ -14,7 +14,7 @@ from udkjax.study.diagnosis.timeline import Timeline
 from udkjax.study.report import plain, plural, row_label
 
 LABEL_WIDTH = 14  # characters of a section's title
-MOST_FIXES = 8  # fixes of one set that are printed
+MOST_FIXES_SHOWN = 8  # fixes of one set that are printed
 SMALLEST_POSE_NUMBER = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
 
 
@@ -167,10 +167,10 @@ def _freedoms(found: Diagnosis) -> list[str]:
 def _redundancy(r: Redundancy) -> list[str]:
     when = "everywhere along the motion" if r.permanent else "in this configuration only"
     lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant row')}, {when}"]
-    for fix in r.fixes[:MOST_FIXES]:
+    for fix in r.fixes[:MOST_FIXES_SHOWN]:
         more = f", takes {fix.removes} redundant rows" if fix.removes > 1 and fix.removes > r.count else ""
         lines.append(f"  fix {fix.constraint}: {fix.change} (condition {1 / fix.conditioning:.3g}{more})")
-    lines += [f"  ... {len(r.fixes) - MOST_FIXES} more"] if len(r.fixes) > MOST_FIXES else []
+    lines += [f"  ... {len(r.fixes) - MOST_FIXES_SHOWN} more"] if len(r.fixes) > MOST_FIXES_SHOWN else []
     if r.permanent and not r.fixes:
         lines.append("  no single change of a joint was found that takes redundancy away and leaves the mobility")
     return lines

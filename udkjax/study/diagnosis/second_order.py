@@ -17,8 +17,8 @@ from udkjax.expressions.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
-N_STARTS = 400  # directions to look from
-ITERATIONS = 60  # of Gauss-Newton: at double zeros each halves the error, to 1e-18
+N_DIRECTIONS = 400  # directions to look from
+GAUSS_NEWTON_STEPS = 60  # of Gauss-Newton: at double zeros each halves the error, to 1e-18
 ZERO_FORM = 1e-10  # of the forms, whose coefficients are at most one
 DOUBLE_ZERO = 1e-7  # of a tangent: a double zero is known to the root of rounding
 SAME_DIRECTION = 1e-4  # rad: directions nearer than that are one
@@ -76,7 +76,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
     if size < ZERO_FORM:
         return [Zeros(np.eye(d), d)]
     A, random = A / size, np.random.default_rng(0)
-    x = _solve(A, np.concatenate([np.eye(d), random.standard_normal((N_STARTS, d))]))
+    x = _solve(A, np.concatenate([np.eye(d), random.standard_normal((N_DIRECTIONS, d))]))
     found: list[Zeros] = []
     for direction in x:
         if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME_DIRECTION for z in found):
@@ -91,7 +91,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
 def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Find zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
-    for _ in range(ITERATIONS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         residual = np.einsum("kij,si,sj->sk", A, x, x)
         matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # and a step across x
         x = x - np.einsum("sij,sj->si", np.linalg.pinv(matrix, rcond=1e-9), np.pad(residual, ((0, 0), (0, 1))))

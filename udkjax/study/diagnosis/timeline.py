@@ -27,7 +27,7 @@ SAMPLES_PER_OUTPUT = 4  # samples from one output to the next, to look for minim
 PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated anew
 PARTS_OF_BRACKET = 16  # parts of a bracket, of which two are left by each refinement
 KINK_RATIO = 2.0  # a minimum is one of zero where it is at most so many times the rise to its neighbours
-TIGHT_TOL = 1e-12  # rtol and atol of an interval that is integrated anew
+RENEWED_TOL = 1e-12  # rtol and atol of an interval that is integrated anew
 
 
 class TimedRankChange(NamedTuple):
@@ -132,7 +132,7 @@ def _renew(
     later = np.linspace(low, high, 2 * PARTS_OF_INTERVAL + 1)
     times = np.unique(np.append(ts[first], later))
     state = State(solution.q[first], solution.v[first])
-    again = simulate(mechanism, times, state, rtol=TIGHT_TOL, atol=TIGHT_TOL, throw=False)
+    again = simulate(mechanism, times, state, rtol=RENEWED_TOL, atol=RENEWED_TOL, throw=False)
     q, v = (np.asarray(x).reshape(len(times), -1) for x in (again.q, again.v))
     return _Path(mechanism, analysis, times, q, v) if np.all(np.isfinite(q)) else None
 

@@ -12,7 +12,7 @@ from udkjax.study.noise import outlier_rows
 from udkjax.study.report import plural
 
 NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
-MOST_NAMED = 5  # of a channel, the largest; the others are counted
+MOST_OUTLIERS_NAMED = 5  # of a channel, the largest; the others are counted
 
 
 class Outlier(NamedTuple):
@@ -61,9 +61,9 @@ def outlier_sentences(problem: FitProblem, outliers: Sequence[Outlier], robust: 
         named = [
             f"row {one.row} ({one.time:.6g} s) by {f'{one.residual:.3g} {one.units}'.rstrip()}, "
             f"{one.deviations:.3g} standard deviations"
-            for one in own[:MOST_NAMED]
+            for one in own[:MOST_OUTLIERS_NAMED]
         ]
-        more = f" and {len(own) - MOST_NAMED} more" if len(own) > MOST_NAMED else ""
+        more = f" and {len(own) - MOST_OUTLIERS_NAMED} more" if len(own) > MOST_OUTLIERS_NAMED else ""
         cure = (
             "by the loss this counts little"
             if robust
