@@ -15,8 +15,7 @@ A value so near to a meeting of branches that its own E is of no use is found ac
 Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -24,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.printing import PrintsWords
-from udkjax.study.control_flow import ControlFlow, sequential
+from udkjax.study.control_flow import sequential
 from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing
 from udkjax.study.curve import AbstractCurve
 
@@ -34,6 +33,8 @@ PREDICTION_TOL = 0.3  # of a step: how far its end may lie from the prediction
 MAX_SECANTS = 60  # until a root is rounding; ten are usual
 MAX_TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
 AT_TOGGLE = 8.0  # units of rounding within which a value is that of a toggle
+
+T = TypeVar("T")
 
 
 class Reached(PrintsWords):
@@ -65,17 +66,30 @@ class Points(NamedTuple):
     limit_q: Float[Array, "n"]
 
 
+class _Search(NamedTuple):
+    """A root along the arc that is being bracketed by the rule of Illinois: secants, of which a side that stays counts half."""
+
+    sigma: Float[Array, ""]  # where the function was looked at last
+    value: Float[Array, ""]
+    other: Float[Array, ""]  # the other side of the bracket
+    other_value: Float[Array, ""]
+    tries: Int[Array, ""]
+
+
 class _State(NamedTuple):
     X: Float[Array, "n+1"]
     tau: Float[Array, "n+1"]
     h: Float[Array, ""]
     k: Int[Array, ""]  # the next value
     trials: Int[Array, ""]
-    event: Int[Array, ""]  # a `Reached`; `_FOLD` where a toggle lies within the next step, `_LANDS` where X is the next value's
+    event: Int[Array, ""]  # a `Reached`, or what else is to be done
+    search: _Search
     points: Points
 
 
-_FOLD, _LANDS = -1, -2  # events beside the outcomes of `Reached`
+# Events beside the outcomes of `Reached`: the start is to be closed; X is the next value's; and within the next step a toggle lies,
+# or the next value before that toggle, and is searched for.
+_START, _LANDS, _TOGGLE, _VALUE = -1, -2, -3, -4
 
 
 def follow(
@@ -105,45 +119,78 @@ def _follow(
     first: int | Int[Array, ""],
 ) -> Points:
     by, xp = curve.by, curve.by.xp
-    X, closed = curve.correct(xp.append(q, s) / curve.units, fixed=True)
-    targets = values / curve.units[-1]
-    tau = curve.tangent(X, xp.append(xp.zeros_like(X[:-1]), 1.0))
-    one, k = xp.asarray(FIRST_STEP, X.dtype), xp.asarray(first)
-    start = xp.where(closed, _LANDS, Reached.open)  # where branches meet, one of them is taken
-    state = _State(X, tau, one, k, xp.asarray(0), start, points)
+    X, targets = xp.append(q, s) / curve.units, values / curve.units[-1]
+    zero, none = xp.zeros((), X.dtype), xp.asarray(0)
+    along = xp.append(xp.zeros_like(X[:-1]), 1.0)
+    search = _Search(zero, zero, zero, zero, none)
+    state = _State(X, along, xp.asarray(FIRST_STEP, X.dtype), xp.asarray(first), none, xp.asarray(_START), search, points)
+    most = MAX_TRIALS + 4 * len(values)
 
-    def is_unfinished(state: _State) -> Bool[Array, ""]:
-        return (state.k < len(values)) & (state.event == Reached.closed)
+    def is_underway(state: _State) -> Bool[Array, ""]:
+        return (state.k < len(values)) & ((state.event == Reached.closed) | (state.event == _START) | (state.event <= _TOGGLE))
 
     def body(state: _State) -> _State:
-        state = by.while_loop(is_unfinished, lambda state: _step(curve, targets, state), state)
-        state = by.cond(state.event == _FOLD, lambda: _find_fold(curve, targets, state), lambda: state)
-        return _record(curve, state)
+        return _record(curve, by.while_loop(is_underway, lambda state: _try(curve, targets, most, state), state))
 
     def goes_on(state: _State) -> Bool[Array, ""]:
-        return (is_unfinished(state) | (state.event == _LANDS)) & (state.trials < MAX_TRIALS + 4 * len(values))
+        return (is_underway(state) | (state.event == _LANDS)) & (state.trials < most)
 
     state = by.while_loop(goes_on, body, state)
-    event = xp.where(is_unfinished(state), Reached.lost, state.event)
+    event = xp.where(is_underway(state), Reached.lost, state.event)
     status = xp.where(np.arange(len(values)) >= state.k, event, state.points.status)
     return state.points._replace(status=status)
 
 
-def _step(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) -> _State:
-    """Take one step towards the next value, or right to it."""
+def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _State) -> _State:
+    """Look at one more point: the start, the end of a step towards the next value or right at it, or one of a search.
+
+    There is one corrector for all, since what is traced more often takes as many times as long to compile.
+    """
     xp = curve.by.xp
-    X, tau, h, k, trials, event, points = state
-    target = targets[k]
+    X, h, target, starts, searches = state.X, state.h, targets[state.k], state.event == _START, state.event <= _TOGGLE
     way = xp.where(target >= X[-1], 1.0, -1.0)
-    tau = tau * xp.where(tau[-1] * way >= 0, 1.0, -1.0)
+    tau = state.tau * xp.where(starts | (state.tau[-1] * way >= 0), 1.0, -1.0)
     slope = xp.abs(tau[-1])
-    wanted = xp.abs(target - X[-1]) / xp.where(slope > 0, slope, 1.0)
-    lands = (wanted <= h) & (slope > 0) | (target == X[-1])
-    eta = xp.where(lands, xp.where(target == X[-1], 0.0, wanted), h)
+    wanted = xp.where(target == X[-1], 0.0, xp.abs(target - X[-1]) / xp.where(slope > 0, slope, 1.0))
+    lands = ~searches & ~starts & ((wanted <= h) & (slope > 0) | (target == X[-1]))
+    eta = xp.where(starts, 0.0, xp.where(searches, _secant(state.search, xp), xp.where(lands, wanted, h)))
     ahead = X + eta * tau
     ahead = xp.append(ahead[:-1], xp.where(lands, target, ahead[-1]))
-    at, closed = curve.correct(ahead, fixed=lands)
+    at, closed = curve.correct(ahead, fixed=lands | starts)
     turned = curve.tangent(at, tau)
+
+    def begin() -> _State:  # where branches meet, one of them is taken
+        return state._replace(X=at, tau=turned, event=xp.where(closed, _LANDS, Reached.open))
+
+    def narrow() -> _State:
+        return _narrow(curve, state, target, way, eta, at, turned)
+
+    def advance() -> _State:
+        return _advance(curve, state._replace(tau=tau), target, way, eta, lands, ahead, at, closed, turned, most)
+
+    cond = curve.by.cond
+    return cond(starts, begin, lambda: cond(searches, narrow, advance))
+
+
+def _choose(condition: Bool[Array, ""], a: T, b: T, xp: ArrayLibrary) -> T:
+    return jax.tree.map(lambda x, y: y if x is y else xp.where(condition, x, y), a, b)
+
+
+def _advance(
+    curve: AbstractCurve,
+    state: _State,
+    target: Float[Array, ""],
+    way: Float[Array, ""],
+    eta: Float[Array, ""],
+    lands: Bool[Array, ""],
+    ahead: Float[Array, "n+1"],
+    at: Float[Array, "n+1"],
+    closed: Bool[Array, ""],
+    turned: Float[Array, "n+1"],
+    most: int,
+) -> _State:
+    """Return the state after a step to `at`, of the length eta, if that step counts."""
+    xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
     rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
     near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
     good = near & (turned @ tau >= LARGEST_BEND) & closed
@@ -151,23 +198,60 @@ def _step(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) -> _S
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
     counts = good & ~folds & ~passed
-    lands = lands & counts
     shorter = xp.where(passed, 0.5 * eta, xp.where(good, h, 0.5 * eta))
     longer = xp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), xp.minimum(1.5 * h, LONGEST_ARC), h)
-    lost = ~good & (0.5 * eta < SHORTEST_ARC)
-    return _State(
+    lost = ~good & (0.5 * eta < SHORTEST_ARC) | (state.trials > most)
+    event = xp.where(lands & counts, _LANDS, xp.where(lost, Reached.lost, state.event))
+    bracket = _Search(eta, way * turned[-1], xp.zeros_like(eta), way * tau[-1], xp.zeros_like(state.search.tries))
+    return state._replace(
         X=xp.where(counts, at, X),
         tau=xp.where(counts, turned, tau),
         h=xp.where(folds, eta, xp.where(counts, longer, shorter)),
-        k=k,
-        trials=trials + 1,
-        event=xp.where(
-            folds,
-            _FOLD,
-            xp.where(lands, _LANDS, xp.where(lost | (trials > MAX_TRIALS + 4 * len(targets)), Reached.lost, event)),
-        ),
-        points=points,
+        trials=state.trials + 1,
+        event=xp.where(folds, _TOGGLE, event),
+        search=bracket,
     )
+
+
+def _secant(search: _Search, xp: ArrayLibrary) -> Float[Array, ""]:
+    """Return where the secant of a bracket is zero."""
+    a, fa, b, fb = search.other, search.other_value, search.sigma, search.value
+    slope = fb - fa
+    return xp.clip(b - fb * (b - a) / xp.where(slope != 0, slope, 1.0), xp.minimum(a, b), xp.maximum(a, b))
+
+
+def _narrow(
+    curve: AbstractCurve,
+    state: _State,
+    target: Float[Array, ""],
+    way: Float[Array, ""],
+    sigma: Float[Array, ""],
+    at: Float[Array, "n+1"],
+    tangent: Float[Array, "n+1"],
+) -> _State:
+    """Return the state of a search after it looked at sigma: for the toggle first, and then for the value if it lies before."""
+    xp, last, end = curve.by.xp, state.search, state.h
+    for_value = state.event == _VALUE
+    value = way * xp.where(for_value, target - at[-1], tangent[-1])
+    crosses = value * last.value < 0
+    other = xp.where(crosses, last.sigma, last.other), xp.where(crosses, last.value, 0.5 * last.other_value)
+    ended = (xp.abs(sigma - last.sigma) <= 2 * float(np.finfo(end.dtype).eps) * end) | (value == 0)
+    ended = ended | (last.tries + 1 >= MAX_SECANTS)
+    narrowed = state._replace(search=_Search(sigma, value, *other, last.tries + 1))
+    # At the toggle: the value lies behind it, at it to rounding, or before.
+    room = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
+    ahead = (target - at[-1]) * way
+    x, points = at * curve.units, state.points
+    beyond = points._replace(limit=x[-1], limit_q=x[:-1])
+    rest = xp.maximum(end - sigma, SHORTEST_ARC)
+    event = xp.where(ahead > room, Reached.beyond_limit, xp.where(ahead >= -room, _LANDS, _VALUE))
+    start = (target - state.X[-1]) * way
+    bracket = _Search(sigma, ahead, xp.zeros_like(sigma), start, xp.zeros_like(last.tries))
+    at_toggle = state._replace(event=event, search=bracket, h=xp.where(event == _LANDS, rest, end))
+    at_toggle = at_toggle._replace(X=xp.where(event == _LANDS, at, state.X), tau=xp.where(event == _LANDS, tangent, state.tau))
+    at_toggle = at_toggle._replace(points=_choose(event == Reached.beyond_limit, beyond, points, xp))
+    at_value = state._replace(X=at, tau=tangent, h=rest, event=xp.full_like(state.event, _LANDS))
+    return _choose(ended, _choose(for_value, at_value, at_toggle, xp), narrowed, xp)
 
 
 def _record(curve: AbstractCurve, state: _State) -> _State:
@@ -197,66 +281,6 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
     points = points._replace(**{name: by.put(old[name], k, xp.where(stores, x, old[name][k])) for name, x in new.items()})
     event = xp.where(lands, Reached.closed, state.event)
     return state._replace(X=X, tau=tau, k=k + stores, event=event, points=points)
-
-
-def _find_fold(curve: AbstractCurve, targets: Float[Array, "T"], state: _State) -> _State:
-    """Find the toggle within the next step, and the next value if it lies before."""
-    by, xp = curve.by, curve.by.xp
-    X, tau, h, k, _, _, points = state
-    target, way = targets[k], xp.sign(tau[-1])
-
-    def point_at(sigma: Float[Array, ""]) -> tuple[Array, Array]:
-        at = curve.correct(X + sigma * tau)[0]
-        return at, curve.tangent(at, tau)
-
-    def find(end: Float[Array, ""], of_value: Bool[Array, ""]) -> tuple[Array, tuple[Array, Array, Array]]:
-        """Return where the tangent turns back, or where the target is, before `end`."""
-
-        def ahead(sigma: Float[Array, ""]) -> Float[Array, ""]:
-            at, tangent = point_at(sigma)
-            return way * xp.where(of_value, target - at[-1], tangent[-1])
-
-        sigma = _root(ahead, end, by)
-        return sigma, (sigma, *point_at(sigma))
-
-    _, (sigma, (fold, landed), (_, turned)) = by.scan(find, h, xp.array([False, True]))
-    room = AT_TOGGLE * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.abs(fold[-1]))
-    before = (target - fold[-1]) * way <= room
-    x = fold * curve.units
-    landed = xp.where(xp.abs(target - fold[-1]) <= room, fold, landed)  # which is known to rounding, and not to its root
-    points = points._replace(
-        limit=xp.where(before, points.limit, x[-1]),
-        limit_q=xp.where(before, points.limit_q, x[:-1]),
-    )
-    return state._replace(
-        X=xp.where(before, landed, X),
-        tau=xp.where(before, turned, tau),
-        h=xp.maximum(h - sigma[1], SHORTEST_ARC),
-        event=xp.where(before, _LANDS, Reached.beyond_limit),
-        points=points,
-    )
-
-
-def _root(f: Callable[[Array], Array], end: Float[Array, ""], by: ControlFlow) -> Float[Array, ""]:
-    """Return where f, positive at 0, becomes negative before `end`, to rounding; the end, where it does not.
-
-    By the rule of Illinois: secants of a bracket, of which a side that stays counts half.
-    """
-    xp, rounding = by.xp, 2 * float(np.finfo(end.dtype).eps)
-
-    def halve(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        a, fa, b, fb, k, _ = state
-        slope = fb - fa
-        c = xp.clip(b - fb * (b - a) / xp.where(slope != 0, slope, 1.0), xp.minimum(a, b), xp.maximum(a, b))
-        fc = f(c)
-        crosses = fc * fb < 0
-        done = (xp.abs(c - b) <= rounding * end) | (fc == 0)
-        return xp.where(crosses, b, a), xp.where(crosses, fb, 0.5 * fa), c, fc, k + 1, done
-
-    # One evaluation for both ends: what is traced once compiles in half the time.
-    at_start, at_end = by.map(f, xp.stack([xp.zeros_like(end), end]))
-    state = xp.zeros_like(end), at_start, end, at_end, xp.asarray(0), at_end >= 0
-    return by.while_loop(lambda s: (s[4] < MAX_SECANTS) & ~s[5], halve, state)[2]
 
 
 def no_points(count: int, n: int, xp: ArrayLibrary) -> Points:

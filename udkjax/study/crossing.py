@@ -85,21 +85,20 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
     """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
     by, xp = curve.by, curve.by.xp
     slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)
-    ends, closed = by.map(lambda k: curve.correct(X + NEAREST_NODE * h * k * slope, fixed=True), xp.array([-1.0, 1.0]))
+    ways = xp.array([-1.0, 1.0])
+    along = NEAREST_NODE * h * ways[:, None] * slope
 
-    def side(way: Array, nearest: Array) -> tuple[Array, Array]:
-        def onward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-            before, last = state
-            ahead = xp.append((last + (last - before))[:-1], X[-1] + way * k * h)
-            at, is_closed = curve.correct(ahead, fixed=True)
-            return (last, at), (at, is_closed)
+    def outward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        before, last = state
+        ahead = xp.where(k == NEAREST_NODE, X + along, last + (last - before))
+        value = xp.where(k == NEAREST_NODE, ahead[:, -1:], (X[-1] + ways * k * h)[:, None])
+        at, are_closed = by.map(lambda x: curve.correct(x, fixed=True), xp.concatenate([ahead[:, :-1], value], 1))
+        inner = at + (xp.mean(at, 0) - at) / NEAREST_NODE  # a step h before the nearest
+        return (xp.where(k == NEAREST_NODE, inner, last), at), (at, are_closed)
 
-        middle = (ends[0] + ends[1]) / 2
-        inner = nearest + (middle - nearest) / NEAREST_NODE  # a step h before the nearest
-        (_, _), (found, are_closed) = by.scan(onward, (inner, nearest), xp.arange(NEAREST_NODE + 1.0, FARTHEST_NODE + 1.0))
-        return xp.concatenate([nearest[None], found]), xp.all(are_closed)
-
-    (down, up), good = by.map(lambda x: side(*x), (xp.array([-1.0, 1.0]), ends))
+    start = xp.stack([X, X])
+    _, (sides, closed) = by.scan(outward, (start, start), xp.arange(NEAREST_NODE, FARTHEST_NODE + 1.0))
+    down, up = sides[:, 0], sides[:, 1]
     points = xp.concatenate([down[::-1], up])  # (12, n + 1)
     units = curve.units
 
@@ -112,13 +111,11 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
     all_of, fewer = weights(FARTHEST_NODE), np.pad(weights(FARTHEST_NODE - 1), 1)
     q, dq, ddq = (xp.asarray(all_of @ x) for x in scaled)
     dddq = xp.asarray(_slope_weights() @ scaled[2]) / h
-    doubts = [
-        xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)
-    ]
+    doubts = [xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)]
     at = xp.append(q, X[-1])
     E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
     at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding
-    known = xp.all(closed) & xp.all(good) & curve.is_closed(at) & (tau[-1] != 0)
+    known = xp.all(closed) & curve.is_closed(at) & (tau[-1] != 0)
     doubt = xp.where(known, xp.max(xp.stack(doubts)), xp.inf)
     doubt = xp.where(xp.isfinite(doubt), doubt, xp.inf)
     dq, ddq, dddq = (x * units[:-1] / units[-1] ** k for k, x in ((1, dq), (2, ddq), (3, dddq)))
