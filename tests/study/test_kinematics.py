@@ -393,6 +393,9 @@ def test_what_cannot_be_driven_is_refused():
         udk.kinematics(udk.library.slider_crank(0.3, 4.0), None, [0.0, 1.0], held={"motor": 1.0})
     with pytest.raises(udk.SceneError, match="driver is None: travel is that of a coordinate"):
         udk.travel(udk.library.slider_crank(0.3, 4.0), None)
+    for of in (lambda f: f, jax.jit, jax.grad):  # known, traced, differentiated
+        with pytest.raises(udk.SceneError, match="the scene has no driver: name a coordinate that drives it"):
+            of(lambda a: jnp.sum(udk.kinematics(udk.library.four_bar(a), None, [0.0, 1.0]).q))(1.0)
     with pytest.raises(udk.SceneError, match="keeps 1 degree of freedom"):
         udk.kinematics(udk.library.double_pendulum(), f"body.{udk.library.double_pendulum().body_names[0]}.angle", [1.0])
 

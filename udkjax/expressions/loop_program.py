@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions.graph import Graph, Scalar
@@ -16,6 +17,7 @@ from udkjax.expressions.scalar_program import ScalarProgram
 # What an output does with the number in its place: replace it, be added to it, stay if it is larger, or if it is not true.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
 ADD_ONE_BY_ONE = "add one by one"  # in loops by NumPy
+MOST_TURNS = 8  # updates of one place by a loop, in a program of JAX: each is an operation of it, or all are a loop
 
 
 class Address(NamedTuple):
@@ -100,25 +102,69 @@ class LoopProgram(NamedTuple):
 
 
 def evaluate_loops(program: LoopProgram, arrays: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    """Return the arrays as a program leaves them, by JAX; no row of a loop may read what another writes."""
+    """Return the arrays as a program leaves them, by JAX; no row of a loop may read what another writes.
+
+    What a loop reads of an array, and what it writes to one, is one operation each: XLA takes milliseconds to compile any.
+    """
     found = dict(arrays)
     for part in program.parts:
         if isinstance(part, Reset):
-            found[part.array] = found[part.array].at[part.start : part.start + part.count].set(part.value)
+            x, end = found[part.array], part.start + part.count
+            found[part.array] = jnp.concatenate([x[: part.start], jnp.full(part.count, part.value), x[end:]])
             continue
         kernel, table = part.kernel, part.table
         if not kernel.outputs or not len(table):
             continue
+        values: list = [np.zeros(len(table))] * len(kernel.inputs)
         pairs = zip(kernel.program.inputs, kernel.inputs, strict=True)
-        values = [
-            found[part.array(x.array)][_places(x, table)] if kernel.program.uses(s) else np.zeros(len(table)) for s, x in pairs
-        ]
+        for name, numbers in _by_array(part, [x if kernel.program.uses(s) else None for s, x in pairs]).items():
+            rows = _take(found[name], np.stack([_places(kernel.inputs[k], table) for k in numbers]))
+            for k, row in zip(numbers, rows, strict=True):
+                values[k] = row
         run: Callable = jax.vmap(kernel.program) if values else kernel.program.by_numpy
-        for x, address in zip(run(values), kernel.outputs, strict=True):
-            name = part.array(address.array)
-            place = found[name].at[_places(address, table)]
-            found[name] = place.add(x) if address.update == ADD else place.set(x)
+        results = run(values)
+        for name, numbers in _by_array(part, kernel.outputs).items():
+            for update in {kernel.outputs[k].update: None for k in numbers}:
+                some = [k for k in numbers if kernel.outputs[k].update == update]
+                places = np.concatenate([_places(kernel.outputs[k], table) for k in some])
+                new = jnp.concatenate([jnp.broadcast_to(results[k], len(table)) for k in some])
+                found[name] = _put(found[name], places, new, update)
     return found
+
+
+def _by_array(part: KernelLoop, addresses: Sequence[Address | None]) -> dict[str, list[int]]:
+    """Return the numbers of the addresses of each array of the program."""
+    found: dict[str, list[int]] = {}
+    for k, address in enumerate(addresses):
+        if address is not None:
+            found.setdefault(part.array(address.array), []).append(k)
+    return found
+
+
+def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
+    """Return numbers of an array, in the shape of their places."""
+    flat = places.ravel()
+    if np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
+        return x[flat[0] : flat[0] + flat.size].reshape(places.shape)
+    return x.at[places].get(mode="promise_in_bounds")
+
+
+def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.Array:
+    """Return an array after an update of some places: by taking, as scattering is a loop to compile for XLA."""
+    order = np.argsort(places, kind="stable")
+    first = np.searchsorted(places[order], places[order])
+    turn = np.empty(len(places), int)
+    turn[order] = np.arange(len(places)) - first  # how many updates of the same place come before
+    if turn.max() >= MOST_TURNS:
+        at = x.at[places]
+        return (at.add if update == ADD else at.set)(new, mode="promise_in_bounds")
+    padded = jnp.append(new, 0.0)
+    for k in range(turn.max() + 1):
+        source = np.full(len(x), len(places))
+        source[places[turn == k]] = np.flatnonzero(turn == k)
+        taken, known = _take(padded, source), source < len(places)
+        x = x + taken if update == ADD else taken if known.all() else jnp.where(known, taken, x)
+    return x
 
 
 class NumpyLoops:

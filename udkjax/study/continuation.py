@@ -87,7 +87,7 @@ class _State(NamedTuple):
     points: Points
 
 
-# Events beside the outcomes of `Reached`: the start is to be closed; X is the next value's; and within the next step a toggle lies,
+# Events beside the outcomes of `Reached`: the start is to be closed; X is the next value's; a toggle lies within the next step,
 # or the next value before that toggle, and is searched for.
 _START, _LANDS, _TOGGLE, _VALUE = -1, -2, -3, -4
 

@@ -104,6 +104,9 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Sc
             problem = "held is given with driver=None, where all drivers go along time: name the one that drives"
             raise SceneError([problem], mechanism.name)
         analysis = analyse(mechanism)
+        if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # nor where that is not known, of traced numbers
+            problem = "driver is None, and the scene has no driver: name a coordinate that drives it, such as"
+            raise SceneError([f"{problem} body.{mechanism.body_names[0]}.angle"], mechanism.name)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
