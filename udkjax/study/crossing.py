@@ -111,7 +111,9 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
     all_of, fewer = weights(FARTHEST_NODE), np.pad(weights(FARTHEST_NODE - 1), 1)
     q, dq, ddq = (xp.asarray(all_of @ x) for x in scaled)
     dddq = xp.asarray(_slope_weights() @ scaled[2]) / h
-    doubts = [xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)]
+    doubts = [
+        xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)
+    ]
     at = xp.append(q, X[-1])
     E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
     at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding
