@@ -16,7 +16,7 @@ G = 9.81
 STABILIZATIONS = {"projection": udk.Projection(), "Baumgarte": udk.Baumgarte(5.0, 5.0), "none": None}
 DENSE = {m.__name__: m() for m in (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)}
 TS = np.linspace(0.0, 2.0, 9)
-every_stabilization = pytest.mark.parametrize("stabilization", STABILIZATIONS.values(), ids=STABILIZATIONS)
+with_gains_too = pytest.mark.parametrize("stabilization", list(STABILIZATIONS.values())[:2], ids=list(STABILIZATIONS)[:2])
 by_projection = pytest.mark.parametrize(  # the others by one motion, the bead's
     "stabilization",
     [pytest.param(s, id=k, marks=pytest.mark.slow if k != "projection" else ()) for k, s in STABILIZATIONS.items()],
@@ -179,7 +179,7 @@ def test_a_velocity_that_is_prescribed_and_not_linear():
 # --- rheonomic
 
 
-@every_stabilization
+@with_gains_too
 def test_a_bead_on_a_turning_wire(stabilization):
     """r'' = w^2 r on a straight wire that turns with w: r = r0 cosh(w t)."""
     w = 1.1
