@@ -19,6 +19,7 @@ from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseTerms
+from udkjax.equations.redundancy import kinematic_rows, ordinary_position, owners_of_row
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
@@ -27,7 +28,7 @@ from udkjax.scene.fields import Numbers, is_traced, names, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of, point_of_pin
-from udkjax.study.holding import require_free
+from udkjax.study.report import join_names
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
@@ -275,3 +276,29 @@ def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) 
     if free:
         problem = f"driven by {driven}, it keeps {free} degree{'s' * (free > 1)} of freedom: its positions do not follow"
         raise SceneError([f"{problem}; drive or hold the others, by drivers of the scene"], mechanism.name)
+
+
+def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:
+    """Refuse a driver whose coordinate the joints and the other drivers hold; numbers are known.
+
+    It is held where its row of Psi_q depends on theirs in an ordinary position.
+
+    Args:
+        driven: the mechanism with the driver.
+        bare: the same without any driver.
+        name: of the driver in the mechanism.
+        driver: what it is called in the message.
+        names: what other drivers are called in the message, where not by their names.
+
+    Raises:
+        SceneError: it names the drivers that hold the coordinate.
+    """
+    q = ordinary_position(bare)
+    involved = None if q is None else owners_of_row(kinematic_rows(driven), 0.0, q, name)
+    if involved is None:
+        return
+    holding = [names.get(other, f"driver {quote(other)}") for other in driven.driver_names if other in involved]
+    if not holding:
+        raise SceneError([f"{driver} cannot be driven: the joints leave it no motion"], driven.name)
+    cure = "drive that, or take it out of the scene" if len(holding) == 1 else "drive one of them, or take one out of the scene"
+    raise SceneError([f"{driver} is held by {join_names(holding)}: {cure}"], driven.name)

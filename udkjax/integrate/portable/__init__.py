@@ -20,7 +20,7 @@ info         names of the first numbers of a run's result "info"; behind them ar
 sampled      places in `numbers` of what has samples; `samples`: base64 of float64, a row for each interval between breaks
 masses       of each body the places in `numbers` of its mass and inertia
 efforts      a list of {driver, unit, row: of Psi, place: of that row in x0}
-forces       how the forces of joints are found (joint_forces.py), while no row is redundant
+forces       how the forces of joints are found, while no row is redundant
 pulls        of each body the places in `numbers` of a spring that holds it: point x, y, target x, y, stiffness, damping; or []
 why          why there is no "run"; empty where there is
 modules      run, close, evaluate, mark: {code: base64 of deflated WebAssembly, data_end, fields or places and size, inputs,

@@ -20,10 +20,10 @@ from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import EVEN
 from udkjax.scene.mjcf.mjcf_reader import INITIAL, OPEN_LOOP
-from udkjax.scene.mjcf.spanning_tree import spanning_tree
 from udkjax.scene.reshaping import attachments
 from udkjax.scene.suspicions import body_sizes
 
+IN_TREE = ((Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,))  # what no equality can express comes before the others
 NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, seen from where x is to the right and z is up
 THICKNESS = 0.04  # of bars that are drawn, beside the largest body
 
@@ -302,3 +302,32 @@ def _numbers(*values: object) -> str:
 
 def _attributes(**values: str) -> str:
     return "".join(f" {name}={quoteattr(value)}" for name, value in values.items())
+
+
+def spanning_tree(mechanism: Mechanism) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the body on which each hangs, from the ground on, and the joint by which; without one it is free on the ground."""
+    groups, edges = {name: name for name in (GROUND, *mechanism.body_names)}, dict[str, list[tuple[str, str]]]()
+
+    def group(name: str) -> str:
+        while groups[name] != name:
+            name = groups[name]
+        return name
+
+    for kinds in IN_TREE:
+        for name, joint in mechanism.joints.items():
+            if isinstance(joint, kinds) and group(joint.bodies[0]) != group(joint.bodies[1]):
+                one, two = joint.bodies
+                groups[group(one)] = group(two)
+                edges.setdefault(one, []).append((two, name))
+                edges.setdefault(two, []).append((one, name))
+    parents, holders = dict[str, str](), dict[str, str]()
+    for root in (GROUND, *mechanism.body_names):
+        reached = [] if root in parents else [root]
+        if reached and root != GROUND:
+            parents[root] = GROUND
+        for name in reached:  # grows while it is gone through
+            for other, joint in edges.get(name, []):
+                if other != GROUND and other not in parents:
+                    parents[other], holders[other] = name, joint
+                    reached.append(other)
+    return parents, holders
