@@ -163,113 +163,83 @@ def test_quantities(text, unit, value):
     assert_allclose(read_quantity(text, unit), value, rtol=1e-15)
 
 
+def drawn(old="", new="", *, head=HEAD, pins="", end=""):
+    """The text of a four-bar, with more of everything, and `new` in place of `old`."""
+    text = head + GROUND + PINS + pins + LINKS + end
+    return text.replace(old, new) if old else text
+
+
 MISTAKES = [
     # units
-    (
-        MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"0.5 m"'),
-        'link "rocker" (link[2]).mass: "m" does not fit; it is measured in kg, g',
-    ),
-    (
-        MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"0.5 stone"'),
-        'link "rocker" (link[2]).mass: "stone" is no unit known here',
-    ),
-    (MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"half"'), 'link "rocker" (link[2]).mass: must be a number, or a text'),
-    (MM + GROUND + PINS + LINKS.replace('"0.5 kg"', '"5"'), 'link "rocker" (link[2]).mass: "5" has no unit'),
-    (MM + GROUND + PINS.replace("[0, 0]", '[0, "1 s"]') + LINKS, 'pins.O[1]: "s" does not fit; it is measured in m, mm, cm'),
-    (
-        MM + "gravity = [0, -9.81]\n" + GROUND + PINS + LINKS,
-        "gravity[1]: -9.81 of what? length is in mm here: write it with its unit",
-    ),
-    (
-        MM + GROUND + PINS + LINKS + '[[motor]]\npin = "O"\nspeed = 5',
-        'motor "motor1" (motor[0]).speed: 5 of what? angle is in deg here',
-    ),
-    (HEAD + 'units = {lenght = "mm"}\n' + GROUND + PINS + LINKS, 'units.lenght: unknown quantity; did you mean "length"?'),
-    (HEAD + 'units = {length = "kg"}\n' + GROUND + PINS + LINKS, 'units.length: "kg" does not fit'),
+    (drawn('"0.5 kg"', '"0.5 m"', head=MM), 'link "rocker" (link[2]).mass: "m" does not fit; it is measured in kg, g'),
+    (drawn('"0.5 kg"', '"0.5 stone"', head=MM), 'link "rocker" (link[2]).mass: "stone" is no unit known here'),
+    (drawn('"0.5 kg"', '"half"', head=MM), 'link "rocker" (link[2]).mass: must be a number, or a text'),
+    (drawn('"0.5 kg"', '"5"', head=MM), 'link "rocker" (link[2]).mass: "5" has no unit'),
+    (drawn("[0, 0]", '[0, "1 s"]', head=MM), 'pins.O[1]: "s" does not fit; it is measured in m, mm, cm'),
+    (drawn(head=MM + "gravity = [0, -9.81]\n"), "gravity[1]: -9.81 of what? length is in mm here: write it with its unit"),
+    (drawn(head=MM, end='[[motor]]\npin = "O"\nspeed = 5'), 'motor "motor1" (motor[0]).speed: 5 of what? angle is in deg here'),
+    (drawn(head=HEAD + 'units = {lenght = "mm"}\n'), 'units.lenght: unknown quantity; did you mean "length"?'),
+    (drawn(head=HEAD + 'units = {length = "kg"}\n'), 'units.length: "kg" does not fit'),
     # names
-    (HEAD + GROUND + PINS.replace("[pins]", "[pin]") + LINKS, 'pin: unknown key; did you mean "pins"?'),
-    (HEAD + GROUND + PINS + LINKS.replace("[[link]]", "[[links]]"), "links: unknown key; write [[link]]"),
-    (
-        HEAD + GROUND + PINS + LINKS.replace('"C", "B"', '"C", "b"'),
-        'link "rocker" (link[2]).pins[1]: no pin named "b"; did you mean "B"?',
-    ),
-    (HEAD + GROUND.replace("O", "Q") + PINS + LINKS, 'ground[0]: no pin named "Q"'),
-    (HEAD + GROUND + PINS + LINKS.replace('"rocker"', '"rod"'), 'link "rod" (link[2]).name: taken by another link'),
-    (HEAD + GROUND + PINS + LINKS.replace('"rocker"', '"ground"'), 'link "ground" (link[2]).name: "ground" is the fixed frame'),
-    (HEAD + GROUND + PINS + LINKS + '[[motor]]\nname = "A"\npin = "O"\nspeed = 1', 'motor "A" (motor[0]).name: taken by pin "A"'),
-    (HEAD + GROUND + PINS + LINKS.replace('name = "rod"\n', ""), "link[1].name: missing"),
-    (HEAD + GROUND + PINS + LINKS.replace("width", "widht"), 'link "rod" (link[1]).widht: unknown key; did you mean "width"?'),
+    (drawn("[pins]", "[pin]"), 'pin: unknown key; did you mean "pins"?'),
+    (drawn("[[link]]", "[[links]]"), "links: unknown key; write [[link]]"),
+    (drawn('"C", "B"', '"C", "b"'), 'link "rocker" (link[2]).pins[1]: no pin named "b"; did you mean "B"?'),
+    (drawn('ground = ["O", "C"]', 'ground = ["Q", "C"]'), 'ground[0]: no pin named "Q"'),
+    (drawn('"rocker"', '"rod"'), 'link "rod" (link[2]).name: taken by another link'),
+    (drawn('"rocker"', '"ground"'), 'link "ground" (link[2]).name: "ground" is the fixed frame'),
+    (drawn(end='[[motor]]\nname = "A"\npin = "O"\nspeed = 1'), 'motor "A" (motor[0]).name: taken by pin "A"'),
+    (drawn('name = "rod"\n', ""), "link[1].name: missing"),
+    (drawn("width", "widht"), 'link "rod" (link[1]).widht: unknown key; did you mean "width"?'),
     # who meets whom
-    (HEAD + GROUND + PINS + "S = [1, 1]\n" + LINKS, "pins.S: no link uses it"),
-    (HEAD + GROUND.replace("]", ', "S"]') + PINS + "S = [1, 1]\n" + LINKS, 'ground[2]: no link reaches pin "S"'),
-    (HEAD + GROUND + PINS + LINKS.replace('["O", "A"]', "[]"), 'link "crank" (link[0]).pins: a link needs at least one pin'),
+    (drawn(pins="S = [1, 1]\n"), "pins.S: no link uses it"),
+    (drawn('ground = ["O", "C"]', 'ground = ["O", "C", "S"]', pins="S = [1, 1]\n"), 'ground[2]: no link reaches pin "S"'),
+    (drawn('["O", "A"]', "[]"), 'link "crank" (link[0]).pins: a link needs at least one pin'),
+    (drawn(pins="S = [9, 9]\n", end='[[link]]\nname = "x"\npins = ["S"]\nmass = 1'), 'link "x" (link[3]).width: a link of one'),
+    (drawn('["O", "A"]', '["A", "A"]'), 'link "crank" (link[0]).pins: names a pin twice'),
+    (drawn("width = 10\n", ""), 'link "rod" (link[1]).width: missing'),
+    (drawn("thickness = 5\n", ""), 'link "rod" (link[1]).thickness: missing'),
+    (drawn("density = 7850\n", ""), 'link "rod" (link[1]): give a density, with a thickness, or a mass'),
     (
-        HEAD + GROUND + PINS + "S = [9, 9]\n" + LINKS + '[[link]]\nname = "x"\npins = ["S"]\nmass = 1',
-        'link "x" (link[3]).width: a link of one',
-    ),
-    (HEAD + GROUND + PINS + LINKS.replace('["O", "A"]', '["A", "A"]'), 'link "crank" (link[0]).pins: names a pin twice'),
-    (HEAD + GROUND + PINS + LINKS.replace("width = 10\n", ""), 'link "rod" (link[1]).width: missing'),
-    (HEAD + GROUND + PINS + LINKS.replace("thickness = 5\n", ""), 'link "rod" (link[1]).thickness: missing'),
-    (
-        HEAD + GROUND + PINS + LINKS.replace("density = 7850\n", ""),
-        'link "rod" (link[1]): give a density, with a thickness, or a mass',
-    ),
-    (
-        HEAD + GROUND + PINS + "S = [200, 9]\nT = [200, 90]\n" + LINKS + '[[link]]\nname = "x"\npins = ["S", "T"]\nmass = 1',
+        drawn(pins="S = [200, 9]\nT = [200, 90]\n", end='[[link]]\nname = "x"\npins = ["S", "T"]\nmass = 1'),
         'link "x" (link[3]).pins: no other link and no ground shares one of them',
     ),
     (
-        HEAD + GROUND.replace('"C"', '"C", "A"') + PINS + LINKS + '[[motor]]\npin = "A"\nspeed = 1',
+        drawn('ground = ["O", "C"]', 'ground = ["O", "C", "A"]', end='[[motor]]\npin = "A"\nspeed = 1'),
         'motor "motor1" (motor[0]).pin: at "A" there must meet two links, or one and the ground; there are ground, crank, rod; '
         'say which two, such as of = ["ground", "crank"]',
     ),
+    (drawn(end='[[motor]]\npin = "O"'), 'motor "motor1" (motor[0]).speed: give one of speed, motion and torque'),
     (
-        HEAD + GROUND + PINS + LINKS + '[[motor]]\npin = "O"',
-        'motor "motor1" (motor[0]).speed: give one of speed, motion and torque',
-    ),
-    (
-        HEAD + GROUND + PINS + LINKS + '[[motor]]\npin = "O"\nof = ["crank", "rod"]\nspeed = 1',
+        drawn(end='[[motor]]\npin = "O"\nof = ["crank", "rod"]\nspeed = 1'),
         'motor "motor1" (motor[0]).of: "rod" is not at pin "O", where there are ground, crank',
     ),
     (
-        HEAD + GROUND + PINS + LINKS + '[[spring]]\nbetween = ["O", "C"]\nstiffness = 1',
+        drawn(end='[[spring]]\nbetween = ["O", "C"]\nstiffness = 1'),
         'spring "spring1" (spring[0]).between: both pins are on "ground"',
     ),
-    (HEAD + GROUND + PINS + LINKS + '[[load]]\npin = "O"', 'load "load1" (load[0]).force: give a force, or a torque'),
-    (HEAD + GROUND + PINS + LINKS + '[[slide]]\nlink = "rod"', 'slide "slide1" (slide[0]).along: give two pins, or a direction'),
+    (drawn(end='[[load]]\npin = "O"'), 'load "load1" (load[0]).force: give a force, or a torque'),
+    (drawn(end='[[slide]]\nlink = "rod"'), 'slide "slide1" (slide[0]).along: give two pins, or a direction'),
+    (drawn(end='[[slot]]\npin = "O"\ndirection = 1\nlink = "rod"'), 'slot "slot1" (slot[0]).link: "rod" has no pin "O"'),
+    (drawn(end='[[gear]]\nlinks = ["rod", "crank"]\nteeth = [1, 2]'), 'gear "gear1" (gear[0]).links: "rod" must share'),
     (
-        HEAD + GROUND + PINS + LINKS + '[[slot]]\npin = "O"\ndirection = 1\nlink = "rod"',
-        'slot "slot1" (slot[0]).link: "rod" has no pin "O"',
-    ),
-    (
-        HEAD + GROUND + PINS + LINKS + '[[gear]]\nlinks = ["rod", "crank"]\nteeth = [1, 2]',
-        'gear "gear1" (gear[0]).links: "rod" must share',
-    ),
-    (
-        HEAD + GROUND + PINS + LINKS + '[[gear]]\nlinks = ["crank", "rocker"]\nradii = [50, 50]',
+        drawn(end='[[gear]]\nlinks = ["crank", "rocker"]\nradii = [50, 50]'),
         'gear "gear1" (gear[0]).radii: wheels of these radii are 100 m apart, and their centres 120 m',
     ),
     # geometry
-    (HEAD + GROUND + PINS.replace("[100, 50]", "[30, 40]") + LINKS, 'pins.B: is at the same place as pin "A"'),
-    (HEAD + GROUND + PINS.replace("[100, 50]", "[100, 50e3]") + LINKS, "pins.B: is 5e+04 m away from the other pins"),
+    (drawn("[100, 50]", "[30, 40]"), 'pins.B: is at the same place as pin "A"'),
+    (drawn("[100, 50]", "[100, 50e3]"), "pins.B: is 5e+04 m away from the other pins"),
+    (drawn('"C", "B"]', '"C", "A", "B"]\nwidth = 10'), 'link "rocker" (link[2]).pins: "A" is 68.7 m off the bar from "C" to "B"'),
     (
-        HEAD + GROUND + PINS + LINKS.replace('["C", "B"]', '["C", "A", "B"]').replace('mass = "0.5', 'width = 10\nmass = "0.5'),
-        'link "rocker" (link[2]).pins: "A" is 68.7 m off the bar from "C" to "B"',
-    ),
-    (
-        HEAD + GROUND + PINS + "S = [60, 80]\n" + LINKS.replace('["O", "A"]', '["O", "A", "S"]'),
+        drawn('["O", "A"]', '["O", "A", "S"]', pins="S = [60, 80]\n"),
         'link "crank" (link[0]).pins: the corners lie on one line, and enclose no area',
     ),
+    (drawn('["O", "A"]', '["O", "B", "A", "C"]'), 'link "crank" (link[0]).pins: the polygon crosses itself'),
     (
-        HEAD + GROUND + PINS + LINKS.replace('["O", "A"]', '["O", "B", "A", "C"]'),
-        'link "crank" (link[0]).pins: the polygon crosses itself',
-    ),
-    (
-        HEAD + GROUND + PINS + LINKS + "outline = [[500, 500], [600, 500], [600, 600]]",
+        drawn(end="outline = [[500, 500], [600, 500], [600, 600]]"),
         'link "rocker" (link[2]).outline: crosses none of the pins "C", "B"',
     ),
     (
-        HEAD + GROUND + PINS + LINKS + '[[slot]]\npin = "B"\nalong = ["O", "C"]',
+        drawn(end='[[slot]]\npin = "B"\nalong = ["O", "C"]'),
         'slot "slot1" (slot[0]).pin: "B" is 50 m off the line through "O" and "C"',
     ),
 ]
