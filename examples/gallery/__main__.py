@@ -1,4 +1,4 @@
-"""Make the gallery: players (.html, with one player.js), pictures of motions and plots (.png), and a page of them all.
+"""Make the gallery: players (.html, with one player.js), pictures of motions and plots (.png), a film (.gif), and a page of them all.
 
     python -m examples.gallery [NAME ...] [--out docs/gallery]
 
@@ -51,6 +51,9 @@ def make(name: str, out: Path) -> dict:
             span = thing.data["end"] - thing.data["start"]
             moment = getattr(module, "MOMENT", MOMENT)
             picture = thing.save(out / f"{name}.png", thing.data["start"] + moment * span, width=WIDTH)
+        elif what == "film":
+            thing.save(out / f"{name}.gif", **module.FILM)
+            continue
         else:
             picture = out / f"{name}_{what}.png"
             thing.savefig(picture, dpi=DPI)

@@ -8,6 +8,7 @@ import numpy as np
 import udkjax as udk
 
 LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # what its page changes
+FILM = {"width": 400, "fps": 12.5, "speed": 0.35}  # of one turn
 
 
 def make():
@@ -30,7 +31,9 @@ def make():
         "largest torque of the motor (N m)": float(np.abs(udk.efforts(mech, sol)["motor"]).max()),
         "after a turn the coupler is where it was, within (m)": float(np.abs(sol.q[100, 1, :2] - sol.q[0, 1, :2]).max()),
     }
-    return facts, {"motion": udk.animate(mech, sol, traces=["P"], live=LIVE)}
+    turn = udk.simulate(mech, np.linspace(0.0, 1.0, 101))
+    film = udk.animate(mech, turn, traces=["A", "B", "P"], measures=())
+    return facts, {"motion": udk.animate(mech, sol, traces=["P"], live=LIVE), "film": film}
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ def test_a_gif_moves_as_long_as_the_run(animation, tmp_path):
         film.seek(10)
         later = np.asarray(film.convert("RGB"), float)
     assert np.abs(first - later).max() > 50
+    assert (later[0] == 255).all()  # the ground is as white as the page that the film is on
     with pytest.raises(ValueError, match="more than 1500: give a higher speed"):
         animation.save(tmp_path / "motion.gif", speed=0.001)
 

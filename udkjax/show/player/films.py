@@ -15,6 +15,7 @@ with OptionalImport():
 
 SMOOTH = 3  # times: a picture of pixels is drawn so much larger, and made smaller
 MOST_FRAMES = 1500  # of a film
+SAME_COLOUR = 8  # of 255: what a nearest colour of a palette is off by
 GIF_TICK = 0.01  # s: what a GIF counts the time of a frame in
 
 
@@ -68,9 +69,18 @@ def save_gif(
     """Write the motion as a GIF that repeats for ever. It counts in hundredths of a second: fps is 100 over a whole number."""
     tick = max(2, round(1 / fps / GIF_TICK))  # browsers slow down what is faster
     times = film_times(animation, 1 / (tick * GIF_TICK), speed)
-    palette = image(animation, times[0], width, theme).quantize(64)  # one for all frames, so that nothing flickers
+    palette = _palette(image(animation, times[0], width, theme))  # one for all frames, so that nothing flickers
     frames = [image(animation, t, width, theme).quantize(palette=palette, dither=Image.Dither.NONE) for t in times]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=10 * tick, loop=0, optimize=True)
+
+
+def _palette(picture: Image.Image) -> Image.Image:
+    """Return a picture in the few colours that it has. Those that one takes for its ground are exactly that."""
+    found = picture.quantize(64)
+    colours, back = np.reshape(found.getpalette(), (-1, 3)), np.array(picture.getpixel((0, 0)))
+    colours[np.abs(colours - back).max(axis=1) <= SAME_COLOUR] = back
+    found.putpalette(colours.ravel().tolist())
+    return found
 
 
 def save_mp4(

@@ -68,11 +68,14 @@ export class Player {
         oninput: () => { this.amplitude = +range.value; this.draw(); }});
       groups.push(make("label", {class: "amplitude"}, "amplitude", range));
     }
-    this.root = make("div", {class: "player", tabindex: -1, onkeydown: event => this.key(event)},
+    this.root = make("div", {class: "player", tabindex: -1},
       make("header", {}, make("h1", {title: data.title}, data.title),
         button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
         button("?", "keys", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+    this.keys = this.options.fill ? window : this.root;  // a page is nothing else
+    this.onKey = event => this.key(event);
+    this.keys.addEventListener("keydown", this.onKey);
     keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
     shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
@@ -217,7 +220,8 @@ export class Player {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.composedPath()[0].tagName) && event.composedPath()[0] !== this.scrub) return;
+    const [target] = event.composedPath();
+    if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(target.tagName) && target !== this.scrub) return;
     const {start, end} = this.data, step = event.shiftKey ? (end - start) / 20 : this.speed / 30;
     const speeds = [...this.speedSelect.options].map(o => +o.value), at = speeds.indexOf(this.speed);
     const actions = {
@@ -228,7 +232,7 @@ export class Player {
       d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), Escape: () => { this.help.hidden = true; },
     };
     const action = actions[event.key] ?? actions[event.key.toLowerCase()];
-    if (!action || (event.key === " " && event.target.tagName === "BUTTON")) return;  // a button takes the space bar itself
+    if (!action || (event.key === " " && ["BUTTON", "SUMMARY"].includes(target.tagName))) return;  // a button takes the space bar itself
     event.preventDefault();
     action();
   }
@@ -307,6 +311,7 @@ export class Player {
   destroy() {
     this.pause();
     this.resize.disconnect();
+    this.keys.removeEventListener("keydown", this.onKey);
     this.media.removeEventListener("change", this.onMedia);
     this.root.remove();
   }
