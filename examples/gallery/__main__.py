@@ -1,4 +1,4 @@
-"""Make the gallery: players (.html, with one player.js), pictures of motions and plots (.png), a film (.gif), and a page of them all.
+"""Make the gallery: players (.html, with one player.js), pictures (.png), a film (.gif), and a page of them all.
 
     python -m examples.gallery [NAME ...] [--out docs/gallery]
 

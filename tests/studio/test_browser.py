@@ -205,19 +205,21 @@ def test_a_pin_in_a_slot_of_a_link_is_drawn_and_held_by_its_motor(studio):
 
 @pytest.mark.slow
 def test_the_six_bar_of_seven_pins_is_drawn(studio):
-    studio.link((40, 100), (60, 130))
+    places = {"O2": (0, 0), "A": (30, 40), "B": (160, 110), "C": (110, 160), "O4": (180, 0), "D": (250, 150), "O6": (250, 20)}
+    studio.link(places["O2"], places["A"])
     studio.tool("a")
-    for place in ((60, 130), (140, 170), (110, 210), (60, 130)):
-        studio.click(*place)
-    for ends in (((160, 100), (140, 170)), ((110, 210), (210, 190)), ((210, 100), (210, 190))):
-        studio.link(*ends)
+    for pin in "ABCA":
+        studio.click(*places[pin])
+    for ends in (("O4", "B"), ("C", "D"), ("O6", "D")):
+        studio.link(*(places[pin] for pin in ends))
     studio.tool("g")
-    for x in (40, 160, 210):
-        studio.click(x, 100)
+    for pin in ("O2", "O4", "O6"):
+        studio.click(*places[pin])
     studio.tool("m")
-    studio.click(40, 100)
+    studio.click(*places["O2"])
     studio.settle()
-    assert len(studio.document["pins"]) == 7 and len(studio.document["link"]) == 5
+    assert sorted(map(tuple, studio.document["pins"].values())) == sorted(places.values())
+    assert len(studio.document["link"]) == 5
     assert "motor1 moves all of it" in studio.findings
     assert_moves_as_simulated(studio, studio.js("studio.state.text"))
 

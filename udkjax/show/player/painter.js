@@ -16,6 +16,7 @@ export const THEMES = {
   },
 };
 
+const FORCES = [[1e6, "MN"], [1e3, "kN"], [1, "N"], [1e-3, "mN"]];
 const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
 
 const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
@@ -39,6 +40,18 @@ export function readable(colour, {back, panel, ink}) {
 /** A colour on the way to another one: t from 0 to 1. */
 export function mix(one, two, t) {
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
+}
+
+/** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
+export function contextOf(canvas) {
+  const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+  const wide = Math.round(width * ratio), high = Math.round(height * ratio);
+  if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  context.lineCap = context.lineJoin = "round";
+  return {context, width, height};
 }
 
 /** Draws at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
@@ -174,7 +187,8 @@ export class Painter {
       const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
       if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
     });
-    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
+    const told = nice(usual / 2), [unit, name] = FORCES.find(([unit]) => told >= unit) ?? FORCES.at(-1);
+    const y = height - 14, words = `${short(told / unit)} ${name}${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
     this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
     const end = width - 14 - this.context.measureText(words).width - 7;
     this.arrow([end - length * told / usual, y], [end, y], colour);

@@ -3,7 +3,7 @@
 import {HELP, LIVE_HELP, SPEEDS, button, icon, keepKeys, make} from "./elements.js";
 import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
-import {THEMES} from "./painter.js";
+import {THEMES, contextOf} from "./painter.js";
 import {followPointers} from "./pointers.js";
 import {drawStrip, stripPart} from "./strip.js";
 import {LIVE_STYLE} from "./sliders.js";
@@ -252,18 +252,6 @@ export class Player {
     this.draw();
   }
 
-  /** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
-  context(canvas) {
-    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-    const wide = Math.round(width * ratio), high = Math.round(height * ratio);
-    if (canvas.width !== wide || canvas.height !== high) { canvas.width = wide; canvas.height = high; }
-    const context = canvas.getContext("2d");
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
-    context.lineCap = context.lineJoin = "round";
-    return {context, width, height};
-  }
-
   /** Pixels of a place in metres in a panel: x + scale X, y - scale Y. */
   view(width, height) {
     const [left, bottom, right, top] = this.data.bounds;
@@ -284,7 +272,7 @@ export class Player {
     const {data, t, theme, show} = this;
     this.panels.forEach(({run, canvas}, k) => {
       const live = this.live?.runs[k];
-      const {context, width, height} = this.context(canvas);
+      const {context, width, height} = contextOf(canvas);
       if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
       live?.paintGhost(painter, context, t);
@@ -297,7 +285,7 @@ export class Player {
       painter.bar(step, height);
     });
     if (this.stripCanvas) {
-      const {context, width, height} = this.context(this.stripCanvas);
+      const {context, width, height} = contextOf(this.stripCanvas);
       drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);
     }
     const span = data.end - data.start;

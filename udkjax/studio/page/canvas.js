@@ -5,7 +5,7 @@ import {middle, symbolsOf} from "./drawn_symbols.js";
 import {Labels, aroundPin, besideBar, within} from "./labels.js";
 import {carry} from "./mover.js";
 import {linkShape} from "./shapes.js";
-import {THEMES} from "./player/painter.js";
+import {THEMES, contextOf} from "./player/painter.js";
 import {SymbolPainter} from "./player/symbols.js";
 import {angleUnit, lengthUnit, shown} from "./units.js";
 import {toPixels} from "./view.js";
@@ -21,16 +21,6 @@ export class DrawingCanvas {
 
   get width() { return this.element.clientWidth; }
   get height() { return this.element.clientHeight; }
-
-  context() {
-    const ratio = window.devicePixelRatio || 1, wide = Math.round(this.width * ratio), high = Math.round(this.height * ratio);
-    if (this.element.width !== wide || this.element.height !== high) [this.element.width, this.element.height] = [wide, high];
-    const context = this.element.getContext("2d");
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, this.width, this.height);
-    context.lineCap = context.lineJoin = "round";
-    return context;
-  }
 
   /** The link that carries a pin, or -1 for the ground. */
   carrier(document, pin) {
@@ -57,7 +47,7 @@ export class DrawingCanvas {
     this.studio = studio;
     const {document, view, motions} = studio, {width, height} = this;
     if (!width || !height) return;
-    const theme = THEMES[studio.theme], painter = new SymbolPainter(this.context(), view, theme, 1, motions);
+    const theme = THEMES[studio.theme], painter = new SymbolPainter(contextOf(this.element).context, view, theme, 1, motions);
     this.painter = painter;
     if (studio.picture) this.picture(studio.picture, view);
     if (studio.show.grid) studio.gridStep = painter.grid(width, height);

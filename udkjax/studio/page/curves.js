@@ -7,7 +7,7 @@ import {carry} from "./mover.js";
 import {lengthName, lengthUnit} from "./units.js";
 import {button, make} from "./player/elements.js";
 import {interval} from "./player/motion.js";
-import {Painter, THEMES} from "./player/painter.js";
+import {Painter, THEMES, contextOf} from "./player/painter.js";
 import {drawStrip, stripPart} from "./player/strip.js";
 
 const ROUNDING = 1e-10;  // of the scale of a quantity
@@ -183,13 +183,11 @@ export class CurvesPanel {
   }
 
   draw() {
-    const {studio, canvas} = this, {motion} = studio, width = canvas.clientWidth, height = canvas.clientHeight, ratio = window.devicePixelRatio || 1;
-    if (!width || !height) return;
+    const {studio, canvas} = this, {motion} = studio;
+    if (!canvas.clientWidth || !canvas.clientHeight) return undefined;
     if (this.names().join() !== this.listed) this.list();
     this.showBar();
-    [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
-    const context = canvas.getContext("2d"), theme = THEMES[studio.theme];
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const {context, width, height} = contextOf(canvas), theme = THEMES[studio.theme];
     if (!this.name || !motion.run || motion.run.count < 2) return this.drawNothing(context, theme, width, height);
     const key = [this.name, this.panel, motion.run, this.served[this.panel]];
     if (!this.cache || key.some((x, k) => x !== this.cache.key[k])) this.cache = {key, curve: this.values(this.name)};

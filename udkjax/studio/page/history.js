@@ -22,9 +22,6 @@ export class History {
     return true;
   }
 
-  /** Put another state in place of this one, where it says more of the same. */
-  amend(state) { this.states[this.at] = state; }
-
   undo() { if (this.canUndo) this.at--; return this.state; }
   redo() { if (this.canRedo) this.at++; return this.state; }
 }

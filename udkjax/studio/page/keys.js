@@ -10,8 +10,9 @@ const typing = target => ["INPUT", "TEXTAREA", "SELECT"].includes(target.tagName
 export function followKeys(studio) {
   window.addEventListener("keydown", event => {
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, command = event.ctrlKey || event.metaKey;
-    const action = command ? commands(studio, event)[key] : plain(studio)[key];
-    if (!action || event.altKey || document.querySelector("dialog[open]")) return;
+    const isNew = event.altKey && event.code === "KeyN";  // for browsers that keep Ctrl+N to themselves
+    const action = isNew ? () => studio.files.startNew() : command ? commands(studio, event)[key] : plain(studio)[key];
+    if (!action || (event.altKey && !isNew) || document.querySelector("dialog[open]")) return;
     if (typing(event.target) && !(command && "sno".includes(key))) return;
     if (key === " " && event.target.tagName === "BUTTON") return;  // a button takes the space bar itself
     event.preventDefault();
@@ -41,7 +42,7 @@ const plain = studio => ({
   Home: () => studio.rewind(),
   " ": () => studio.motion.toggle(),
   f: () => studio.fit(),
-  "?": () => studio.parts.help.showModal(),
+  "?": () => studio.showHelp(),
   ...Object.fromEntries(TOOLS.map(tool => [tool.key, () => studio.setTool(tool.name)])),
 });
 

@@ -27,7 +27,7 @@ export function buildPage(studio, root) {
     button("Save", "save (Ctrl+S)", () => studio.files.save(false)), button("Export", "export as page, picture, film, table or script", () => studio.files.showExport()));
   const header = make("header", {}, parts.title, files, make("div", {class: "group"}, parts.undo, parts.redo,
     button(svgIcon(ICONS.fit), "fit (F)", () => studio.fit(), "icon")), make("div", {class: "group end"},
-    button(icon("theme"), "dark or light", () => studio.switchTheme(), "icon"), button("?", "keys (?)", () => parts.help.showModal(), "icon")));
+    button(icon("theme"), "dark or light", () => studio.switchTheme(), "icon"), button("?", "keys (?)", () => studio.showHelp(), "icon")));
   parts.tools = TOOLS.map(tool => {
     const found = button(make("span", {}, tool.name), `${tool.title} (${tool.key.toUpperCase()})`, () => studio.setTool(tool.name), "tool");
     found.dataset.tool = tool.name;

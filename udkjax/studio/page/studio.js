@@ -137,6 +137,11 @@ class Studio {
     this.parts.status.classList.toggle("bad", isBad);
   }
 
+  showHelp() {
+    this.parts.help.showModal();
+    this.parts.help.scrollTop = 0;  // not at the button, which takes the focus
+  }
+
   // The view
 
   setView(view, isFitted = false) {

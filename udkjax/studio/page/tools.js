@@ -27,7 +27,7 @@ const SCALE = {name: "scale", title: "Bring the picture to scale: drag between t
 export const toolOf = name => (name === "scale" ? SCALE : TOOLS.find(tool => tool.name === name));
 
 export const KEYS = [
-  ["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["Ctrl N, Ctrl O, Ctrl S", "new, open, save"], ["Ctrl D", "duplicate"], ["Delete", "delete"],
+  ["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["Ctrl N or Alt N", "new"], ["Ctrl O, Ctrl S", "open, save"], ["Ctrl D", "duplicate"], ["Delete", "delete"],
   ["F", "fit"], ["Esc", "leave the tool"], ["Space", "play, pause"], ["Home", "as drawn"], ["Arrows", "move what is selected, or through time"], ["Wheel", "zoom"], ["Drag the ground", "pan"],
   ["Shift drag", "select an area"], ["Alt", "no snapping"], ["Drop a pin on a pin", "merge"],
   ...TOOLS.map(tool => [tool.key.toUpperCase(), tool.title]),
