@@ -167,6 +167,7 @@ const THEMES = {
   },
 };
 
+const FORCES = [[1e6, "MN"], [1e3, "kN"], [1, "N"], [1e-3, "mN"]];
 const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
 
 const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
@@ -190,6 +191,18 @@ function readable(colour, {back, panel, ink}) {
 /** A colour on the way to another one: t from 0 to 1. */
 function mix(one, two, t) {
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
+}
+
+/** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
+function contextOf(canvas) {
+  const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+  const wide = Math.round(width * ratio), high = Math.round(height * ratio);
+  if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  context.lineCap = context.lineJoin = "round";
+  return {context, width, height};
 }
 
 /** Draws at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
@@ -325,7 +338,8 @@ class Painter {
       const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
       if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
     });
-    const told = nice(usual / 2), y = height - 14, words = `${short(told)} N${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
+    const told = nice(usual / 2), [unit, name] = FORCES.find(([unit]) => told >= unit) ?? FORCES.at(-1);
+    const y = height - 14, words = `${short(told / unit)} ${name}${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
     this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
     const end = width - 14 - this.context.measureText(words).width - 7;
     this.arrow([end - length * told / usual, y], [end, y], colour);
@@ -587,6 +601,7 @@ function followPointers(player, canvas, liveRun) {
   let moved = 0, hand = null;  // the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   canvas.addEventListener("pointerdown", event => {
+    if (event.button > 1) return;
     canvas.setPointerCapture(event.pointerId);
     down.set(event.pointerId, point(event));
     moved = 0;
@@ -1506,11 +1521,14 @@ class Player {
         oninput: () => { this.amplitude = +range.value; this.draw(); }});
       groups.push(make("label", {class: "amplitude"}, "amplitude", range));
     }
-    this.root = make("div", {class: "player", tabindex: -1, onkeydown: event => this.key(event)},
+    this.root = make("div", {class: "player", tabindex: -1},
       make("header", {}, make("h1", {title: data.title}, data.title),
         button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
         button("?", "keys", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
+    this.keys = this.options.fill ? window : this.root;  // a page is nothing else
+    this.onKey = event => this.key(event);
+    this.keys.addEventListener("keydown", this.onKey);
     keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
     shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
@@ -1655,7 +1673,8 @@ class Player {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.composedPath()[0].tagName) && event.composedPath()[0] !== this.scrub) return;
+    const [target] = event.composedPath();
+    if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(target.tagName) && target !== this.scrub) return;
     const {start, end} = this.data, step = event.shiftKey ? (end - start) / 20 : this.speed / 30;
     const speeds = [...this.speedSelect.options].map(o => +o.value), at = speeds.indexOf(this.speed);
     const actions = {
@@ -1666,7 +1685,7 @@ class Player {
       d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), Escape: () => { this.help.hidden = true; },
     };
     const action = actions[event.key] ?? actions[event.key.toLowerCase()];
-    if (!action || (event.key === " " && event.target.tagName === "BUTTON")) return;  // a button takes the space bar itself
+    if (!action || (event.key === " " && ["BUTTON", "SUMMARY"].includes(target.tagName))) return;  // a button takes the space bar itself
     event.preventDefault();
     action();
   }
@@ -1684,18 +1703,6 @@ class Player {
       this.stage.style.height = `${Math.round(narrow ? height * this.runs.length : height)}px`;
     }
     this.draw();
-  }
-
-  /** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
-  context(canvas) {
-    const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-    const wide = Math.round(width * ratio), high = Math.round(height * ratio);
-    if (canvas.width !== wide || canvas.height !== high) { canvas.width = wide; canvas.height = high; }
-    const context = canvas.getContext("2d");
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
-    context.lineCap = context.lineJoin = "round";
-    return {context, width, height};
   }
 
   /** Pixels of a place in metres in a panel: x + scale X, y - scale Y. */
@@ -1718,7 +1725,7 @@ class Player {
     const {data, t, theme, show} = this;
     this.panels.forEach(({run, canvas}, k) => {
       const live = this.live?.runs[k];
-      const {context, width, height} = this.context(canvas);
+      const {context, width, height} = contextOf(canvas);
       if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
       live?.paintGhost(painter, context, t);
@@ -1731,7 +1738,7 @@ class Player {
       painter.bar(step, height);
     });
     if (this.stripCanvas) {
-      const {context, width, height} = this.context(this.stripCanvas);
+      const {context, width, height} = contextOf(this.stripCanvas);
       drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);
     }
     const span = data.end - data.start;
@@ -1745,6 +1752,7 @@ class Player {
   destroy() {
     this.pause();
     this.resize.disconnect();
+    this.keys.removeEventListener("keydown", this.onKey);
     this.media.removeEventListener("change", this.onMedia);
     this.root.remove();
   }

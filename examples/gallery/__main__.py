@@ -52,7 +52,7 @@ def make(name: str, out: Path) -> dict:
             moment = getattr(module, "MOMENT", MOMENT)
             picture = thing.save(out / f"{name}.png", thing.data["start"] + moment * span, width=WIDTH)
         elif what == "film":
-            thing.save(out / f"{name}.gif", **module.FILM)
+            thing.save(out / f"{name}.gif", **getattr(module, "FILM", {}))
             continue
         else:
             picture = out / f"{name}_{what}.png"
