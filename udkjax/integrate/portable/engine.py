@@ -33,7 +33,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import units_of
 
 Json = dict[str, Any]
-MAX_STEPS = 20_000  # of a run in a page: beyond, it would not answer for seconds
+STEPS_OF_A_PAGE = 20_000  # of a run in it: beyond, it would not answer for seconds
 
 
 class PortableEngine(NamedTuple):
@@ -150,7 +150,7 @@ def _places(mechanism: Mechanism, pull: bool) -> Json:
 def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float) -> Problem:
     """Return a run that stands for all: its times and its state are replaced in the page."""
     choices = Choices(rtol=rtol, atol=atol, drift_tol=DRIFT_PROJECTED, dt0=None, method=AUTO, stabilization=Projection())
-    choices = choices._replace(max_steps=MAX_STEPS)
+    choices = choices._replace(max_steps=STEPS_OF_A_PAGE)
     compiled = compile_known(mechanism, analysis, *choices.of_mechanism)
     start = State(mechanism.q0, mechanism.v0)
     problem = prepare_run(compiled, analysis, np.array([0.0, 1.0]), start, None, choices, np).problem

@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.solvers.divided_differences import HIGHEST, DifferenceInterpolation, StepCoefficients, step_coefficients
 from udkjax.integrate.solvers.multistep import (
+    LOST_STEP,
+    STRICTER,
     Flag,
     Multistep,
     Scalar,
@@ -40,11 +42,9 @@ LARGEST = 2.0
 HALF = 0.5
 # Not of a published code. With these an error made of many steps is a few times the tolerance, and takes no more right-hand sides
 # than STEP or VODE (tests/integrate/test_adams.py).
-STRICTER = 8.0  # than the tolerance: the errors of its many short steps add up
 SHARE = 0.25  # of the tolerance: the error that the next step is chosen for; STEP, whose steps only halve or double, has 0.5
 RUNGS = 4.0  # a step changes by powers of 2^(1/4): the factor does not follow the rounding errors in an estimate
 SMALLEST = 0.25  # factor of a step; STEP halves once or twice
-LOST = 0.05  # a step that so small a part of the one planned has to replace begins again with order one: there was a jump
 NEGLIGIBLE = 1e-4  # relative to the tolerance: estimates below are of rounding errors, and say nothing about the order
 EVEN = 1e-2  # relative: two steps that differ by less count as of one size
 # Of rounding.
@@ -249,7 +249,7 @@ class Adams(Multistep):
         value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
         calls = state.evaluations + stale
         updated = eqx.tree_at(lambda s: (s.phi, s.evaluations), state, (state.phi + (value - state.phi[0]), calls))
-        lost = (h < LOST * state.control.step) | made_jump
+        lost = (h < LOST_STEP * state.control.step) | made_jump
         return jax.tree.map(lambda a, b: jnp.where(lost, a, b), self._begin(h, y, value, calls), updated), displaced
 
     def _correct(

@@ -14,6 +14,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.solvers import newton
 from udkjax.integrate.solvers.multistep import (
+    LOST_STEP,
+    STRICTER,
     Flag,
     Multistep,
     Scalar,
@@ -38,12 +40,10 @@ NO_DIVISION_BY_ZERO = 1e-6  # ADDON
 # BIAS2, BIAS3: 6, 6, 10), beyond STRICTER; and the part of the error that an iteration may leave (CORTES: 0.1). In brackets are
 # VODE's own numbers. With these an error made of many steps is a few times the tolerance, and the same error takes no more
 # right-hand sides than VODE (tests/integrate/test_bdf.py).
-STRICTER = 8.0
 LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
 # Not of a published code.
 BETTER = 1.1  # another order allows a step larger by this factor, or it is not taken
-LOST = 0.05  # what replaces so small a part of the step planned is of order one: there has been a jump
 REPEATED = 1e-3  # relative: a step that is so much smaller than planned was rejected before
 
 
@@ -161,7 +161,7 @@ class BDF(Multistep):
         tolerances, h = stop_gradients(self.root_finder), t1 - t0
         state = self._history(terms, t0, t1, y0, args, solver_state, made_jump)
         retried = h < (1 - REPEATED) * state.planned
-        k = jnp.where(h < LOST * state.planned, 1, state.order)
+        k = jnp.where(h < LOST_STEP * state.planned, 1, state.order)
 
         psi = t1 - state.times  # p and its derivative at t1, from the first k + 1 rows
         parts = _weights(state.times, t1)[:, None] * state.phi
