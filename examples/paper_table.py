@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import udkjax as udk
-from udkjax.study import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 TOLERANCES = (1e-10, 1e-8, 1e-6)
 METHODS = (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt)

@@ -6,7 +6,7 @@ from udkjax.extras import OptionalImport
 from udkjax.scene import loads
 from udkjax.show.plots import draw_motion
 from udkjax.show.style import COLOURS
-from udkjax.study import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 with OptionalImport():
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import root_scalar
 
 import udkjax as udk
-from udkjax.study import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 TS = np.linspace(0.0, 20.0, 401)
 COARSE = np.linspace(0.0, 20.0, 41)

@@ -12,8 +12,7 @@ import udkjax as udk
 from udkjax.equations import equations_of
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.diffrax_engine import derivative
-from udkjax.study import exact_coordinates
-from udkjax.study.accuracy import pendulum
+from udkjax.study.accuracy import exact_coordinates, pendulum
 
 FORMULATIONS = {
     "Augmented": udk.Augmented(),

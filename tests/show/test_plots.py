@@ -15,7 +15,7 @@ from udkjax.integrate import Result, Solution
 from udkjax.show import plots
 from udkjax.show.plots import attachments, farthest_instants, outline, to_ground, trajectory
 from udkjax.show.style import COLOURS
-from udkjax.study import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 
 def solution(mech, q, v=None, code=Result.successful):

@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.integrate import Result, Solution
 from udkjax.show.summary import trust
-from udkjax.study import exact_coordinates
-from udkjax.study.accuracy import accuracy, conserves_energy, largest_violation
+from udkjax.study.accuracy import accuracy, conserves_energy, exact_coordinates, largest_violation
 
 
 def solution(mech, ts, q, v) -> Solution:

@@ -32,7 +32,7 @@ COMMANDS = (
     "doctor",
 )
 
-
+GARBAGE_EVERY = 50_000  # objects: most that a command makes are there to stay, and looking them through takes a tenth of a second
 PROGRAM_CACHE_BYTES = 200_000_000  # bytes of programs of JAX; those that were used longest ago make room
 
 
@@ -40,6 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run one command; exit with one of the codes of `udkjax.cli.exits`."""
     # At its end Python would look for garbage among all that JAX has made, for a third of a second.
     atexit.register(gc.freeze)
+    gc.set_threshold(GARBAGE_EVERY)
     if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
         print(f"udkjax {version('udkjax')}")
         return

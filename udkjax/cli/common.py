@@ -59,11 +59,10 @@ def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[s
 def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> tuple["Mechanism", str]:
     """Read a scene and its text; the options are those of `read_mjcf`."""
     import udkjax as udk
-    from udkjax.scene import MjcfWarning
 
     try:
         with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", MjcfWarning)
+            warnings.simplefilter("always", UserWarning)  # as is an `MjcfWarning`
             mechanism = udk.read_mjcf(scene, leave_out, key) if leave_out or key is not None else udk.load(scene)
         for warning in caught:
             say(f"{scene}: {warning.message}")

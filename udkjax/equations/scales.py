@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, numbers_as_vector
-from udkjax.printing import PrintsTable, units
+from udkjax.printing import prints_table, units
 from udkjax.scene.fields import ROUNDING, library_for, number
 from udkjax.scene.mechanism import Mechanism
 
@@ -36,7 +36,8 @@ class GuessTerms(NamedTuple):
     gamma: NumericArray
 
 
-class Scales(PrintsTable):
+@prints_table
+class Scales(NamedTuple):
     """The units of lengths, rates, masses and rows of Psi; arrays without derivatives."""
 
     length: Float[Array, ""]  # m

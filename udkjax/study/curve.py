@@ -1,9 +1,9 @@
 """The positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value: X = (q, s)."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -22,12 +22,12 @@ NEWTON_STEPS = 8  # corrections; three are usual
 _Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
 
 
-class AbstractCurve(eqx.Module):
+class AbstractCurve(ABC):
     """The positions of a driven mechanism, as a curve in scaled coordinates and value."""
 
-    weights: eqx.AbstractVar[Any]  # of the rows
-    units: eqx.AbstractVar[Any]  # of coordinates and value
-    rows: eqx.AbstractVar[Any]  # the scales of the rows
+    weights: Any  # of the rows
+    units: Any  # of coordinates and value
+    rows: Any  # the scales of the rows
 
     by: ClassVar[ControlFlow]
 
@@ -97,6 +97,8 @@ class AbstractCurve(eqx.Module):
         return dq, W * (inverse @ (w * self.gamma(s, q, dq))), inverse.rank
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Curve(AbstractCurve):
     """The positions of a mechanism whose numbers may be traced."""
 
@@ -128,10 +130,11 @@ class Curve(AbstractCurve):
         return gamma(self.mechanism, s, q, v)
 
 
+@dataclass(frozen=True)
 class KnownCurve(AbstractCurve):
     """The positions of a mechanism of known numbers, by NumPy on the scene's programs: nothing is compiled for them."""
 
-    terms: DenseTerms = eqx.field(static=True)
+    terms: DenseTerms
     weights: Float[np.ndarray, "m"]
     units: Float[np.ndarray, "n+1"]
     rows: Float[np.ndarray, "m"]

@@ -6,7 +6,7 @@ import pytest
 import udkjax as udk
 from experiments.paper import vode
 from udkjax.integrate import Result
-from udkjax.study import exact_coordinates
+from udkjax.study.accuracy import exact_coordinates
 
 
 @pytest.fixture(scope="module")
