@@ -68,7 +68,7 @@ def compilations():
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     mechanism = udk.library.parallelogram()
-    for _ in range(100):  # from some call on the numbers of a run are put by one program
+    for _ in range(100):  # from some call on the arrays of a run are put by one program
         udk.simulate(mechanism, [0.0, 0.1])
 
     def during(run) -> list[float]:

@@ -1,6 +1,6 @@
 """Decisions on a mechanism before it runs: its equations, and the operation of machine code, or why there is none."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -51,7 +51,9 @@ class RunPlan:
         return not self.why_not_native
 
 
-class CompiledMechanism(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class CompiledMechanism:
     """A mechanism as runs take it, whatever their times, states and tolerances: found once, and handed down.
 
     The arrays of the equations and the breakpoints may be traced or batched.
@@ -59,7 +61,7 @@ class CompiledMechanism(eqx.Module):
 
     equations: AbstractSystem
     breakpoints: Float[Array, "k"] | None  # the times where the motion is not smooth, in any order; None: it is
-    plan: RunPlan = eqx.field(static=True)
+    plan: RunPlan = field(metadata={"static": True})
 
     @property
     def samples(self) -> SampleRows:

@@ -1,8 +1,9 @@
 """The input and the output of an integrator: the same for all of them."""
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -13,7 +14,9 @@ from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.gradients import stop_gradients
 
 
-class Problem(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Problem:
     """An initial value problem: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""
 
     compiled: CompiledMechanism
@@ -29,7 +32,9 @@ class Problem(eqx.Module):
     rate: Float[Array, ""]  # of the system and the run (1/s)
     max_steps: Int[ArrayLike, ""]
     marks: Float[Array, "m"] | None = None  # of rows of Psi: one for those that are independent; None: machine code knows them
-    points: int | None = eqx.field(static=True, default=None)  # that a record for reverse mode has room for; None: by breakpoints
+    points: int | None = field(
+        default=None, metadata={"static": True}
+    )  # that a record for reverse mode has room for; None: by breakpoints
 
     @property
     def equations(self) -> AbstractSystem:

@@ -1,8 +1,8 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
 import warnings
+from collections import Counter
 from collections.abc import Sequence
-from itertools import count
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -167,14 +167,14 @@ def simulate(
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
 
     solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices)
-    if isinstance(solution.code, Tracer) or not isinstance(mechanism, Mechanism):
+    if not isinstance(mechanism, Mechanism) or not is_known or isinstance(solution.code, Tracer):
         return _required(solution, throw)
-    if missed and is_known:
+    if missed:
         analysis = analyse(mechanism)  # what was given was of other numbers, in which a row depended
         solution, _, end = _run(mechanism, analysis, ts, state, closure, choices)
-    if is_known and _has_failed(solution):
-        solution = explained(solution, mechanism, analysis, choices.drift_tol, solver, end)
-    return _required(solution, throw)
+    if _has_failed(solution):
+        return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
+    return solution
 
 
 def _has_failed(solution: Solution) -> bool:
@@ -248,10 +248,9 @@ def _finish(
     q, v = [xp.where(reached[:, None], y, xp.nan).reshape(-1, *run.state_shape) for y in (q, v)]
     stats = counts(raw, problem.compiled.plan.projected, len(ts), xp)
     rtol, atol = xp.asarray(choices.rtol, float), xp.asarray(choices.atol, float)
-    arrays, numbers = (ts, q, v), (code, time, stats, rtol, atol)
     if xp is np:
-        arrays, numbers = jax.device_put(arrays), _put_numbers(numbers)
-    (ts, q, v), (code, time, stats, rtol, atol), names = arrays, numbers, choices.settings(problem.compiled.plan.why_not_native)
+        ts, q, v, code, time, stats, rtol, atol = _put((ts, q, v, code, time, stats, rtol, atol))
+    names = choices.settings(problem.compiled.plan.why_not_native)
     solution = make_module(
         Solution,
         ts=ts,
@@ -270,16 +269,17 @@ def _finish(
     return solution, run.has_missed_rows, (raw.t, raw.y)
 
 
-_put_together = jax.jit(lambda *numbers: numbers)
-_WORTH_A_PROGRAM = 60  # calls: putting numbers one by one takes 0.2 ms longer than by a program, which takes 15 ms to compile
-_puts = count()
+_put_together = jax.jit(lambda *arrays: arrays)
+_WORTH_A_PROGRAM = 60  # calls: putting arrays one by one takes 0.3 ms longer than by a program, which takes 15 ms to compile
+_calls: Counter[tuple[int, ...]] = Counter()  # by shape of the positions
 
 
-def _put_numbers(numbers: Any) -> Any:
-    """Return numbers as those of JAX."""
-    if next(_puts) < _WORTH_A_PROGRAM:
-        return jax.device_put(numbers)
-    leaves, tree = jax.tree.flatten(numbers)
+def _put(arrays: Any) -> Any:
+    """Return arrays of NumPy, and numbers, as those of JAX."""
+    leaves, tree = jax.tree.flatten(arrays)
+    _calls[shape := np.shape(arrays[1])] += 1
+    if _calls[shape] <= _WORTH_A_PROGRAM:
+        return jax.device_put(arrays)
     return jax.tree.unflatten(tree, _put_together(*leaves))
 
 

@@ -8,7 +8,7 @@ data.
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
-from inspect import isclass, signature
+from inspect import Parameter, isclass, signature
 from types import UnionType
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
@@ -44,21 +44,42 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
         The same function. Raises `TypeError` where an argument is of a wrong type, `ValueError` where it is of a wrong shape or
         value; the message names the argument, what was given and what is meant.
     """
-    parameters, checks = signature(function), _checks_of(function)
+    bind, checks = _binder(function), _checks_of(function)
 
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        bound = parameters.bind(*args, **kwargs)
-        given = frozenset(bound.arguments)  # defaults are right
-        bound.apply_defaults()
+        given, bound = bind(args, kwargs)
         for name, check, if_none in checks:
-            if name in given and (bound.arguments[name] is not None or if_none == "takes"):
-                check(name, bound.arguments[name], given=bound.arguments)
+            if name in given and (bound[name] is not None or if_none == "takes"):
+                check(name, bound[name], given=bound)
             elif name in given and if_none == "refuses":
                 raise ArgumentTypeError(f"{name} must be given, not None")
         return function(*args, **kwargs)
 
     return call
+
+
+def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str, Any]], tuple[Given, Given]]:
+    """Return what names the arguments of a call: those that are given, and all with their defaults."""
+    parameters = signature(function)
+    defaults = {name: p.default for name, p in parameters.parameters.items() if p.default is not p.empty}
+    kinds = {p.kind for p in parameters.parameters.values()}
+    names = [name for name, p in parameters.parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    required, plain = (
+        parameters.parameters.keys() - defaults.keys(),
+        kinds <= {Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY},
+    )
+
+    def bind(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Given, Given]:
+        given = dict(zip(names, args, strict=False)) | kwargs
+        bound = defaults | given
+        is_right = len(given) == len(args) + len(kwargs) and required <= given.keys() and len(bound) == len(parameters.parameters)
+        if not (plain and is_right):  # `bind` says what is wrong
+            given = parameters.bind(*args, **kwargs).arguments
+            bound = defaults | given
+        return given, bound
+
+    return bind
 
 
 def argument_problems(function: Callable[..., object], given: Given) -> list[str]:

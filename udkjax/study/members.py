@@ -4,10 +4,12 @@ A member has numbers of its own, and shares others with all. A program computes 
 is filled up with copies. So results do not depend on how many members there are, nor on how they are cut into chunks.
 """
 
+import hashlib
 import os
 import platform
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
@@ -59,7 +61,7 @@ class Program:
         """Return the executable, which is made once, for members such as these."""
         with self._lock:
             if self._compiled is None:
-                self._compiled = jax.jit(self._on_devices()).lower(shared, _rows(own, 0, self.size)).compile()
+                self._compiled = _compile(jax.jit(self._on_devices()).lower(shared, _rows(own, 0, self.size)), self.devices)
         return self._compiled
 
     def shapes(self, shared: PyTree, own: PyTree) -> tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]]:
@@ -94,6 +96,27 @@ class Program:
         mesh = Mesh(np.array(self.devices), ("members",), axis_types=(AxisType.Auto,))
         same, spread = PartitionSpec(), PartitionSpec("members")
         return jax.shard_map(self._compute, mesh=mesh, in_specs=(same, spread), out_specs=spread, check_vma=False)
+
+
+_EXECUTABLES: OrderedDict[Hashable, jax.stages.Compiled] = OrderedDict()  # the `MOST_PROGRAMS` that were asked for last
+
+
+def _compile(lowered: jax.stages.Lowered, devices: tuple[Any, ...]) -> jax.stages.Compiled:
+    """Return the executable of a program: one serves all studies that differ by the values of its arguments alone.
+
+    Programs are told by their text, but for those whose text does not hold all of them: functions of Python that they call, and
+    constants that JAX may keep beside them.
+    """
+    text = lowered.as_text()
+    if "callback" in text or getattr(jax.config, "jax_use_simplified_jaxpr_constants", False):
+        return lowered.compile()
+    key = hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, devices
+    found = _EXECUTABLES.get(key) or lowered.compile()
+    _EXECUTABLES[key] = found
+    _EXECUTABLES.move_to_end(key)
+    while len(_EXECUTABLES) > MOST_PROGRAMS:
+        _EXECUTABLES.popitem(last=False)
+    return found
 
 
 def _rows(own: T, first: int, count: int) -> T:

@@ -99,6 +99,17 @@ def test_what_is_not_finished_is_marked(plan, finished):
     assert np.isnan(part.q_end.values[part.result.values == NOT_COMPUTED]).all()
 
 
+def test_other_values_take_the_same_program(pendulum, compilations):
+    """What differs by more than the values of its axes takes another one: here other output times, which are constants of it."""
+    ends = lambda masses, ts: udk.sweep(pendulum, {"body.rod.mass": masses}, ts, progress=False).q_end.values  # noqa: E731
+    ends([1.0, 2.0], TS)
+    found = []
+    assert compilations(lambda: found.append(ends([3.0, 5.0], TS))) == []
+    members = [pendulum.with_parameters({"body.rod.mass": mass}) for mass in (3.0, 5.0)]
+    assert_allclose(found[0], [udk.simulate(member, TS).q[-1] for member in members], rtol=0, atol=1e-12)
+    assert_allclose(ends([3.0, 5.0], 0.5 * TS), [udk.simulate(member, 0.5 * TS).q[-1] for member in members], rtol=0, atol=1e-12)
+
+
 def test_copies_of_a_plan_share_its_program(plan, finished, compilations):
     copy = pickle.loads(pickle.dumps(plan))
     chunk = Chunk(0, 0, finished[0][0], 1.0)
