@@ -30,9 +30,7 @@ from udkjax.study.curve import Curve
 
 # Of the largest (s - s*) dq/dp beside it: a residue below that is of rounding, which E^+ multiplies by a hundred at most there.
 RESIDUE = 1e-6
-MOST_MEETINGS = (
-    8  # values of one call where branches meet: at others, derivatives by numbers that move the constraints are not numbers
-)
+MOST_MEETINGS = 8  # values of a call where branches meet: at others, derivatives by what moves the constraints are not numbers
 
 Rows = Float[Array, "T n"]
 Three = tuple[Rows, Rows, Rows]  # of q, q' and q''

@@ -38,9 +38,8 @@ from udkjax.study.channels import locate
 
 Record = Json
 Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
-PRECISION = (
-    1e-5  # of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand
-)
+# Of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand.
+PRECISION = 1e-5
 TIME_PRECISION = 1e-9  # of the timeline
 FORCE_PRECISION = 1e-3  # of the usual force
 USUAL_FORCE_QUANTILE = 0.95  # of the instants: at these no joint's force is larger than the usual one, which sets arrows' length

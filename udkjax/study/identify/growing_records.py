@@ -34,9 +34,8 @@ MOST_PARTS = 30  # even at the least growth they lead to two thousand times the 
 HUBER_LIMIT = 4.0  # standard deviations: on the way larger residuals count as by Huber's loss
 LOST_RATIO = 3.0  # times the root mean square of residuals of the part before: the larger part has led to another minimum
 SAME_BEGINNING_DISTANCE = 0.02  # of an unknown: fits of first parts this near lead to the same fit of the whole
-LEAST_USED_NOISE = (
-    1e-4  # of what a channel shows: less is not used of what is known, so that a model that lacks something still fits
-)
+# Of what a channel shows: less is not used of what is known, so that a model that lacks something still fits.
+LEAST_USED_NOISE = 1e-4
 
 Known: TypeAlias = list[tuple[np.ndarray, Fit]]
 
