@@ -15,3 +15,5 @@ from udkjax.scene.library.pendulums import compound_pendulum as compound_pendulu
 from udkjax.scene.library.pendulums import double_pendulum as double_pendulum
 from udkjax.scene.library.pendulums import driven_pendulum as driven_pendulum
 from udkjax.scene.library.pendulums import simple_pendulum as simple_pendulum
+
+__all__: list[str]
