@@ -11,12 +11,13 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_count, require_number
 from udkjax.study.design.design_problem import DesignProblem
-from udkjax.study.design.found import Designs, FoundDesign, verified
+from udkjax.study.design.found import Designs
 from udkjax.study.design.goals import Goal
 from udkjax.study.design.limits import LengthLimits, Range, box_of, read_bounds
 from udkjax.study.design.motion_goals import MotionTerm
 from udkjax.study.design.polish import polish
-from udkjax.study.design.search import KEPT_TO, SearchState, improve, loss_of
+from udkjax.study.design.search import SearchState, begin, improve, raise_walls
+from udkjax.study.design.selection import POLISHING, select
 from udkjax.study.design.starts import find_starts
 from udkjax.study.drive import Drive
 from udkjax.study.free_numbers import FreeNumbers
@@ -25,8 +26,6 @@ SAMPLES = 8  # random mechanisms for each start: the best of them are taken
 # Steps of a search, and the share of the trials that goes on afterwards: most have shown by then where they lead.
 STAGES = ((15, 0.4), (30, 0.4), (100, 0.3))
 FEWEST = 16  # trials that go on, at least; as many are polished in the end
-POLISHING = 40  # Newton steps, of which some five are usual at each hardness of the limits
-ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are one
 
 
 class DesignSearch:
@@ -92,13 +91,12 @@ class DesignSearch:
         problem = self.problem
         trials = find_starts(problem, starts, SAMPLES * starts, np.random.default_rng(seed), threads)
         if not len(trials.x):
-            return Designs((), np.zeros(0), starts)
-        state = search(problem, improve(problem, trials, STAGES[0][0], threads), threads)
-        loss = loss_of(state.found)
-        excess = np.max(state.found.limits, axis=1, initial=-np.inf)
-        good = np.flatnonzero(state.found.is_there & (excess <= 100 * KEPT_TO * problem.scale))
-        order = good[np.argsort(loss[good], kind="stable")]
-        return Designs(tuple(_distinct(problem, state, order, loss, results)), loss[order], starts)
+            what = "makes a whole turn" if problem.rotation else "has all positions of the goal"
+            reason = f"no random mechanism within the bounds {what}: change the bounds or the structure"
+            return Designs((), np.zeros(0), starts, reason)
+        state = search(problem, improve(problem, begin(problem, trials, threads), STAGES[0][0], threads), threads)
+        found = select(problem, state, results, threads)
+        return Designs(tuple(found.found), found.losses, starts, found.reason)
 
 
 def search(problem: DesignProblem, state: SearchState, threads: int | None) -> SearchState:
@@ -108,26 +106,10 @@ def search(problem: DesignProblem, state: SearchState, threads: int | None) -> S
         count = max(FEWEST, int(share * len(state.merit)))
         merit = np.where(state.found.is_there, state.merit, np.inf)
         state = state.take(np.argsort(merit, kind="stable")[:count])
-        state = improve(problem, state.trials, steps, threads, state)
+        raise_walls(problem, state)
+        state = improve(problem, state, steps, threads)
     merit = np.where(state.found.is_there, state.merit, np.inf)
     return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST]), POLISHING, threads)
-
-
-def _distinct(problem: DesignProblem, state: SearchState, order: np.ndarray, loss: np.ndarray, results: int) -> list[FoundDesign]:
-    found: list[FoundDesign] = []
-    seen: list[np.ndarray] = []
-    for k in order:
-        if len(found) == results:
-            break
-        x, s, q = (a[k] for a in state.trials)
-        signature = np.append(problem.signature(x, q[0]), 0.0)
-        if any(np.max(np.abs(signature - other)) < ALIKE * problem.scale for other in seen):
-            continue
-        one = verified(problem, x, s, q, float(loss[k]))
-        if one is not None:
-            found.append(one)
-            seen.append(signature)
-    return found
 
 
 @checked

@@ -282,11 +282,6 @@ class DesignProblem:
 
     # --- residuals
 
-    @property
-    def has_margin(self) -> bool:
-        """True if transmission is limited."""
-        return self.rotation or self.least > LEAST_TRANSMISSION
-
     def evaluate(
         self,
         trials: Trials,
@@ -314,7 +309,7 @@ class DesignProblem:
             more[which], more_slopes[which], turns[which] = self._turn_limit(x[which], margin[which], threads)
             limits, slopes = np.concatenate([limits, more], 1), np.concatenate([slopes, more_slopes], 1)
             is_there &= turns
-        elif self.least > LEAST_TRANSMISSION:
+        else:
             unit = MARGIN_WEIGHT * self.scale
             limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
             by_x = table[:, :, G, 2:]  # values that are unknowns are held: what moves them is another residual's matter

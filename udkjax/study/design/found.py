@@ -76,13 +76,15 @@ class Designs(PrintsTable):
 
     Attributes:
         found: the designs.
-        losses: of all trials that ended within the limits, sorted; the more often the best was found, the less is left to find.
+        losses: of all trials within the limits, sorted; the more often the best was found, the less is left to find.
         starts: from how many mechanisms the search began.
+        reason: why nothing was found, and the cure; empty where something was.
     """
 
     found: tuple[FoundDesign, ...]
     losses: Float[np.ndarray, "k"]
     starts: int = eqx.field(static=True)
+    reason: str = eqx.field(static=True, default="")
 
     def __len__(self) -> int:
         return len(self.found)
@@ -95,6 +97,7 @@ class Designs(PrintsTable):
 
     def _table(self) -> PrintedTable:
         rows = [("starts", str(self.starts)), ("within the limits", str(len(self.losses)))]
+        rows += [("nothing was found", self.reason)] if self.reason else []
         for k, one in enumerate(self.found):
             turns = ", turns" if one.turns else ""
             rows.append((str(k + 1), f"loss {one.loss:.6g}, transmission {one.transmission:.3g}{turns}"))

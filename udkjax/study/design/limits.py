@@ -15,7 +15,7 @@ from udkjax.study.free_numbers import FreeNumbers
 Range = tuple[float, float]
 # How far a position stays from where branches meet over a turn that has to be complete, whatever transmission is asked for:
 # sine of the transmission angle of a four-bar. Closer, machine parts with clearances do not know their branch.
-LEAST_TRANSMISSION = 1e-3
+LEAST_TRANSMISSION = 3e-3
 DEFAULT_REACH = 2.0  # times the extent of targets and drawing: how far pins are searched, where there are no bounds
 DEFAULT_FACTOR = 4.0  # other numbers: from this fraction of their values to this multiple
 
@@ -97,6 +97,8 @@ class LengthLimits:
         centres = np.array([area[:2] for area in found.values() if area.ndim == 1]).reshape(-1, 2)
         sides = [(pin, *side) for pin, area in found.items() if area.ndim == 2 for side in zip(*_sides(area), strict=True)]
         self.count, self._free = len(rows) + len(sides), free.count
+        ends = [f"the area of {pin}" if a is None else f"the length {a}-{pin}" for (a, pin), *_ in rows]
+        self.names = [*ends, *(f"the area of {pin}" for pin, *_ in sides)]
         self._way, self._end = np.array([way for _, way, _ in rows]), np.array([end for *_, end in rows])
 
         def between(x: Array) -> Array:  # affine: pins are free numbers, or stay where they are

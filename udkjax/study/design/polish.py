@@ -68,11 +68,9 @@ def _newton_step(
     merit = np.where(exists, merit_of(there, u, weight), np.inf)
     better = merit < state.merit[active]
     taken, kept = active[better], active[~better]
-    for a, b in zip((*state.trials, *state.found), (*new[:2], there.q, *there), strict=True):
-        a[taken] = b[better]
+    state.accept(problem, taken, new.take(better), TrialResiduals(*(a[better] for a in there)), merit[better])
     promised = np.abs(np.einsum("mk,mk->m", g, dz))
     small = promised <= CONVERGED * state.merit[active] + ROUNDING * problem.scale**2
-    state.merit[taken] = merit[better]
     shift[taken] = np.maximum(0.1 * shift[taken], LEAST_SHIFT)
     shift[kept] = shift[kept] * 10.0
     ended = active[small | (shift[active] > MOST_SHIFT)]

@@ -17,10 +17,12 @@ RELAX, TIGHTEN = 0.2, 4.0  # of the damping, after a step that is taken and one 
 # Weights w of limits beside residuals. A search begins with soft walls, along which it finds its way, and hardens them each time
 # it has settled: the violation falls by the square of the weight.
 FIRST_WEIGHT, HARDEN, MOST_WEIGHT = 0.5, 6.0, 100.0
+HIGH = 20.0  # of weights, for each scale of the root of the loss: walls that are low beside the loss hold nothing back
 # Squares of transmissions: where limits begin, and by what they shrink to what is asked for, whenever a trial has settled.
 FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
 KEPT_TO = 1e-8  # scales: what a limit may be exceeded by in the end, before the last polish
 SETTLED = 1e-9  # relative fall of the loss below which a trial has settled
+PRESSED = 1e-5  # that of one beyond a limit, or pressing on it, which is to harden
 ROUNDING = 1e-26  # of the squared scale: a loss below is zero to rounding
 AHEAD = 0.1  # of a step: where residuals are evaluated for their second derivative along it
 MOST_BEND = 0.75  # of a step: twice the acceleration, at most
@@ -35,15 +37,42 @@ class SearchState:
     multipliers: np.ndarray
     weight: np.ndarray
     margin: np.ndarray
+    least: np.ndarray
     damping: np.ndarray
     merit: np.ndarray
     settled: np.ndarray
+    kept: Trials
+    kept_loss: np.ndarray
 
     def take(self, which: np.ndarray) -> "SearchState":
         """Return some of them."""
         found = TrialResiduals(*(a[which] for a in self.found))
-        rest = (self.multipliers, self.weight, self.margin, self.damping, self.merit, self.settled)
-        return SearchState(self.trials.take(which), found, *(a[which] for a in rest))
+        rest = (self.multipliers, self.weight, self.margin, self.least, self.damping, self.merit, self.settled)
+        return SearchState(
+            self.trials.take(which), found, *(a[which] for a in rest), self.kept.take(which), self.kept_loss[which]
+        )
+
+    def accept(self, problem: DesignProblem, which: np.ndarray, trials: Trials, found: TrialResiduals, merit: np.ndarray):
+        """Take new places of some trials, and remember the best one of each that is within all limits."""
+        for a, b in zip((*self.trials, *self.found), (*trials[:2], found.q, *found), strict=True):
+            a[which] = b
+        self.merit[which] = merit
+        self.keep(problem, which)
+
+    def keep(self, problem: DesignProblem, which: np.ndarray):
+        """Remember trials that are within all limits, where they are better than what is remembered."""
+        found = TrialResiduals(*(a[which] for a in self.found))
+        loss = np.where(found.is_there & (self.excess(problem, which) <= 0), loss_of(found), np.inf)
+        better = loss < self.kept_loss[which]
+        for a, b in zip(self.kept, self.trials, strict=True):
+            a[which[better]] = b[which[better]]
+        self.kept_loss[which[better]] = loss[better]
+
+    def excess(self, problem: DesignProblem, which: np.ndarray) -> np.ndarray:
+        """Return by how much some trials exceed the limits that are asked for in the end, at most (m)."""
+        limits, more = self.found.limits[which], self.margin[which] - self.least[which] ** 2
+        limits[:, problem.lengths.count :] -= MARGIN_WEIGHT * problem.scale * more[:, None]
+        return np.max(limits, axis=1, initial=-np.inf)
 
 
 def loss_of(found: TrialResiduals) -> np.ndarray:
@@ -51,14 +80,8 @@ def loss_of(found: TrialResiduals) -> np.ndarray:
     return np.einsum("mjg,mjg->m", found.r, found.r) + np.einsum("mt,mt->m", found.terms, found.terms)
 
 
-def improve(
-    problem: DesignProblem, trials: Trials, steps: int, threads: int | None = None, state: SearchState | None = None
-) -> SearchState:
-    """Improve trials by so many steps at most; return where they got, those that have no positions with an infinite merit.
-
-    `state` is that of the trials, where they have been improved before.
-    """
-    state = _first_state(problem, trials, threads) if state is None else state
+def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
+    """Improve trials by so many steps at most; return where they got, those that have no positions with an infinite merit."""
     sign = np.sign(state.found.transmission[:, 0])
     for _ in range(steps):
         active = np.flatnonzero(~state.settled)
@@ -68,13 +91,18 @@ def improve(
     return state
 
 
-def _first_state(problem: DesignProblem, trials: Trials, threads: int | None) -> SearchState:
+def begin(problem: DesignProblem, trials: Trials, threads: int | None, least: float = 0.0) -> SearchState:
+    """Return the state in which the search from some trials begins, for a transmission that is not below `least`."""
     members = len(trials.x)
-    margin = np.full(members, max(problem.least**2, FIRST_MARGIN))
+    least = np.full(members, max(problem.least, least))
+    margin = np.maximum(least**2, FIRST_MARGIN)
     found = problem.evaluate(trials, margin, threads)
     multipliers = np.zeros_like(found.limits)
     weight, damping, merit = np.full(members, FIRST_WEIGHT), np.full(members, FIRST_DAMPING), np.full(members, np.inf)
-    state = SearchState(trials, found, multipliers, weight, margin, damping, merit, ~found.is_there)
+    kept = Trials(*(a.copy() for a in trials))
+    rest = (multipliers, weight, margin, least, damping, merit, ~found.is_there, kept, np.full(members, np.inf))
+    state = SearchState(trials, found, *rest)
+    state.keep(problem, np.arange(members))
     state.merit[found.is_there] = merit_of(found, multipliers, weight)[found.is_there]
     return state
 
@@ -103,10 +131,10 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     merits = np.where(exists, merit_of(there, u, weight), np.inf)
     better, fall = merits < before, before - merits
     taken, kept = active[better], active[~better]
+    state.accept(problem, taken, new.take(better), TrialResiduals(*(a[better] for a in there)), merits[better])
+    slow = fall[better] < PRESSED * before[better]
     settled = fall[better] < SETTLED * before[better]
-    for a, b in zip((*state.trials, *state.found), (*new[:2], there.q, *there), strict=True):
-        a[taken] = b[better]
-    state.merit[taken] = merits[better]
+    settled[slow] |= goes_on(problem, state, taken[slow])
     state.damping[taken] = np.maximum(RELAX * state.damping[taken], LEAST_DAMPING)
     state.damping[kept] *= TIGHTEN
     done = np.concatenate(
@@ -149,21 +177,36 @@ def goes_on(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np
     """Return of trials that go no farther whether they should, once limits have changed."""
     limits, u = state.found.limits[which], state.multipliers[which]
     wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > KEPT_TO * problem.scale
-    if problem.has_margin:  # the last rows
-        rows = slice(problem.lengths.count, None)
-        wrong |= (state.margin[which] > problem.least**2) & np.any(limits[:, rows] + u[:, rows] > 0, axis=1)
-    return wrong
+    rows = slice(problem.lengths.count, None)  # of transmission
+    return wrong | (state.margin[which] > state.least[which] ** 2) & np.any(limits[:, rows] + u[:, rows] > 0, axis=1)
 
 
 def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
     """Update the multipliers of some trials, harden their limits, and bring their margins nearer to what is asked for."""
-    harder = np.minimum(state.weight[which] * HARDEN, MOST_WEIGHT)
-    softer = (state.weight[which] / harder)[:, None] ** 2
-    state.multipliers[which] = softer * np.maximum(0.0, state.found.limits[which] + state.multipliers[which])
-    state.weight[which], state.settled[which] = harder, False
-    margin = np.maximum(SHRINK_MARGIN * state.margin[which], problem.least**2)
-    if problem.has_margin:
-        unit = MARGIN_WEIGHT * problem.scale
-        state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
+    most = MOST_WEIGHT * _height(problem, state, which)
+    limits, u, weight = state.found.limits[which], state.multipliers[which], state.weight[which]
+    state.multipliers[which], state.settled[which] = np.maximum(0.0, limits + u), False
+    margin = np.maximum(SHRINK_MARGIN * state.margin[which], state.least[which] ** 2)
+    unit = MARGIN_WEIGHT * problem.scale
+    state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
     state.margin[which] = margin
-    state.merit[which] = merit_of(TrialResiduals(*(a[which] for a in state.found)), state.multipliers[which], harder)
+    _reweigh(problem, state, which, np.maximum(weight, np.minimum(HARDEN * weight, most)))
+
+
+def raise_walls(problem: DesignProblem, state: SearchState):
+    """Raise limits to the height of what is left of the losses."""
+    every = np.arange(len(state.merit))
+    _reweigh(problem, state, every, np.maximum(state.weight, FIRST_WEIGHT * _height(problem, state, every)))
+
+
+def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
+    """Return the unit of the weights of some trials."""
+    return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(TrialResiduals(*(a[which] for a in state.found)))))
+
+
+def _reweigh(problem: DesignProblem, state: SearchState, which: np.ndarray, weight: np.ndarray):
+    """Change weights of some trials, by which limits press on as hard as before."""
+    state.multipliers[which] *= (state.weight[which] / weight)[:, None] ** 2
+    state.weight[which] = weight
+    merit = merit_of(TrialResiduals(*(a[which] for a in state.found)), state.multipliers[which], weight)
+    state.merit[which] = np.where(np.isfinite(state.merit[which]), merit, np.inf)
