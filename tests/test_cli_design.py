@@ -95,7 +95,7 @@ def test_all_four_bars_are_found_shown_and_written(folder, capsys):
     ("old", "new", "says"),
     [
         ("complete = true", "complete = 1", "must be true or false"),
-        ("complete = true", "complete = true\ntransmission = 10", "leave it out"),
+        ("complete = true", "complete = true\nfree = ['pin.A']", "leave it out"),
         (", [1.5, 1.9, 109]", "", "five poses; there are 4"),
         ('pin = "P"', "", "name the pin"),
         ('kind = "poses"', 'kind = "function"', "unknown key"),

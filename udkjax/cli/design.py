@@ -68,12 +68,12 @@ def design(
         for one in found
     ]
     show(
-        {"starts": starts, "losses": found.losses, "designs": listed},
+        {"starts": starts, "losses": found.losses, "reason": found.reason, "designs": listed},
         table(f"designs of {mech.name or 'a mechanism'}", lines),
         json,
     )
     if not len(found):
-        fail("nothing was found within the limits: give more --starts, or wider bounds")
+        fail(f"nothing was found: {found.reason}")
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
@@ -111,9 +111,11 @@ def _show_all(file: Path, search: Any, results: int, out: Path | None, json: boo
     )
     listed = [{name: getattr(one, name) for name in (*names, "values", "pins")} for one in chosen]
     counts = {"solutions": found.paths, "classes": found.classes, "unproven": found.unproven, "four_bars": len(found)}
+    counts |= {"beyond_limits": found.left_out, "others": [{"kind": kind, "pins": pins} for kind, pins in found.others]}
     show({**counts, "designs": listed}, table(f"four-bars of {found.mechanism.name or 'a drawing'}", lines), json)
     if not len(found):
-        fail("no real four-bar meets the goal exactly: drop complete = true for the nearest")
+        beyond = f" within the limits; {found.left_out} are beyond them" if found.left_out else ""
+        fail(f"no real four-bar meets the goal exactly{beyond}: drop complete = true for the nearest")
 
 
 def _write(found: Iterable[Any], goal: Any, out: Path) -> str:

@@ -80,4 +80,4 @@ def test_dyads_of_random_circles_are_found():
         off = np.maximum(
             np.abs(u[0] + 1j * u[1] - joint * np.exp(1j * turn[0])), np.abs(u[0] + 1j * u[1] - u[2] - 1j * u[3] + P[0] - pivot)
         )
-        assert off.min() < 1e-9 and u.shape[1] in (2, 4) and found.unproven == 0
+        assert off.min() < 1e-9 and u.shape[1] in (2, 4) and not found.unproven.size

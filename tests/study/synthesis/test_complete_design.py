@@ -25,6 +25,17 @@ def places_of(frame, crank, coupler, rocker, point, angles):
     return A, A + coupler * turn, A + point * turn, np.angle(turn)
 
 
+def crank_error(places, a, A, B, b):
+    """By how much the crank b B changes its length at most, where the coupler goes through places and a A keeps its own."""
+    x, y, worst = A - places[0], B - places[0], 0.0
+    for place in places[1:]:
+        # |place + t x - a| = |A - a|: t x (place - a)* has a known real part; of both roots one keeps the other crank, too.
+        w, size = x * np.conj(place - a), np.abs(A - a) ** 2 - np.abs(place - a) ** 2 - np.abs(x) ** 2
+        t = np.exp(1j * (np.array([1, -1]) * np.arccos(np.clip(size / (2 * np.abs(w)), -1, 1)) - np.angle(w)))
+        worst = max(worst, np.abs(np.abs(place + t * y - b) - np.abs(B - b)).min())
+    return worst
+
+
 @pytest.fixture(scope="module")
 def published():
     return udk.design_all(FOUR_BAR, udk.PathGoal("P", DATA["points"]))
@@ -38,18 +49,43 @@ def test_the_published_problem_has_its_64_real_classes(published):
     assert str(published).startswith(f"{len(published)} four-bars") and "proven within" in str(published[0])
 
 
+def test_limits_leave_out_what_is_beyond_them(published):
+    limits = {"lengths": {("O", "A"): (0.1, 2.0)}, "bounds": {"pin.O": (-3.0, 3.0)}, "areas": {"C": (0.5, 0.5, 4.0)}}
+    found = udk.design_all(FOUR_BAR, udk.PathGoal("P", DATA["points"]), transmission=0.05, rotation=True, **limits)
+    pivot, joint, end = (published.pins[f"pin.{name}"] for name in "OAC")
+    crank, off = np.linalg.norm(joint - pivot, axis=1), np.linalg.norm(end - 0.5, axis=1)
+    inside = (crank >= 0.1) & (crank <= 2.0) & (np.abs(pivot) <= 3.0).all(axis=1) & (off <= 4.0)
+    inside &= (published.transmission >= np.sin(0.05)) & published.turns
+    assert 0 < len(found) == inside.sum() == len(published) - found.left_out
+    np.testing.assert_array_equal(found.pins["pin.O"], pivot[inside])
+    with pytest.raises(SceneError, match="no pin named"):
+        udk.design_all(FOUR_BAR, udk.PathGoal("P", DATA["points"]), lengths={("O", "Z"): (0, 1)})
+
+
+def test_other_ends_are_listed():
+    """Of places that repeat in one coordinate some solutions meet, and others go to infinity: each is counted and listed."""
+    y = [1, 2, -1, 0.5, 3, 0.5, -1, 2, 1]
+    found = udk.design_all(FOUR_BAR, udk.PathGoal("P", np.stack([np.arange(9.0) - 4.0, y], 1)))
+    kinds = [other.kind for other in found.others]
+    assert kinds.count("infinite") == found.paths["infinite"] > 0 and kinds.count("singular") == found.paths["singular"] > 0
+    assert found.paths["regular"] + found.paths["infinite"] + found.paths["singular"] == 1442
+    # Two more have real joints and, where the place is on the axis of symmetry, no real turn: they are none of the real ones.
+    assert found.unproven == 0
+
+
+def test_places_whose_solutions_are_far_away_have_all_of_them():
+    """One class of these places has a pivot 1e8 units away, and is no solution at infinity."""
+    found = udk.design_all(FOUR_BAR, udk.PathGoal("P", np.random.default_rng(1028).normal(size=(9, 2))))
+    assert found.paths == {"tracked": 1442, "regular": 1442} and not found.others
+
+
 def test_pins_hold_their_links_in_all_positions(published):
     """Each four-bar, its coupler turned by the angle that keeps one crank as long as it was, keeps the other one as well."""
     pivot, joint, other, traced, end = ([1, 1j] @ published.pins[f"pin.{name}"].T for name in "OABPC")
     places = np.array(DATA["points"]) @ [1, 1j]
     for k in range(0, len(published), 7):
-        x, y, a, b = joint[k] - traced[k], other[k] - traced[k], pivot[k], end[k]
-        for place in places[1:]:
-            # |place + t x - a| = |A - a|: t x (place - a)* has a known real part; of both roots one keeps the other crank, too.
-            w, size = x * np.conj(place - a), np.abs(joint[k] - a) ** 2 - np.abs(place - a) ** 2 - np.abs(x) ** 2
-            t = np.exp(1j * (np.array([1, -1]) * np.arccos(np.clip(size / (2 * np.abs(w)), -1, 1)) - np.angle(w)))
-            off = np.abs(np.abs(place + t * y - b) - np.abs(other[k] - b))
-            assert off.min() < 1e-6 * (1 + np.abs(b) + np.abs(y))
+        error = crank_error(places, pivot[k], joint[k], other[k], end[k])
+        assert error < 1e-6 * (1 + np.abs(end[k]) + np.abs(other[k] - traced[k]))
 
 
 def test_motions_confirm_what_has_no_defect(published):

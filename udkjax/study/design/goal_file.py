@@ -30,7 +30,7 @@ TOP = (
     "transmission",
     "rotation",
 )
-SEARCHED = ("free", "motion", "bounds", "areas", "length", "transmission", "rotation")  # what only a search can hold to
+SEARCHED = ("free", "motion")  # what only a search can hold to
 LENGTH = ("pins", "least", "most")
 # The keys of each kind of goal, and the SI units of those that have some; "value" is that of what drives.
 GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
@@ -94,7 +94,8 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     if complete:
         if not isinstance(goal, PathGoal | PoseGoal):
             raise SceneError(['goal.kind must be "path" or "poses" where complete = true'], name)
-        return CompleteSearch(mechanism, goal, table.get("driver"))
+        limits = {"bounds": bounds, "lengths": lengths, "areas": areas, "transmission": transmission}
+        return CompleteSearch(mechanism, goal, table.get("driver"), {**limits, "rotation": table.get("rotation", False)})
     choices = {key: table[key] for key in ("free", "driver", "rotation") if key in table}
     try:
         goals = [goal, *(term for term in terms if term is not None)]

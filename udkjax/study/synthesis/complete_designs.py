@@ -1,6 +1,7 @@
 """All four-bars that meet a goal exactly, each with its certificate and what its motion is like."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from udkjax.study.drive import Drive
 from udkjax.study.kinematics import Kinematics, kinematics
 
 TURN = 2.0 * np.pi
+NEARLY_REAL = 1e-4  # of the extent: singular ends are known to the root of rounding, and less
 
 
 class CompleteDesign(PrintsTable):
@@ -83,6 +85,25 @@ class CompleteDesign(PrintsTable):
         return PrintedTable(f"four-bar {self.mechanism.name}".strip(), rows)
 
 
+class OtherSolution(NamedTuple):
+    """A solution beside the designs: where the path to it ended, or what could not be proven.
+
+    Attributes:
+        kind: "singular" where solutions meet or are no isolated ones, "infinite" where a joint goes to infinity, "lost" where a
+            path could not be followed to its end; "unproven" where a real solution is too nearly singular for a proof.
+        pins: the coordinates of the pins in the first position by name (2,), in m, complex ones unless the solution is real.
+    """
+
+    kind: str
+    pins: dict[str, np.ndarray]
+
+    @property
+    def is_real(self) -> bool:
+        """True if the coordinates are real, to within what is known of them."""
+        places = np.array(list(self.pins.values()))
+        return bool(np.max(np.abs(np.imag(places))) <= NEARLY_REAL * np.max(np.abs(places - places.mean(axis=0))))
+
+
 class CompleteDesigns(PrintsTable):
     """All four-bars that meet a goal: a sequence of `CompleteDesign`, each made when it is asked for.
 
@@ -105,7 +126,8 @@ class CompleteDesigns(PrintsTable):
         numbers: of classes (M,).
         cognates: which of the class (M,).
         classes: how many real classes, or dyads of a link in poses, were proven, all different.
-        unproven: how many more appear to be real without a proof.
+        others: the other solutions, complex ones counted, that are singular, infinite, lost or unproven.
+        left_out: how many designs are left out because they exceed a limit.
         paths: what became of the solutions of the whole problem, complex ones counted, by name.
         mechanism: the drawing's, as it was given.
         coupler: the name of its coupler.
@@ -126,11 +148,17 @@ class CompleteDesigns(PrintsTable):
     numbers: Int[np.ndarray, "M"]
     cognates: Int[np.ndarray, "M"]
     classes: int = eqx.field(static=True)
-    unproven: int = eqx.field(static=True)
+    others: tuple[OtherSolution, ...]
+    left_out: int = eqx.field(static=True)
     paths: dict[str, int] = eqx.field(static=True)
     mechanism: Mechanism
     coupler: str = eqx.field(static=True)
     driver: Drive = eqx.field(static=True)
+
+    @property
+    def unproven(self) -> int:
+        """How many more classes appear to be real without a proof."""
+        return sum(other.kind == "unproven" for other in self.others)
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -157,6 +185,7 @@ class CompleteDesigns(PrintsTable):
         rows = [("solutions", ", ".join(f"{count} {name}" for name, count in self.paths.items()))]
         rows += [("real, proven", f"{self.classes}{f'; {self.unproven} more without a proof' if self.unproven else ''}")]
         rows += [("defects", ", ".join(f"{self.defects.count(name)} {name}" for name in dict.fromkeys(self.defects)))]
+        rows += [("beyond limits", str(self.left_out))] if self.left_out else []
         for k, (kind, defect) in enumerate(zip(self.kinds[:8], self.defects, strict=False)):
             rows.append((str(k + 1), f"{kind}, defect {defect}, transmission {self.transmission[k]:.3g}"))
         return PrintedTable(f"{len(self)} four-bars", rows)

@@ -39,6 +39,10 @@ class DrawnFourBar(NamedTuple):
         joints |= {"A": bars.A[which, position], "B": bars.B[which, position]}
         return {f"pin.{self.pins[key]}": np.stack([np.real(z), np.imag(z)], 1) for key, z in joints.items()}
 
+    def coordinates(self, joints: Mapping[str, np.ndarray], start: np.ndarray) -> dict[str, np.ndarray]:
+        """Return x, y (2,) by the names of pins, complex, of joints given by x + i y and x - i y from a place (2,)."""
+        return {f"pin.{self.pins[key]}": start + np.array([z + w, (z - w) / 1j]) / 2 for key, (z, w) in joints.items()}
+
     def values(self, bars: FourBars, angles: np.ndarray) -> np.ndarray:
         """Return the driver's values (M, J) (rad) at angles of the crank, counted as the mechanism does where it is drawn."""
         own = bars.crank_angles[:, :1] + np.pi * self.is_reversed

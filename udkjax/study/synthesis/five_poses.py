@@ -21,7 +21,7 @@ DYADS = 4  # of generic poses, complex ones counted
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
 AT_INFINITY = 1e-7  # a joint or pivot so many times as far away as the poses are from each other is at infinity
 ISOTROPIC = 1e-6  # from the isotropic points, of two homogeneous coordinates of length one
-LEAST_PIVOT = 1e-11  # of the cubic terms of the minors: below it, zeros are no isolated ones
+SMALLEST_CUBIC = 1e-11  # of the cubic terms of the minors: below it, zeros are no isolated ones
 MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 CUBIC = ((3, 0), (2, 1), (1, 2), (0, 3))
 SINE_TOL = 8.0 * ROUNDING  # what a sine of the longest floating-point type may be off by
@@ -34,14 +34,14 @@ class RealDyads(NamedTuple):
         boxes: proven to hold one solution each: the joint (two), the crank from the pivot to it (two).
         turns: of the link in each pose, as complex numbers (5,).
         infinite: how many have a joint or a pivot at infinity, complex ones counted.
-        unproven: how many more appear to be real, but could not be proven.
+        unproven: what else appears to be real, but could not be proven: joints and cranks (4, K).
         scale: m, a power of two.
     """
 
     boxes: Certificate
     turns: np.ndarray
     infinite: int
-    unproven: int
+    unproven: np.ndarray
     scale: float
 
 
@@ -62,9 +62,9 @@ def find_real_dyads(poses: np.ndarray) -> RealDyads:
     near = reality < NEARLY_REAL
     found = certify(dyad_system(d), np.real(u)[:, near])
     proven = np.flatnonzero(found.is_proven & _first_of_each(found))
-    sure = int(np.count_nonzero(~found.is_proven & (reality[near] < SURELY_REAL)))
+    unproven = np.real(u)[:, near][:, ~found.is_proven & (reality[near] < SURELY_REAL)]
     turns = np.exp(1j * angle.astype(float))
-    return RealDyads(found.take(proven), turns, int(np.count_nonzero(~is_finite)), sure, scale)
+    return RealDyads(found.take(proven), turns, int(np.count_nonzero(~is_finite)), unproven, scale)
 
 
 def _first_of_each(found: Certificate) -> np.ndarray:
@@ -89,7 +89,7 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tupl
     minors = [_determinant(L[list(rows)]) for rows in combinations(range(4), 3)]
     table = np.array([[minor.get(m, 0.0) for m in (*CUBIC, *MONOMIALS)] for minor in minors])
     table /= np.linalg.norm(table, axis=1, keepdims=True) + (np.linalg.norm(table, axis=1, keepdims=True) == 0)
-    if np.linalg.svd(table[:, :4], compute_uv=False)[-1] < LEAST_PIVOT:
+    if np.linalg.svd(table[:, :4], compute_uv=False)[-1] < SMALLEST_CUBIC:
         raise ValueError("dyads through these poses are no isolated ones: change a pose that others repeat, mirror or translate")
     reduced = -np.linalg.solve(table[:, :4], table[:, 4:])
     steps = []

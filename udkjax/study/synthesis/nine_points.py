@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from udkjax.integrate.path_tracking import ACCEPTED, INFINITE, SINGULAR, PathTracker, Precision
+from udkjax.integrate.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
 from udkjax.study.synthesis.balls import LONG, Ball
 from udkjax.study.synthesis.boxes import certainly_different
 from udkjax.study.synthesis.certificate import Certificate, certify
@@ -53,20 +53,32 @@ class Paths(NamedTuple):
     lost: int
 
 
+class OtherEnds(NamedTuple):
+    """Ends of paths beside the classes that were found: joints x, X, r, R, y, Y, s, S (8, K), and a word for each."""
+
+    joints: np.ndarray
+    kinds: tuple[str, ...]
+
+
 class RealClasses(NamedTuple):
     """Four-bars of real classes, one each, in units of `scale` from the first place.
 
     Attributes:
         boxes: proven to hold one solution each: joint and crank of both dyads, then cosines less one and sines of turns.
         paths: what became of all paths.
-        unproven: how many more appear to be real, but could not be proven.
+        ends: where the other paths came to, and what appears to be real, but could not be proven.
         scale: m, a power of two.
     """
 
     boxes: Certificate
     paths: Paths
-    unproven: int
+    ends: OtherEnds
     scale: float
+
+    @property
+    def unproven(self) -> int:
+        """How many more classes appear to be real."""
+        return self.ends.kinds.count("unproven")
 
 
 def find_real_classes(points: np.ndarray) -> RealClasses:
@@ -74,25 +86,27 @@ def find_real_classes(points: np.ndarray) -> RealClasses:
     scale = power_of_two_near(points)
     places = np.asarray(points, LONG) / scale
     d = places[1:] - places[0]
-    z, paths = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
+    z, paths, ends = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
     x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
-    reality = np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0))
+    turn = 1.0 + z[JOINTS:]
+    unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex where joints are not
+    reality = np.maximum(np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0)), unreal)
     near = reality < NEARLY_REAL
-    joints, turns = 0.5 * (x + conjugates)[:, near], 1.0 + z[JOINTS:, near]
-    turns = turns / np.abs(turns) - 1.0
+    joints, turns = 0.5 * (x + conjugates)[:, near], turn[:, near] / np.abs(turn[:, near]) - 1.0
     u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
     exact = Displacements(*(Ball.fractions(places[1:, k : k + 1]) - Ball.fractions(places[:1, k : k + 1]) for k in (0, 1)))
-    found = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
+    with np.errstate(over="ignore", invalid="ignore"):  # of ends at which Newton's method leaves for infinity: not proven then
+        found = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
     keep = np.flatnonzero(found.is_proven)
     keep = keep[distinct(isotropic(found.middle[:, keep]))]
-    sure = np.count_nonzero(~found.is_proven & (reality[near] < SURELY_REAL))
-    proven = certainly_different(found.take(keep))
-    boxes, sure = found.take(keep[proven]), int(sure + len(keep) - len(proven))
-    return RealClasses(boxes, paths, sure, scale)
+    proven = keep[certainly_different(found.take(keep))]
+    unproven = [*np.flatnonzero(~found.is_proven & (reality[near] < SURELY_REAL)), *np.setdiff1d(keep, proven)]
+    ends = OtherEnds(np.concatenate([ends.joints, isotropic(u[:, unproven])], 1), (*ends.kinds, *["unproven"] * len(unproven)))
+    return RealClasses(found.take(proven), paths, ends, scale)
 
 
-def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths]:
-    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of a size of one."""
+def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
+    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of a size of one, and the rest."""
     target = np.concatenate([d, d.conj()])
     start, parameters = start_solutions()
     follow = tracker()
@@ -114,10 +128,13 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths]:
         before, known = known.shape[1], _merged(known, more[:, found == ACCEPTED])
         if known.shape[1] == before:
             break
-    missing = CLASSES - known.shape[1]
-    infinite = min(int(np.count_nonzero(status == INFINITE)), missing)
-    singular = min(int(np.count_nonzero(status == SINGULAR)), missing - infinite)
-    return known, Paths(CLASSES, known.shape[1], infinite, singular, missing - infinite - singular)
+    missing, ends = CLASSES - known.shape[1], {}
+    for code, name in ((INFINITE, "infinite"), (SINGULAR, "singular"), (LOST, "lost")):
+        ends[name] = np.flatnonzero(status == code)[: missing - sum(map(len, ends.values()))]
+    infinite, singular = len(ends["infinite"]), len(ends["singular"])
+    paths = Paths(CLASSES, known.shape[1], infinite, singular, missing - infinite - singular)
+    which = np.concatenate(list(ends.values()))
+    return known, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, of in ends.items() for _ in of))
 
 
 @cache
