@@ -157,7 +157,7 @@ class CompleteDesigns(PrintsTable):
 
     @property
     def unproven(self) -> int:
-        """How many more classes appear to be real without a proof."""
+        """The number of further classes that appear to be real without a proof."""
         return sum(other.kind == "unproven" for other in self.others)
 
     def __len__(self) -> int:

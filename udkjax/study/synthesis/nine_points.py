@@ -77,7 +77,7 @@ class RealClasses(NamedTuple):
 
     @property
     def unproven(self) -> int:
-        """How many more classes appear to be real."""
+        """The number of further classes that appear to be real."""
         return self.ends.kinds.count("unproven")
 
 
