@@ -94,13 +94,13 @@ def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int
 def begin(problem: DesignProblem, trials: Trials, threads: int | None, least: float = 0.0) -> SearchState:
     """Return the state in which the search from some trials begins, for a transmission that is not below `least`."""
     members = len(trials.x)
-    least = np.full(members, max(problem.least, least))
-    margin = np.maximum(least**2, FIRST_MARGIN)
+    leasts = np.full(members, max(problem.least, least))
+    margin = np.maximum(leasts**2, FIRST_MARGIN)
     found = problem.evaluate(trials, margin, threads)
     multipliers = np.zeros_like(found.limits)
     weight, damping, merit = np.full(members, FIRST_WEIGHT), np.full(members, FIRST_DAMPING), np.full(members, np.inf)
     kept = Trials(*(a.copy() for a in trials))
-    rest = (multipliers, weight, margin, least, damping, merit, ~found.is_there, kept, np.full(members, np.inf))
+    rest = (multipliers, weight, margin, leasts, damping, merit, ~found.is_there, kept, np.full(members, np.inf))
     state = SearchState(trials, found, *rest)
     state.keep(problem, np.arange(members))
     state.merit[found.is_there] = merit_of(found, multipliers, weight)[found.is_there]
