@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.programs import run
 from udkjax import GROUND
+from udkjax.equations.differentiable_programs import FORWARD, REVERSE
 from udkjax.equations.scene_arrays import constants_of
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
@@ -73,18 +74,20 @@ def test_they_are_those_of_the_textbook(scene, name):
     active = [True] * (programs.number_count - 2) + [False] * 2
     results = ["a"] if name == "accelerations" else ["q1", "v1"]
 
-    def differentiated(reverse, seeds):
-        written_out = WrittenOut(programs, [], [name], active, reverse)
+    def differentiated(mode, seeds):
+        written_out = WrittenOut(programs, [], [name], active, mode)
         evaluation, derivative = written_out.derivative(name)
         given = {"constants": np.array(written_out.prologue(numbers)), "t": np.array([t]), "q": q, "v": v}
         moving = np.asarray(dconstants)[list(written_out.moving)]
         return moving, run(derivative, given | {"stored": run(evaluation, given)["stored"]} | seeds(moving))
 
-    moving, found = differentiated(False, lambda moving: {"d_constants": moving, "d_q": dq, "d_v": dv})
+    moving, found = differentiated(FORWARD, lambda moving: {"d_constants": moving, "d_q": dq, "d_v": dv})
     found = np.concatenate([found[f"d_{x}"] for x in results])
     assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * float(1 + np.abs(expected).max()))
     weights = random.standard_normal(len(found))
-    _, back = differentiated(True, lambda _: {f"bar_{x}": weights[k * q.size : (k + 1) * q.size] for k, x in enumerate(results)})
+    _, back = differentiated(
+        REVERSE, lambda _: {f"bar_{x}": weights[k * q.size : (k + 1) * q.size] for k, x in enumerate(results)}
+    )
     total = back["bar_constants"] @ moving + back["bar_q"] @ dq + back["bar_v"] @ dv
     assert_allclose(total, weights @ found, rtol=0, atol=1e-10 * float(np.abs(weights) @ np.abs(found)))
 

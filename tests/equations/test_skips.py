@@ -7,6 +7,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations.analysis import analyse
+from udkjax.equations.differentiable_programs import FORWARD, REVERSE
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
 from udkjax.pinv.rank_policy import RankPolicy
@@ -223,17 +224,17 @@ def test_numbers_that_change_make_no_other_code(linkage):
 # --- derivatives
 
 
-def derivative(mechanism, name="accelerations", reverse=False, numbers=()):
+def derivative(mechanism, name="accelerations", mode=FORWARD, numbers=()):
     """How many operations of each kind an evaluation takes that derivatives follow, and these."""
     found = programs(mechanism)
     active = [k in numbers for k in range(found.number_count)]
-    both = WrittenOut(found, [], [name], active, reverse).derivative(name)
+    both = WrittenOut(found, [], [name], active, mode).derivative(name)
     return tuple(x.program.count() for x in both)
 
 
-@pytest.mark.parametrize(("reverse", "most"), [(False, 0.55), (True, 0.55)])
-def test_a_derivative_takes_half_of_what_the_accelerations_take_and_factorizes_nothing(linkage, plain, reverse, most):
-    evaluation, further = derivative(linkage, reverse=reverse)
+@pytest.mark.parametrize(("mode", "most"), [(FORWARD, 0.55), (REVERSE, 0.55)])
+def test_a_derivative_takes_half_of_what_the_accelerations_take_and_factorizes_nothing(linkage, plain, mode, most):
+    evaluation, further = derivative(linkage, mode=mode)
     more = arithmetic(evaluation) - arithmetic(plain)  # what the derivative needs to know
     assert arithmetic(further) + more <= most * (arithmetic(plain) + PAIR * plain["sincos"])
     assert not {"div", "sqrt", "sincos"} & set(further)

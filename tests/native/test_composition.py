@@ -261,7 +261,7 @@ from udkjax.equations.written_out import WrittenOut
 import hashlib
 mechanism = udk.library.parallelogram()
 programs = scene_programs(mechanism, udk.analyse(mechanism).redundant_rows)
-written_out = WrittenOut(programs, [], ["projection"], [True] * programs.number_count, reverse=True)
+written_out = WrittenOut(programs, [], ["projection"], [True] * programs.number_count, mode="reverse")
 program = written_out.derivative("projection").derivative.program
 graph, order = program.graph, program.order
 text = str([(graph.nodes[k].kind, [a.index for a in graph.nodes[k].arguments]) for k in order])

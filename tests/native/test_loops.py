@@ -16,9 +16,11 @@ from tests.programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
+from udkjax.equations.differentiable_programs import PREFIXES, TWICE
 from udkjax.equations.scene_arrays import constants_of
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.written_out import WrittenOut
+from udkjax.expressions.loop_derivative import LoopDerivative
 from udkjax.expressions.loop_program import KernelLoop, Reset
 from udkjax.native import machine
 from udkjax.native.loops import LoopWriter
@@ -197,15 +199,19 @@ def test_no_number_is_written_once_it_was_read():
                 assert not {p for p in outputs if p[0] not in ("nearness", "trusted")} & read
 
 
+def on_the_manifold(at):
+    q, v = at.q, at.v
+    for _ in range(6):
+        q = at.run("newton_q", q=q)["q1"]
+        v = at.run("newton_v_and_psi", q=q, v=v)["v1"]
+    return q, v
+
+
 @pytest.mark.parametrize("name", RESULTS)
 def test_derivatives_against_differences(at, name):
     code, random = at.code, np.random.default_rng(4)
     results, evaluated = RESULTS[name], code.differentiable[name]
-    q, v = at.q, at.v
-    for _ in range(6 if name == "projection" else 0):  # its derivatives are those of a state on the manifold
-        state = at.run("newton_q", q=q)
-        q = state["q1"]
-        v = at.run("newton_v_and_psi", q=q, v=v)["v1"]
+    q, v = on_the_manifold(at) if name == "projection" else (at.q, at.v)  # of which its derivatives are
     dconstants = random.standard_normal(len(code.constants)) * at.constants
     dconstants[:2] = 0.0
     dq, dv = random.standard_normal((2, code.coordinate_count))
@@ -237,6 +243,49 @@ def test_derivatives_against_differences(at, name):
     loops.run(evaluated.derivative().reverse, reverse)
     total = reverse["bar_constants"] @ dconstants + reverse["bar_q"] @ dq + reverse["bar_v"] @ dv
     assert_allclose(total, w @ along, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_second_derivatives_against_differences(at, name):
+    """Along two directions that open the loops, too: a projection is right to second order where it is taken twice."""
+    code, random = at.code, np.random.default_rng(7)
+    results, evaluated = RESULTS[name], code.differentiable[name]
+    q, v = on_the_manifold(at) if name == "projection" else (at.q, at.v)
+    numbers = random.standard_normal((2, len(at.numbers))) * at.numbers
+    numbers[:, -2:] = 0.0  # thresholds
+    dq, dv = random.standard_normal((2, 2, code.coordinate_count))
+
+    def value(h):
+        constants = at.constants.copy()
+        loops.run(code.prologue, {"numbers": at.numbers + h @ numbers, "constants": constants})
+        moved_q, moved_v = q + h @ dq, v + h @ dv
+        if name == "projection":
+            for _ in range(4):
+                moved_q = at.run("newton_q", constants=constants, q=moved_q)["q1"]
+            return np.append(moved_q, at.run("newton_v_and_psi", constants=constants, q=moved_q, v=moved_v)["v1"])
+        found = at.arrays(constants, moved_q, moved_v)
+        loops.run(evaluated.program, found)
+        return np.concatenate([found[x] for x in results])
+
+    def mixed(h):
+        one, two = h * np.array([1.0, 1.0]), h * np.array([1.0, -1.0])
+        return (value(one) - value(two) - value(-two) + value(-one)) / (4 * h**2)
+
+    h = 2e-4
+    expected = (4 * mixed(h) - mixed(2 * h)) / 3
+    found = at.arrays(q=q, v=v)
+    loops.run(evaluated.program, found)
+    found["numbers"] = at.numbers
+    found |= {prefix + x: np.full(len(a), np.nan) for x, a in found.items() for prefix in PREFIXES[TWICE]}
+    for x, given in {"numbers": numbers, "q": dq, "v": dv}.items():
+        found |= dict(zip((prefix + x for prefix in PREFIXES[TWICE]), (*given.copy(), 0.0 * given[0]), strict=True))
+    loops.run(LoopDerivative(code.prologue.parts, ()).second(()), found)
+    for _ in range(2 if name == "projection" else 1):
+        loops.run(evaluated.in_mode(TWICE), found)
+        if name == "projection":
+            found |= {prefix + x: found[f"{prefix}{x}1"].copy() for prefix in PREFIXES[TWICE] for x in "qv"}
+    second = np.concatenate([found[f"de_{x}"] for x in results])
+    assert_allclose(second, expected, atol=1e-6 * max(1.0, np.abs(expected).max()))
 
 
 def test_constants_by_jax_are_those_of_the_loops(at):

@@ -5,11 +5,18 @@ from functools import cached_property
 from typing import NamedTuple
 
 from udkjax.equations.scene_solver import SceneSolver, program
-from udkjax.expressions.loop_derivative import LoopDerivative
+from udkjax.equations.scene_terms import Parts
+from udkjax.expressions.loop_derivative import COTANGENT, OTHER, SECOND, TANGENT, LoopDerivative
 from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
 
 # Arrays that derivatives take as fixed. Sines and cosines are known functions of q to every kernel that reads them.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
+
+# Modes of differentiation: along a direction, its transpose, and along two directions with the second derivative of both.
+FORWARD, REVERSE, TWICE = "forward", "reverse", "twice"
+PREFIXES = {FORWARD: (TANGENT,), REVERSE: (COTANGENT,), TWICE: (TANGENT, OTHER, SECOND)}  # of arrays of changes, or cotangents
+# Arrays of the second correction of a solution: the first has left no change of first order for it.
+SETTLED = ("right2", "sum2", "y2", "x2")
 
 
 class DifferentiableProgram(NamedTuple):
@@ -25,14 +32,26 @@ class DifferentiableProgram(NamedTuple):
 
     The loops say so in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals vanish,
     and with them whatever they multiply.
+
+    Second derivatives are those of x corrected twice by the factors at hand, x + (J C J^T)^(-1) (b - J C J^T x): each correction
+    makes derivatives of one more order right.
     """
 
     program: LoopProgram
     parts: Sequence[KernelLoop | Reset]
+    second_parts: Sequence[KernelLoop | Reset]
 
     def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
         """Return the derivative, with further arrays fixed."""
         return LoopDerivative(self.parts, {*NOT_DIFFERENTIATED, *fixed})
+
+    def in_mode(self, mode: str, fixed: Collection[str] = ()) -> LoopProgram:
+        """Return the program of a mode of differentiation, with further arrays fixed."""
+        if mode == TWICE:
+            twice = LoopDerivative(self.second_parts, {*NOT_DIFFERENTIATED, *fixed} - {"x0"})
+            return twice.second(SETTLED)
+        derivative = self.derivative(fixed)
+        return derivative.reverse if mode == REVERSE else derivative.forward
 
 
 class DifferentiablePrograms:
@@ -66,13 +85,29 @@ class DifferentiablePrograms:
         copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
         position = [*terms.element_terms(("psi",), "v", 1), *solver.solve(1), self._correction("q", 1)]
         at_q1 = terms.element_terms(("psi_dot",), "v", 2, q="q1", sines="sines1")
+        at_rest = [Reset(x, 0, terms.layout.sizes[x]) for x in ("x0", "jt_x0", "z")]  # no correction is left
+        second = [*self._corrected("psi"), terms.add("q1", start="q", solution=0, sign=-1)]
+        second += [*self._corrected("psi_dot", q="q1", sines="sines1"), terms.add("v1", start="v", solution=0, sign=-1)]
         return DifferentiableProgram(
-            program(solver.position_terms("psi_q"), solver.factorize_dropping, copies),
+            program(solver.position_terms("psi_q"), solver.factorize_dropping, copies, at_rest),
             [*position, *at_q1, *solver.solve(2), self._correction("v", 2)],
+            second,
         )
 
     def _correction(self, x: str, solve: int) -> KernelLoop:
         return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
+
+    def _corrected(self, right: str, **names: str) -> Parts:
+        """x0, which is known and changes by what two corrections change by, and jt_x0."""
+        terms = self._solver.terms
+        yield Reset("x0", 0, terms.layout.sizes["x0"])
+        for solve in (1, 2):
+            yield from terms.transposed(**names)
+            yield terms.add("z", solution=0)
+            yield from terms.difference(right, solve, **names)
+            yield from self._solver.elimination.substitute(solve)
+            yield from terms.correct_solution(solve)
+        yield from terms.transposed(**names)
 
     def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, to: str, sign: int) -> DifferentiableProgram:
         """x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
@@ -83,4 +118,5 @@ class DifferentiablePrograms:
         return DifferentiableProgram(
             program(system, solver.solve(), [z, result], [solver.safe] if to == "a" else []),
             [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],
+            [*loads, *self._corrected(right), terms.add(to, start=x, solution=0, sign=sign)],
         )

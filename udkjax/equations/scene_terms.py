@@ -276,14 +276,50 @@ class SceneTerms:
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                outputs, n = group.programs.outputs, group.coordinates
-                entries = [outputs["psi_q"][row * n : (row + 1) * n] for row in group.rows]
+                outputs, n, entries = group.programs.outputs, group.coordinates, _entries(group)
                 z = [w.read("z", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(n)]
                 for i, row in enumerate(group.rows):
                     w.write(outputs[output][row] - dot(w.graph, entries[i], z), "right1", RIGHT, i)
                 _write_jt(w, group, entries, [w.read("x0", RIGHT, i) for i in rows(group)], "jt_x0")
 
             yield self.over_group(("residual", output), group, write, fixed=("x0", "z"), v=v)
+
+    def transposed(self, **names: str) -> Parts:
+        """jt_x0 = Psi_q^T x0, with Psi_q as a function of the state."""
+        yield Reset("jt_x0", 0, self.layout.coordinate_count)
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                _write_jt(w, group, _entries(group), [w.read("x0", RIGHT, i) for i in rows(group)], "jt_x0")
+
+            yield self.over_group("transposed", group, write, **names)
+
+    def difference(self, output: str, solve: int, **names: str) -> Parts:
+        """right = b - Psi_q z of a linear system, with Psi_q and b as functions of the state."""
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                z = [w.read("z", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
+                for i, (row, entries) in enumerate(zip(group.rows, _entries(group), strict=True)):
+                    w.write(group.programs.outputs[output][row] - dot(w.graph, entries, z), "right", RIGHT, i)
+
+            yield self.over_group(("difference", output), group, write, right=f"right{solve}", **names)
+
+    def correct_solution(self, solve: int) -> Parts:
+        """x0 + x, with x of a linear system, in place of x0."""
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                for i in rows(group):
+                    w.write(w.read("x", RIGHT, i), "x0", RIGHT, i, ADD)
+
+            yield KernelLoop(self.kernel(("correct", len(group.rows)), write), group.table, {"x": f"x{solve}"})
+
+
+def _entries(group: ConstraintGroup) -> list[list[Scalar]]:
+    """Return the entries of the eliminated rows of Psi_q of a group, as functions of the state."""
+    n = group.coordinates
+    return [group.programs.outputs["psi_q"][row * n : (row + 1) * n] for row in group.rows]
 
 
 def rows(group: ConstraintGroup) -> range:

@@ -6,12 +6,13 @@ of the loops, but whatever the programs need.
 
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
-from udkjax.equations.differentiable_programs import DifferentiableProgram
+from udkjax.equations.differentiable_programs import FORWARD, PREFIXES, REVERSE, TWICE, DifferentiableProgram
 from udkjax.equations.scene_programs import RESULTS, ScenePrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
-from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
+from udkjax.expressions.loop_derivative import COTANGENT, OTHER, SECOND, TANGENT
 from udkjax.expressions.loop_program import LoopProgram
 from udkjax.expressions.unroll import Arrays, unroll
 
@@ -43,7 +44,7 @@ class WrittenOut:
         names: Which of them.
         differentiated: Which of the differentiable ones: the names of `ScenePrograms.differentiable`.
         active: Of the numbers that the prologue takes: along which there are derivatives.
-        reverse: Whether derivatives are transposed: from cotangents of the results to those of q, v and the constants.
+        mode: Of derivatives: `FORWARD`, `TWICE`; `REVERSE`, from cotangents of the results to those of q, v and the constants.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class WrittenOut:
         names: Sequence[str],
         differentiated: Sequence[str] = (),
         active: Sequence[bool] = (),
-        reverse: bool = False,
+        mode: str = FORWARD,
     ):
         graph = self.graph = Graph()
         n, count = programs.coordinate_count, programs.number_count
@@ -70,7 +71,7 @@ class WrittenOut:
         moved = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
         self.moving = [k for k, s in sorted(layout.items()) if s.index in moved]
         """The constants of the loops along which there are derivatives; programs count these alone."""
-        self._derivatives = {x: self._differentiate(programs.differentiable[x], n, reverse) for x in differentiated}
+        self._derivatives = {x: self._differentiate(programs.differentiable[x], n, mode) for x in differentiated}
         wanted = [
             s for found in (*self._results.values(), *(x for d in self._derivatives.values() for x in d)) for s in found.values()
         ]
@@ -96,21 +97,30 @@ class WrittenOut:
         evaluation = self._program(results | {place: s for s, place in at.items()}, {})
         return WrittenOutDerivative(evaluation, self._program(outputs, at | self._seeds))
 
-    def prologue_derivative(self, active: Sequence[bool], reverse: bool) -> WrittenOutProgram:
+    def prologue_derivative(self, active: Sequence[bool], mode: str) -> WrittenOutProgram:
         """Return the program from the changes of the active numbers to those of the moving constants, or its transpose."""
         graph, layout = self.graph, self._arrays["constants"]
         numbers = {s: ("numbers", k) for k, s in enumerate(self.numbers)}
         variables = [s for s, is_active in zip(self.numbers, active, strict=False) if is_active]
         values = [layout[k] for k in self.moving]
-        seeded, prefix = (values, COTANGENT + "constants") if reverse else (variables, TANGENT + "numbers")
-        places = range(len(values)) if reverse else [k for _, k in (numbers[s] for s in variables)]
-        seeds = {graph.input((prefix, k), "tangent"): (prefix, k) for k in places}
-        if reverse:
+
+        def seeds_of(name: str, places: Sequence[int]) -> dict[Scalar, Place]:
+            return {graph.input((name, k), "tangent"): (name, k) for k in places}
+
+        if mode == REVERSE:
+            seeds = seeds_of(COTANGENT + "constants", range(len(values)))
             found = dict(zip(variables, cotangents(graph, values, list(seeds), variables), strict=True))
             outputs = {(COTANGENT + "numbers", k): found.get(s, graph.constant(0.0)) for s, (_, k) in numbers.items()}
         else:
-            found = tangents(graph, values, dict(zip(seeded, seeds, strict=True)))
-            outputs = {(TANGENT + "constants", k): s for k, s in enumerate(found)}
+            places = [numbers[s][1] for s in variables]
+            seeds, found = {}, {}
+            for prefix in (TANGENT, OTHER) if mode == TWICE else (TANGENT,):
+                some = seeds_of(prefix + "numbers", places)
+                found[prefix] = tangents(graph, values, dict(zip(variables, some, strict=True)))
+                seeds |= some
+            if mode == TWICE:
+                found[SECOND] = tangents(graph, found[TANGENT], dict(zip(variables, some, strict=True)))
+            outputs = {(prefix + "constants", k): s for prefix, scalars in found.items() for k, s in enumerate(scalars)}
         program = ScalarProgram(graph, [*numbers, *seeds], list(outputs.values()))
         return WrittenOutProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
 
@@ -127,24 +137,23 @@ class WrittenOut:
         """The inputs of derivatives that are tangents or cotangents."""
         return {}
 
-    def _differentiate(
-        self, given: DifferentiableProgram, n: int, reverse: bool
-    ) -> tuple[dict[Place, Scalar], dict[Place, Scalar]]:
+    def _differentiate(self, given: DifferentiableProgram, n: int, mode: str) -> tuple[dict[Place, Scalar], dict[Place, Scalar]]:
         """Return the results, and their changes, or the cotangents of what they depend on."""
-        arrays, derivative = self._unroll(given.program), given.derivative()
-        results = [x for x in ("a", "q1", "v1") if x in arrays]
+        arrays = self._unroll(given.program)
+        results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
         variables = {"constants": self.moving, "q": range(n), "v": range(n)}
-        prefix, program = (COTANGENT, derivative.reverse) if reverse else (TANGENT, derivative.forward)
-        group = "cotangent" if reverse else "tangent"
-        seeded = {x: range(n) for x in results} if reverse else variables
-        seeds = {prefix + x: {k: self.graph.input((x, k), group) for k in places} for x, places in seeded.items()}
+        prefixes, program = PREFIXES[mode], given.in_mode(mode)
+        group = "cotangent" if mode == REVERSE else "tangent"
+        seeded, sought = (results, variables) if mode == REVERSE else (variables, results)
+        seeds: Arrays = {}
+        for prefix, (x, places) in product(prefixes, seeded.items()):
+            seeds[prefix + x] = {k: self.graph.input((prefix + x, k), group) for k in places}
         self._seeds |= {s: (x, i) for x, scalars in seeds.items() for i, s in enumerate(scalars.values())}
-        found = self._unroll(program, arrays | seeds, group)
-        outputs = variables if reverse else {x: range(n) for x in results}
-        zero = self.graph.constant(0.0)
-        changes = {
-            (prefix + x, i): found.get(prefix + x, {}).get(k, zero) for x, places in outputs.items() for i, k in enumerate(places)
-        }
+        found = self._unroll(program, arrays | seeds, None if mode == TWICE else group)
+        changes = {}
+        for prefix, (x, places) in product(prefixes, sought.items()):
+            some = found.get(prefix + x, {})
+            changes |= {(prefix + x, i): some.get(k, self.graph.constant(0.0)) for i, k in enumerate(places)}
         return _entries(arrays, ("a", "safe")), changes
 
 

@@ -5,6 +5,7 @@ must still be there: no number is written again once it has been read.
 """
 
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from udkjax.expressions.loop_program import ADD, SET, Address, Kernel, KernelLoo
 from udkjax.expressions.scalar_program import ScalarProgram
 
 TANGENT, COTANGENT = "d_", "bar_"
+OTHER, SECOND = "e_", "de_"  # the changes along another direction, and along both
 
 
 class LoopDerivative:
@@ -21,7 +23,7 @@ class LoopDerivative:
 
     def __init__(self, parts: Sequence[KernelLoop | Reset], fixed: Collection[str]):
         self._parts, self._fixed = list(parts), frozenset(fixed)
-        self._kernels: dict[tuple[str, Kernel, frozenset[str]], Kernel | None] = {}
+        self._kernels: dict[tuple[str, Kernel, frozenset[str], frozenset[str]], Kernel | None] = {}
 
     @property
     def forward(self) -> LoopProgram:
@@ -44,14 +46,34 @@ class LoopDerivative:
                 parts += self._differentiate(part, COTANGENT, self._pull_back, part.table[::-1])
         return LoopProgram(parts)
 
-    def _differentiate(self, part: KernelLoop, prefix: str, write: Callable, table: np.ndarray) -> list[KernelLoop]:
+    def second(self, settled: Collection[str]) -> LoopProgram:
+        """Return the program of the changes of all arrays along two directions and along both: d x, e x, and d(e x).
+
+        Each kernel finds the three of its results at once, so that a number may be added to once it has been read. Arrays
+        that are `settled` change to second order alone.
+        """
+        parts: list[KernelLoop | Reset] = []
+        for part in self._parts:
+            if isinstance(part, Reset):
+                if part.array not in self._fixed:
+                    prefixes = (SECOND,) if part.array in settled else (TANGENT, OTHER, SECOND)
+                    parts += [Reset(prefix + part.array, part.start, part.count) for prefix in prefixes]
+            else:
+                still = frozenset(name for name in part.kernel.arrays if part.array(name) in settled)
+                parts += self._differentiate(part, SECOND, partial(_push_twice, still=still), part.table, still)
+        return LoopProgram(parts)
+
+    def _differentiate(
+        self, part: KernelLoop, prefix: str, write: Callable, table: np.ndarray, still: frozenset[str] = frozenset()
+    ) -> list[KernelLoop]:
         named = {x.array for x in (*part.kernel.inputs, *part.kernel.outputs)}
         constant_arrays = frozenset(name for name in named if part.array(name) in self._fixed or name in part.fixed)
-        key = prefix, part.kernel, constant_arrays
+        key = prefix, part.kernel, constant_arrays, still
         if key not in self._kernels:
             self._kernels[key] = write(part.kernel, constant_arrays)
         kernel = self._kernels[key]
-        names = {**part.names, **{prefix + x: prefix + y for x, y in part.names.items()}}
+        prefixes = (TANGENT, OTHER, SECOND) if prefix == SECOND else (prefix,)
+        names = {**part.names, **{prefix + x: prefix + y for prefix in prefixes for x, y in part.names.items()}}
         return [] if kernel is None else [KernelLoop(kernel, table, names)]
 
     def _push_forward(self, kernel: Kernel, constant_arrays: frozenset[str]) -> Kernel | None:
@@ -64,7 +86,7 @@ class LoopDerivative:
         places = [address for _, address in (*stored, *added)]
         writes = [(s, address) for s, address in zip(found, places, strict=True) if address.update == SET or not s.is_zero]
         reads = [(seeds[s], address) for s, address in active]
-        return _kernel(kernel, reads, writes, TANGENT)
+        return _kernel(kernel, _prefixed(reads, TANGENT), _prefixed(writes, TANGENT))
 
     def _pull_back(self, kernel: Kernel, constant_arrays: frozenset[str]) -> Kernel | None:
         active, outputs = _active(kernel, constant_arrays)
@@ -74,7 +96,8 @@ class LoopDerivative:
         found = cotangents(graph, [s for s, _ in outputs], seeds, [s for s, _ in active], given)
         places = [address._replace(update=ADD) for _, address in active]
         writes = [(s, address) for s, address in zip(found, places, strict=True) if not s.is_zero]
-        return _kernel(kernel, list(zip(seeds, (address for _, address in outputs), strict=True)), writes, COTANGENT)
+        reads = list(zip(seeds, (address for _, address in outputs), strict=True))
+        return _kernel(kernel, _prefixed(reads, COTANGENT), _prefixed(writes, COTANGENT))
 
 
 Addressed = list[tuple[Scalar, Address]]
@@ -92,12 +115,33 @@ def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed,
     return [x for x in inputs if x[1].array not in constant_arrays], [x for x in outputs if x[1].array not in constant_arrays]
 
 
-def _kernel(kernel: Kernel, seeds: Addressed, outputs: Addressed, prefix: str) -> Kernel | None:
-    """Return a kernel that also takes `seeds`, with its results in arrays with a prefix."""
+def _push_twice(kernel: Kernel, constant_arrays: frozenset[str], still: frozenset[str]) -> Kernel | None:
+    active, outputs = _active(kernel, constant_arrays)
+    graph, results = kernel.program.graph, [s for s, _ in outputs]
+    moving = {prefix: [x for x in active if x[1].array not in still] for prefix in (TANGENT, OTHER)} | {SECOND: active}
+    seeds = {prefix: {s: graph.input((prefix, s.index), "tangent") for s, _ in some} for prefix, some in moving.items()}
+    one, other = (tangents(graph, results, seeds[prefix]) for prefix in (TANGENT, OTHER))
+    first = seeds[OTHER] | {d: seeds[SECOND][s] for s, d in seeds[TANGENT].items()}
+    settled = {s: d for s, d in seeds[SECOND].items() if s not in seeds[TANGENT]}
+    both = [a + b for a, b in zip(tangents(graph, one, first), tangents(graph, results, settled), strict=True)]
+    reads, writes = [], []
+    for prefix, found in {TANGENT: one, OTHER: other, SECOND: both}.items():
+        reads += _prefixed([(seeds[prefix][s], address) for s, address in moving[prefix]], prefix)
+        written = [(s, x) for s, (_, x) in zip(found, outputs, strict=True) if prefix == SECOND or x.array not in still]
+        writes += _prefixed([(s, x) for s, x in written if x.update == SET or not s.is_zero], prefix)
+    return _kernel(kernel, reads, writes)
+
+
+def _prefixed(addressed: Addressed, prefix: str) -> Addressed:
+    """Return the same of arrays with a prefix."""
+    return [(s, address._replace(array=prefix + address.array)) for s, address in addressed]
+
+
+def _kernel(kernel: Kernel, seeds: Addressed, outputs: Addressed) -> Kernel | None:
+    """Return a kernel that also takes `seeds`, and writes other results."""
     if not outputs:
         return None
     inputs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))
-    inputs += [(s, address._replace(array=prefix + address.array, update=SET)) for s, address in seeds]
-    places = [address._replace(array=prefix + address.array) for _, address in outputs]
+    inputs += [(s, address._replace(update=SET)) for s, address in seeds]
     program = ScalarProgram(kernel.program.graph, [s for s, _ in inputs], [s for s, _ in outputs])
-    return Kernel(program, [address for _, address in inputs], places)
+    return Kernel(program, [address for _, address in inputs], [address for _, address in outputs])

@@ -1,7 +1,5 @@
 """The closure of a mechanism as a function of its numbers: by machine code or by JAX, with derivatives of any order."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,11 +36,10 @@ class AssemblyFunction(DifferentiableFunction):
     """q and v of a closed state as a function of the numbers of a guess: a mechanism, its analysis, and t, q and v."""
 
     guess: TreeOfNumbers
-    is_plain: bool = eqx.field(static=True, default=False)
 
     @property
-    def plain(self) -> "AssemblyFunction":
-        return replace(self, is_plain=True)
+    def orders(self) -> int:
+        return 1
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         return list(close_by_jax(*self.guess(xs))[:2])
@@ -71,7 +68,7 @@ class AssemblyFunction(DifferentiableFunction):
         which = self.guess.marks(has_tangent)
         mechanism, analysis, t, q, v = self.guess(xs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
-        if self.is_plain or others or not native_closing.can_close(mechanism):
+        if others or not native_closing.can_close(mechanism):
             return None, None
         return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
 

@@ -5,7 +5,7 @@ code where that serves, else diffrax's. Both together are one linear map with it
 so that no derivative is ever transposed operation by operation.
 """
 
-from dataclasses import replace
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -83,15 +83,15 @@ def _(primals, tangents):
 class DifferentiableRun(DifferentiableFunction):
     """Positions and velocities at the output times, and at the end, of the numbers of a problem.
 
-    Derivatives beyond the first are those of diffrax alone: `plain`.
+    Derivatives beyond the second are those of diffrax alone.
     """
 
     problem: TreeOfNumbers
     native: bool = eqx.field(static=True)
 
     @property
-    def plain(self) -> "DifferentiableRun":
-        return replace(self, native=False)
+    def orders(self) -> int:
+        return 2 if self.native else 0
 
     def fast(self, xs: list[Array]) -> IntegratorOutput:
         """Return the run by machine code, which has no derivatives, if that serves."""
@@ -99,23 +99,34 @@ class DifferentiableRun(DifferentiableFunction):
         return native_engine.integrate(problem) if self.native else _integrate_by_diffrax(problem)
 
     def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
-        return super().forward(xs, active, vs, run) if run is None else self.run_and_jvp(xs, active, vs)[1]
+        del run
+        return self.run_and_jvp(xs, active, vs)[1]
 
     def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
-        if run is None:
-            return self.pull(xs, active, ws)
         problem, which = self.problem(xs), self.problem.marks(active)
         if self._is_native(xs, active):
+            if run is None:
+                raw, record = self.recorded(xs, active)
+                run = (raw.q, raw.v), record
             q, v, y = ws
             found = native_engine.vjp(problem, which, run, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
             return [bar for m, bar in pairs if m is True]
+        if run is None:
+            return self.pull(xs, active, ws)
 
         def function(some: list[Array]) -> list[Array]:
             raw = _integrate_by_diffrax(self.problem(replaced(xs, active, some)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
         return jax.vjp(function, select(xs, active))[1](ws)[0]
+
+    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
+        either, problem = tuple(map(operator.or_, active, others)), self.problem(xs)
+        if not self._is_native(xs, either) or problem.compiled.plan.operation.sampled:
+            return super().twice(xs, active, vs, others, us)
+        changes = ((self.problem.marks(which), self.problem.changes(which, dxs)) for which, dxs in ((active, vs), (others, us)))
+        return list(native_engine.second_derivative(problem, self.problem.marks(either), *changes))
 
     def run_and_jvp(self, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """Return the run, and the change of its states along v of those of x that are active: by machine code, if that serves."""

@@ -4,9 +4,12 @@ A derivative of the map is one of two functions again, of x and a direction v, o
 
     g(x, v) = J(x) v,        h(x, w) = J(x)^T w.
 
-Forward mode of both is JAX's. In reverse mode, since w^T J(x) v is one number, of which derivatives may be taken in any order,
-the cotangents of x are d/dx (w^T J v) = dh(x, w) along v, and those of v and w are h and g. There h is found row by row, w^T J e
-for each unit vector e, so that forward mode through diffrax is all that derivatives of higher orders take.
+Both change by the second derivative D^2 f along two directions, and by g and h themselves, which are linear in v and w:
+
+    dg = D^2 f [v, dx] + J dv,        dh_i = w^T D^2 f [dx, e_i] + (J^T dw)_i        for each unit vector e_i,
+
+and since w^T J(x) v is one number, the cotangents of x are w^T D^2 f [v, e_i], those of v and w h and g. So second derivatives
+along pairs of directions are all that takes; those of higher orders are found so by forward mode of JAX.
 """
 
 import math
@@ -36,13 +39,10 @@ class DifferentiableFunction(eqx.Module):
     def __call__(self, xs: list[Array]) -> list[Array]:
         """Return f(x)."""
 
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        """Return J^T w, of those of x that are active: w^T J e for each unit vector e. Forward mode of it is JAX's, too."""
-        some = select(xs, active)
-        units = jnp.eye(sum(x.size for x in some))
-        shapes = [x.shape for x in some]
-        row = lambda e: jnp.vdot(_flat(ws), _flat(change_along(self, xs, active, _split(e, shapes))[1]))  # noqa: E731
-        return _split(jax.vmap(row)(units), shapes)
+    @property
+    def orders(self) -> int:
+        """The order up to which its derivatives are machine code."""
+        return 0
 
     @abstractmethod
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
@@ -58,10 +58,13 @@ class DifferentiableFunction(eqx.Module):
         del run
         return self.pull(xs, active, ws)
 
-    @property
-    def plain(self) -> "DifferentiableFunction":
-        """The same in the form that is differentiated more than once."""
-        return self
+    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
+        """Return J^T w, of those of x that are active, as a function whose forward mode is JAX's."""
+        return _by_rows(lambda es: change_along(self, xs, active, es)[1], xs, active, ws)
+
+    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
+        """Return D^2 f [v, u], along v of those of x that are active, and u of others."""
+        return change_along(lambda xs: change_along(self, xs, active, vs)[1], xs, others, us)[1]
 
 
 class Along(DifferentiableFunction):
@@ -74,17 +77,34 @@ class Along(DifferentiableFunction):
         xs, vs = self.parts(xs)
         return change_along(self.of, xs, self.active, vs)[1]
 
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        xs, vs = self.parts(xs)
-        of_x, of_v = active[: len(xs)], active[len(xs) :]
-        either = tuple(a or b for a, b in zip(of_x, self.active, strict=True))
-        found, change = change_along(lambda xs: self.of.pull(xs, either, ws), xs, self.active, vs)
-        change = select(change, tuple(x for x, e in zip(of_x, either, strict=True) if e))
-        found = select(found, tuple(m for m, e in zip(self.active, either, strict=True) if e))
-        return [*change, *select(found, of_v)]
+    @property
+    def orders(self) -> int:
+        return self.of.orders - 1
 
-    def parts(self, xs: list[Array]) -> tuple[list[Array], list[Array]]:
+    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
+        del run
+        (xs, directions), (of_x, of_v) = self.parts(xs), self.parts(active)
+        dxs, dvs = vs[: sum(of_x)], vs[sum(of_x) :]
+        found = [jnp.zeros(shape) for shape in self.shapes([*xs, *directions])]
+        if dxs:
+            found = self.of.twice(xs, self.active, directions, of_x, dxs)
+        if dvs:
+            found = [a + b for a, b in zip(found, self.of.forward(xs, self._those(of_v), dvs, None), strict=True)]
+        return found
+
+    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
+        del run
+        (xs, directions), (of_x, of_v) = self.parts(xs), self.parts(active)
+        found = _by_rows(lambda es: self.of.twice(xs, self.active, directions, of_x, es), xs, of_x, ws)
+        return [*found, *(self.of.backward(xs, self._those(of_v), ws, None) if any(of_v) else [])]
+
+    def parts(self, xs: Sequence[Any]) -> tuple[Any, Any]:
         return xs[: len(self.active)], xs[len(self.active) :]
+
+    def _those(self, which: Mask) -> Mask:
+        """Return a mask of x, from one of those that are active."""
+        rest = iter(which)
+        return tuple(m and next(rest) for m in self.active)
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         return self.of.shapes(self.parts(xs)[0])
@@ -97,18 +117,35 @@ class Back(Along):
         xs, ws = self.parts(xs)
         return self.of.pull(xs, self.active, ws)
 
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        (xs, bars), directions = self.parts(xs), ws
-        of_x, of_w = active[: len(xs)], active[len(xs) :]
-        found = []
-        if any(of_x):
-            found += change_along(lambda xs: self.of.pull(xs, of_x, bars), xs, self.active, directions)[1]
-        if any(of_w):
-            found += select(change_along(self.of, xs, self.active, directions)[1], of_w)
+    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
+        del run
+        (xs, bars), (of_x, of_w) = self.parts(xs), self.parts(active)
+        dxs, dws = vs[: sum(of_x)], vs[sum(of_x) :]
+        found = [jnp.zeros(x.shape) for x in select(xs, self.active)]
+        if dxs:
+            found = _by_rows(lambda es: self.of.twice(xs, of_x, dxs, self.active, es), xs, self.active, bars)
+        if dws:
+            dws = replaced([jnp.zeros(x.shape) for x in bars], of_w, dws)
+            found = [a + b for a, b in zip(found, self.of.backward(xs, self.active, dws, None), strict=True)]
         return found
+
+    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
+        del run
+        (xs, bars), (of_x, of_w) = self.parts(xs), self.parts(active)
+        found = _by_rows(lambda es: self.of.twice(xs, self.active, ws, of_x, es), xs, of_x, bars)
+        return [*found, *(select(self.of.forward(xs, self.active, ws, None), of_w) if any(of_w) else [])]
 
     def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
         return [x.shape for x in select(self.parts(xs)[0], self.active)]
+
+
+def _by_rows(rate: Callable[[list[Array]], list[Array]], xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
+    """Return the gradient of w^T r(e) of a linear function r of changes e of those of x that are active: of each unit vector."""
+    some = [x.shape for x in select(xs, active)]
+    if not some:
+        return []
+    row = lambda e: jnp.vdot(_flat(ws), _flat(rate(_split(e, some))))  # noqa: E731
+    return _split(jax.vmap(row)(jnp.eye(sum(map(math.prod, some)))), some)
 
 
 def change_along(function: Callable, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[Any, Any]:
@@ -159,11 +196,11 @@ def _derivative(primals, tangents):
     found = _bind(linear, vector)
     if all(dx is None for dx in at.xs):
         return found, _bind(linear, change)
-    kind, function = Back if linear.transposed else Along, linear.function
+    kind = Back if linear.transposed else Along
     parts = [None] * len(linear.inputs) if change is None else _split(change, linear.inputs)
     dxs = [*at.xs, *parts]
     active = tuple(dx is not None for dx in dxs)
-    further = Linear(kind(function.plain, linear.active), [*linear.xs, *_split(vector, linear.inputs)], None, active)
+    further = Linear(kind(linear.function, linear.active), [*linear.xs, *_split(vector, linear.inputs)], None, active)
     return found, _bind(further, _flat(select(dxs, active)))
 
 
@@ -177,14 +214,14 @@ _linear_p = linear_primitive("derivative_of_a_run", _apply, _shape, _derivative,
 
 
 @eqxi.filter_primitive_def
-def _apply_first(linear, vector):
-    """Apply a map of first derivatives; those of higher orders take diffrax's loops, which are compiled in any case."""
-    if linear.run is None:
+def _apply_short(linear, vector):
+    """Apply a map of machine code; others take diffrax's loops, which are compiled in any case."""
+    if linear.run is None and linear.function.orders < 1:
         raise TooLongError
     return _apply(linear, vector)
 
 
-expand_as(_linear_p, lambda **parameters: partial(_apply_first, **parameters))
+expand_as(_linear_p, lambda **parameters: partial(_apply_short, **parameters))
 
 
 def _bind(linear: Linear, vector: Array) -> Array:

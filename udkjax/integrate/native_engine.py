@@ -21,7 +21,7 @@ from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tang
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.formulations import formulation_tol
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
-from udkjax.native.operations import MarkRows, RunStates
+from udkjax.native.operations import MarkRows, RunStates, RunTangents
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
@@ -77,15 +77,31 @@ def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
-    operation, n = _operation(problem, active), len(problem.q)
-    tangents = number_tangents(_numbers_of(problem), _active_of(problem, active), _numbers_of(problem, change))
-    along = jnp.asarray(numbers_as_vector(tangents))
-    dq, dv = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
-    directions = [along, dq, dv]
-    if operation.sampled:
-        directions.insert(0, problem.compiled.samples.changes(change.textbook.mechanism))
+    return _integrate_along(problem, [(active, change)], _operation(problem, active))
+
+
+def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
+    """Return the second derivatives of positions, velocities and the end along two changes, each of what is active in it."""
+    run = problem.compiled.plan.operation
+    assert run is not None  # who comes here has asked whether there is one
+    operation = run.with_second_tangents(active_numbers(_numbers_of(problem), _active_of(problem, active)))
+    return _integrate_along(problem, changes, operation)[1]
+
+
+def _integrate_along(
+    problem: Problem, changes: Sequence[tuple[Any, Any]], operation: RunTangents
+) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
+    n, samples, directions = len(problem.q), [], []
+    for active, change in changes:
+        tangents = number_tangents(_numbers_of(problem), _active_of(problem, active), _numbers_of(problem, change))
+        state = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
+        directions += [jnp.asarray(numbers_as_vector(tangents)), *state]
+        samples += [problem.compiled.samples.changes(change.textbook.mechanism)] if operation.sampled else []
     *found, dys, dend = native_p.bind(
-        *_inputs(problem, operation), *(x[None, None] for x in directions), operation=operation, times=len(problem.ts)
+        *_inputs(problem, operation),
+        *(x[None, None] for x in (*samples, *directions)),
+        operation=operation,
+        times=len(problem.ts),
     )
     return _output(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 

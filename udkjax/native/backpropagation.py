@@ -14,9 +14,10 @@ Members walk back side by side, in lanes; the next ones follow when all are back
 
 from collections.abc import Sequence
 
+from udkjax.equations.differentiable_programs import REVERSE
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import Lane, Plan
-from udkjax.native.prologue import REVERSE, write_prologue_derivative
+from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.record import Recorded
 from udkjax.native.runge_kutta import stage_state
 from udkjax.native.samples import ARGUMENTS, count_breakpoints, numbers_of_row
@@ -28,7 +29,7 @@ class Reverse(Recorded):
 
     inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar", "record")
-    reverse = True
+    mode = REVERSE
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
@@ -53,7 +54,7 @@ class Reverse(Recorded):
         for each in self._linearizations:
             each.reverse()
         if self.count:
-            write_prologue_derivative(self, self.active, True)
+            write_prologue_derivative(self, self.active, REVERSE)
         self._write_transposed_differences()
         self._write_step_back()
         self._write_leave_row()
@@ -329,7 +330,7 @@ class Reverse(Recorded):
         member, row = self.to_int(f, self._lane(f, "member", k)), self._lane(f, "row", k)
         sampled = self.plan.sampled
         numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, call, "numbers", member)
-        f.call(REVERSE, numbers, constants, bars, found)
+        f.call(PROLOGUE[REVERSE], numbers, constants, bars, found)
         if sampled:
             rows = (f.load(call, self.call_fields.index("knots"), base=INT) + 1) * len(sampled)
             to = f.at(self._result(f, call, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))

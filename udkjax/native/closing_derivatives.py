@@ -8,12 +8,13 @@ are differentiated as corrections.py has it.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+from udkjax.equations.differentiable_programs import FORWARD, REVERSE
 from udkjax.equations.position_closure import CLOSURE_ITERATIONS, VELOCITIES
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.closing import CORRECTED, Closing
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Layout
-from udkjax.native.prologue import FORWARD, REVERSE, write_prologue_derivative
+from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 
 
 class ClosingDerivative(Closing):
@@ -56,7 +57,7 @@ class ClosingForward(ClosingDerivative):
             w.add(name, self.n)
 
     def write_derivatives(self):
-        write_prologue_derivative(self, self.active, False)
+        write_prologue_derivative(self, self.active, FORWARD)
         for x, correction in self.corrections.items():
             correction.write_adjoint()
             correction.forward()
@@ -105,7 +106,7 @@ class ClosingForward(ClosingDerivative):
                 with f.each(count) as i:
                     self._set(f, to, i, f.load(start, p * count + i), "tangent")
             dnumbers, dconstants = (f.at(f.given["tangent"], self.tangents[x]) for x in ("numbers", "constants"))
-            f.call(FORWARD, self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
+            f.call(PROLOGUE[FORWARD], self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
 
     def _finish_closing(self, f: Function, member: Value):
         call = self.call_record(f)
@@ -128,6 +129,7 @@ class ClosingForward(ClosingDerivative):
 class ClosingReverse(ClosingDerivative):
     """Closing, and back: its corrections are recorded and walked back from a cotangent of the state."""
 
+    mode = REVERSE
     inputs = ("statebar",)
     outputs = ("numbersbar", "qbar", "vbar")
 
@@ -147,7 +149,7 @@ class ClosingReverse(ClosingDerivative):
             p.add(name, n)
 
     def write_derivatives(self):
-        write_prologue_derivative(self, self.active, True)
+        write_prologue_derivative(self, self.active, REVERSE)
         for x, correction in self.corrections.items():
             correction.write_adjoint()
             correction.reverse()
@@ -216,7 +218,7 @@ class ClosingReverse(ClosingDerivative):
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_v"), pull("pull_q"))
         constants, bars, to = (self.address(f, x) for x in ("constants", "total bar constants", "numbersbar"))
-        f.call(REVERSE, self.member_address(f, call, "numbers", member), constants, bars, to)
+        f.call(PROLOGUE[REVERSE], self.member_address(f, call, "numbers", member), constants, bars, to)
         for name, place, count in (
             ("numbersbar", "numbersbar", self.code.number_count),
             ("qbar", "bar iterate q", self.n),

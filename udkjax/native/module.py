@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
+from udkjax.equations.differentiable_programs import FORWARD
 from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
 from udkjax.native.ir import POINTER, Function, Value
 from udkjax.native.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
@@ -33,10 +34,11 @@ class Module(Memory):
         plan: What the code depends on.
         differentiated: Of which differentiable programs of the scene the module takes derivatives.
         active: Of the numbers of the scene: along which there are derivatives.
-        reverse: Whether these are of reverse mode.
     """
 
-    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = (), reverse: bool = False):
+    mode = FORWARD  # of derivatives
+
+    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
         self.plan, self.code, self.method = plan, plan.code, plan.method
         code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
         self.n, self.m = n, m
@@ -50,7 +52,7 @@ class Module(Memory):
         self.takes_dense_rows = self.is_dense or self.is_formulated
         self.pieces = code.piece_count if plan.breaks else 0
         self.programs = {name: getattr(code, name) for name in self.program_names()}
-        self.written_out = WrittenOut(code, list(self.programs), differentiated, active, reverse) if plan.written_out else None
+        self.written_out = WrittenOut(code, list(self.programs), differentiated, active, self.mode) if plan.written_out else None
         self.constants = len(self.written_out.constants if self.written_out else code.constants)
         self.moving = range(self.constants if any(active) else 0) if self.written_out is None else self.written_out.moving
         """The constants, by their numbers in the layout of the scene, along which there are derivatives."""

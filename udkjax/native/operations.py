@@ -24,7 +24,7 @@ from udkjax.native.record import STORED, record_length
 from udkjax.native.row_marks import RowMarks
 from udkjax.native.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
 from udkjax.native.tableau import Method
-from udkjax.native.tangents import Forward
+from udkjax.native.tangents import Forward, ForwardTwice
 from udkjax.native.trajectory import Trajectory
 
 Shape = tuple[int, ...]
@@ -123,6 +123,10 @@ class RunStates(Operation):
         """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
         return RunTangents(**self._for_derivatives, active=active)
 
+    def with_second_tangents(self, active: tuple[bool, ...]) -> "RunSecondTangents":
+        """Return the operation that finds second derivatives along pairs of directions of what is active."""
+        return RunSecondTangents(**self._for_derivatives, active=active)
+
     def with_cotangents(self, active: tuple[bool, ...], points: int) -> "RunCotangents":
         """Return the operation that walks back to the numbers that are active, by a record of so many points."""
         return RunCotangents(**self._for_derivatives, active=active, points=points)
@@ -157,6 +161,18 @@ class RunTangents(RunStates):
         directions, n = inputs[-1].shape[1], self.coordinates
         changes = [(members, directions, times, 2 * n), (members, directions, 2 * n)]
         return [*super().outputs(inputs, members, times), *changes]
+
+
+@dataclass(frozen=True)
+class RunSecondTangents(RunTangents):
+    """Integrate, with the second derivatives of the states and of the end along pairs of directions."""
+
+    @property
+    def tangents(self) -> int:
+        return 2 * super().tangents
+
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return ForwardTwice(self.plan(width, vector), self.active, vector if several else width)
 
 
 @dataclass(frozen=True)

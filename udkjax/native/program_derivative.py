@@ -5,13 +5,16 @@ close a mechanism ("_newton_q", "_newton_v") there are
 
     evaluation(work, out, stored)   the results, and what its derivatives need to know of the state
     forward(work, stored, tangent, out)   the change of the results, from those of the constants and the state in a tangent
+    twice(work, stored, tangent, out)     the same along two directions and along both, in three tangents one behind the other
     reverse(work, stored, bar)      `bar constants` and `bar state`, from the cotangents of the results
 
 where all but the accelerations leave their changes in `result` of a tangent, and find their cotangents in `bar result`.
 """
 
-from udkjax.equations.differentiable_programs import DifferentiableProgram
-from udkjax.expressions.loop_derivative import COTANGENT, TANGENT
+from collections.abc import Sequence
+
+from udkjax.equations.differentiable_programs import PREFIXES, TWICE, DifferentiableProgram
+from udkjax.expressions.loop_derivative import COTANGENT
 from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.module import Module
 from udkjax.native.program import Place
@@ -27,20 +30,21 @@ class ProgramDerivative:
         self._module, self._name = module, name
         self._suffix = "" if name == "accelerations" else f"_{name}"
         self._evaluated: DifferentiableProgram = module.code.differentiable[name]
-        self._derivative = self._evaluated.derivative([] if module.moving else ["constants"])
+        self._fixed = [] if module.moving else ["constants"]
         self._stored: dict[str, int] = {}  # the arrays of loops, and where they begin
         self.stored = 0
         if module.written_out:
             self._written_out = module.written_out.derivative(name)
             self.stored = sum(x == "stored" for x, _ in self._written_out.evaluation.outputs)
             return
-        used = self._evaluated.program.arrays | LoopProgram(self._evaluated.parts).arrays
+        parts = self._evaluated.second_parts if module.mode == TWICE else self._evaluated.parts
+        used = self._evaluated.program.arrays | LoopProgram(parts).arrays
         for x, count in module.code.stored_sizes.items():
             if x in used:
                 self._stored[x] = self.stored
                 self.stored += count
         if "along" not in module.places.places:  # changes or cotangents of what is stored, of all such programs
-            module.places.add("along", sum(module.code.stored_sizes.values()))
+            module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
 
     def place(self, name: str) -> int:
         """Return where an array begins in what loops store."""
@@ -51,9 +55,15 @@ class ProgramDerivative:
         results = {x: ("stored", place) for x, place in self._stored.items()}
         return self._module.arrays | results | {"stored": ("stored", 0)}
 
-    def _along(self, prefix: str) -> dict[str, Place]:
-        start = 0 if self._module.written_out else self._module.places["along"]
-        return {prefix + x: ("work", start + place) for x, place in self._stored.items()}
+    def _along(self, prefixes: Sequence[str]) -> dict[str, Place]:
+        if self._module.written_out:
+            return {}
+        start, size = self._module.places["along"], sum(self._module.code.stored_sizes.values())
+        return {
+            prefix + x: ("work", start + k * size + place)
+            for k, prefix in enumerate(prefixes)
+            for x, place in self._stored.items()
+        }
 
     def evaluation(self):
         at = self._at | {"a": ("out", 0)}
@@ -64,25 +74,28 @@ class ProgramDerivative:
             self._module.loops.write(self._evaluated.program, name, pointers, at)
 
     def forward(self):
-        w = self._module.tangents
+        """Write `forward`, or `twice`."""
+        module, w = self._module, self._module.tangents
         changes = {"constants": "constants", "q": "state q", "v": "state v", "q1": "result q", "v1": "result v"}
-        at = self._at | self._along(TANGENT)
-        at |= {TANGENT + x: ("tangent", w[place]) for x, place in changes.items()} | {f"{TANGENT}a": ("out", 0)}
-        self._write(
-            LoopProgram(self._derivative.forward.parts), f"forward{self._suffix}", ("work", "stored", "tangent", "out"), at
-        )
+        prefixes, program = PREFIXES[module.mode], self._evaluated.in_mode(module.mode, self._fixed)
+        at = self._at | self._along(prefixes)
+        for k, prefix in enumerate(prefixes):
+            at |= {prefix + x: ("tangent", w[place] + k * w.size) for x, place in changes.items()}
+            at[f"{prefix}a"] = ("out", k * w.size)
+        self._write(program, f"{module.mode}{self._suffix}", ("work", "stored", "tangent", "out"), at)
 
     def reverse(self):
         module, p = self._module, self._module.places
         found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v", "q1": "bar result q", "v1": "bar result v"}
-        at = self._at | self._along(COTANGENT) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
+        prefixes, program = PREFIXES[module.mode], self._evaluated.in_mode(module.mode, self._fixed)
+        at = self._at | self._along(prefixes) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
         counts = {x: module.code.stored_sizes[x] for x in self._stored} | {
             "constants": len(module.moving),
             "q": module.n,
             "v": module.n,
         }
         cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items() if x not in ("q1", "v1")]
-        program = LoopProgram([*cleared, *self._derivative.reverse.parts])
+        program = LoopProgram([*cleared, *program.parts])
         self._write(program, f"reverse{self._suffix}", ("work", "stored", "bar"), at | {f"{COTANGENT}a": ("bar", 0)})
 
     def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):

@@ -12,14 +12,17 @@ and the accelerations, the end of a step and the outputs, which are projected, b
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from udkjax.equations.differentiable_programs import FORWARD, TWICE
 from udkjax.native.dense_output import write_between, write_differences
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
 from udkjax.native.program_derivative import ProgramDerivative
-from udkjax.native.prologue import FORWARD, write_prologue_derivative
+from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.samples import row_address
 from udkjax.native.steps import POINTS
 from udkjax.native.trajectory import Trajectory
+
+GIVEN = ("d", "e")  # of the changes that tangents hold: those along directions, not along two of them
 
 
 class Differentiated(Trajectory):
@@ -28,11 +31,9 @@ class Differentiated(Trajectory):
     `active` says which numbers of the scene have derivatives; positions and velocities do.
     """
 
-    reverse = False  # mode
-
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         differentiated = ("accelerations", "projection") if plan.projected else ("accelerations",)
-        super().__init__(plan, differentiated, active, self.reverse)
+        super().__init__(plan, differentiated, active)
         self.active, self.count, self.last = active, len(self.moving), plan.method.stages
         # Of each active number that has samples: its column there, and its place among the numbers.
         self.active_samples = {k: place for k, place in enumerate(plan.sampled) if active[place]}
@@ -69,18 +70,21 @@ class Forward(Differentiated):
     """A trajectory with its changes along directions.
 
     Directions come in groups, each with memory of its own, a `tangent`: one direction for all members, or, of a single member, as
-    many directions side by side as there are lanes.
+    many directions side by side as there are lanes. Where changes are taken along pairs of directions, a group has a tangent for
+    each of them and one for both, one behind the other.
     """
 
     accelerate_stage = Differentiated.evaluate_stage  # in each step, since its changes follow at once
-    inputs = ("dnumbers", "dq", "dv")
+    mode = FORWARD
+    ways = ("d",)  # of the tangents of a direction: the changes that each holds, prefixes of inputs
     outputs = ("dys", "dend")
     directions_in = 1
 
     def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
         super().__init__(plan, active)
-        if plan.sampled:
-            self.inputs = (*self.inputs[:-3], "dsamples", *self.inputs[-3:])
+        given = [way for way in self.ways if way in GIVEN]
+        names = [f"{way}samples" for way in given if plan.sampled] + [f"{way}{x}" for way in given for x in ("numbers", "q", "v")]
+        self.inputs = (*self.inputs, *names)
         self.tangents = w = Layout(lanes, plan.vector)
         self.group = lanes // plan.width  # directions of a tangent
         w.add("constants", self.count)
@@ -98,17 +102,23 @@ class Forward(Differentiated):
         for each in self._linearizations:
             each.forward()
         if self.count:
-            write_prologue_derivative(self, self.active, False)
+            write_prologue_derivative(self, self.active, self.mode)
         w = self.tangents
         write_differences(self, "tangent_differences", ("tangent", w))
         write_between(self, "tangent_between", ("tangent", w))
 
     @contextmanager
-    def _each_tangent(self, f: Function) -> Iterator[Value]:
+    def _each_group(self, f: Function) -> Iterator[Value]:
         """Run the block for every group of directions, with `tangent` where its memory is."""
+        with self._each_tangent(f, len(self.ways)) as p:
+            yield p
+
+    @contextmanager
+    def _each_tangent(self, f: Function, step: int = 1) -> Iterator[Value]:
+        """Run the block for every tangent of every group, or for the first of so many."""
         first = f.load(f.given["work"], self.places["tangents"] * f.width, base=POINTER)
-        with f.each(self._groups(f, self.call_record(f))) as p:
-            f.given["tangent"] = f.at(first, p * (self.tangents.size * self.tangents.width))
+        with f.each(self._groups(f, self.call_record(f)) * (len(self.ways) // step)) as p:
+            f.given["tangent"] = f.at(first, p * (step * self.tangents.size * self.tangents.width))
             yield p
 
     @contextmanager
@@ -118,6 +128,10 @@ class Forward(Differentiated):
             direction = p * self.group + j
             with f.if_(direction < self._directions(f, self.call_record(f))):
                 yield direction, lane if self.group == 1 else j
+
+    def _way(self, f: Function, way: str) -> Value:
+        """Return the address of one of the tangents of a group."""
+        return f.at(f.given["tangent"], self.ways.index(way) * self.tangents.size * self.tangents.width)
 
     def _directions(self, f: Function, call: Value) -> Value:
         return f.load(call, self.call_fields.index("directions"), base=INT)
@@ -132,18 +146,21 @@ class Forward(Differentiated):
     def _project_tangent(self, f: Function):
         """Compute `result` of a tangent: its `state` once projected, at the state, which is on the manifold."""
         if self.of_projection:
-            self._along(f, "forward_projection", "projection linearization")
+            self._along(f, f"{self.mode}_projection", "projection linearization")
         else:
-            with f.each(self.registers("tangent")) as r:
-                for x in "qv":
-                    self.put(f, f"result {x}", r, self.vector(f, f"state {x}", r, "tangent"), "tangent")
+            for k in range(len(self.ways)):
+                f.given["tangent"] = f.at(f.given["tangent"], min(k, 1) * self.tangents.size * self.tangents.width)
+                with f.each(self.registers("tangent")) as r:
+                    for x in "qv":
+                        self.put(f, f"result {x}", r, self.vector(f, f"state {x}", r, "tangent"), "tangent")
 
     def record_stage(self, f: Function, s: Lane, i: int):
         """Compute the changes of the stage's accelerations."""
         h = self.broadcast(f, s.step)
         with self._each_tangent(f):
             self._change_stage(f, i, h, "point3")
-            self._along(f, "forward", f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
+        with self._each_group(f):
+            self._along(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         """Compute the changes of point 3, from those of point 2, where the step began."""
@@ -166,15 +183,22 @@ class Forward(Differentiated):
                 for x in "qv":
                     new = f.select(begin, self.vector(f, f"point2 {x}", r, "tangent"), self.vector(f, f"state {x}", r, "tangent"))
                     self.put(f, f"state {x}", r, new, "tangent")
+        self._project_end(f, begin)
+        with self._each_group(f):
+            self._along(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
+            for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
+                old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
+                self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
+
+    def _project_end(self, f: Function, begin: Value):
+        """Project the changes of the state at the end of a step."""
+        del begin
+        with self._each_group(f):
             self._project_tangent(f)
-            with f.each(self.registers("tangent")) as r:
-                for x in "qv":
-                    self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
-            self._along(f, "forward", f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
-            with f.each(self.registers("tangent")) as r:
-                for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
-                    old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
-                    self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
+            for x in "qv":
+                self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
 
     def _change_stage(self, f: Function, i: int, h: Value, start: str):
         """Compute the change of the state of stage i in a tangent, of the step from a point."""
@@ -193,15 +217,17 @@ class Forward(Differentiated):
         with f.each(self.rowcount) as r:
             self.put(f, "state v", r, self.vector(f, "result v", r))  # the programs look for states there
         self._evaluate_end(f)
-        with self._each_tangent(f) as p:
+        with self._each_tangent(f):
             f.call("tangent_differences", f.given["work"], f.given["tangent"])
             f.call("tangent_between", f.given["work"], f.given["tangent"])
+        with self._each_group(f) as p:
             self._project_tangent(f)
+            f.given["tangent"] = self._way(f, self.ways[-1])
             with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
                 self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "result q", "result v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
-        """The changes of a state of the member in lane k along the directions of group p."""
+        """The changes of a state of the member in lane k along the directions of group p, of the last tangent of each."""
         call, member = self.call_record(f), self.to_int(f, f.lane(s.member, k))
         times = f.load(call, self.call_fields.index("times"), base=INT)
         with self._each_direction(f, p, k) as (direction, lane):
@@ -214,16 +240,22 @@ class Forward(Differentiated):
         """The changes of the constants along all directions."""
         if not self.count:
             return
-        dconstants = Value(f, f.reserve(DOUBLE, self.count), POINTER)
-        with self._each_tangent(f) as p, self._each_direction(f, p, lane) as (direction, place):
-            f.call(FORWARD, numbers, constants, self._changes_of_numbers(f, member, direction), dconstants)
-            with f.each(self.count) as i:
-                f.store(f.load(dconstants, i), f.given["tangent"], (i + self.tangents["constants"]) * self.tangents.width + place)
+        found = [Value(f, f.reserve(DOUBLE, self.count), POINTER) for _ in self.ways]
+        none = Value(f, f.reserve(DOUBLE, self.code.number_count), POINTER)  # along both of two directions numbers do not change
+        if len(self.ways) > 1:
+            with f.each(self.code.number_count) as i:
+                f.store(0.0, none, i)
+        with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, place):
+            given = [self._changes_of_numbers(f, way, member, direction) if way in GIVEN else none for way in self.ways]
+            f.call(PROLOGUE[self.mode], numbers, constants, *given, *found)
+            for way, changes in zip(self.ways, found, strict=True):
+                with f.each(self.count) as i:
+                    f.store(f.load(changes, i), self._way(f, way), (i + self.tangents["constants"]) * self.tangents.width + place)
 
-    def _changes_of_numbers(self, f: Function, member: Value, direction: Value) -> Value:
+    def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
         """The address of the changes of a member's numbers along a direction; of samples, those of their row."""
         call, count = f.given["call"], self.code.number_count
-        given = f.at(self.member_address(f, call, "dnumbers", member), direction * count)
+        given = f.at(self.member_address(f, call, f"{way}numbers", member), direction * count)
         places = self.active_samples
         if not places:
             return given
@@ -232,36 +264,39 @@ class Forward(Differentiated):
             f.store(f.load(given, i), copy, i)
         rows = f.load(call, self.call_fields.index("knots"), base=INT) + 1
         row = f.load(f.given["work"], f.given["lane"] + self.places["row"] * f.width)
-        samples = f.at(row_address(self, f, "dsamples", member, row), direction * rows * len(self.plan.sampled))
+        samples = f.at(row_address(self, f, f"{way}samples", member, row), direction * rows * len(self.plan.sampled))
         for k, place in places.items():
             f.store(f.load(samples, k), copy, place)
         return copy
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        with self._each_tangent(f) as p, self._each_direction(f, p, lane) as (direction, place):
-            for x in "qv":
-                self._read_state(f, f"d{x}", member, direction, place, [f"point{k} {x}" for k in range(POINTS)])
-            with f.each(self.n) as i:
-                for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.last))):
-                    f.store(0.0, f.given["tangent"], (i + self.tangents[name]) * self.tangents.width + place)
+        with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, place):
+            for way in self.ways:
+                tangent = self._way(f, way)
+                self._read_state(f, way, member, direction, tangent, place, [f"point{k}" for k in range(POINTS)])
+                with f.each(self.n) as i:
+                    for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.last))):
+                        f.store(0.0, tangent, (i + self.tangents[name]) * self.tangents.width + place)
 
-    def _read_state(self, f: Function, name: str, member: Value, direction: Value, place: Value, to: Sequence[str]):
-        """The change of q or v that is given of a member along a direction, into a lane of a tangent."""
-        start = self.member_address(f, self.call_record(f), name, member)
-        with f.each(self.n) as i:
-            x = f.load(start, direction * self.n + i)
-            for array in to:
-                f.store(x, f.given["tangent"], (i + self.tangents[array]) * self.tangents.width + place)
+    def _read_state(
+        self, f: Function, way: str, member: Value, direction: Value, tangent: Value, place: Value, to: Sequence[str]
+    ):
+        """The change of the first state of a member along a direction, into a lane of arrays of a tangent."""
+        for x in "qv":
+            start = self.member_address(f, self.call_record(f), f"{way}{x}", member) if way in GIVEN else None
+            with f.each(self.n) as i:
+                change = f.load(start, direction * self.n + i) if start else f.const(0.0)
+                for array in to:
+                    f.store(change, tangent, (i + self.tangents[f"{array} {x}"]) * self.tangents.width + place)
 
     def end_members(self, f: Function, s: Lane):
         """The changes of the first state, which is taken as it is given, and of the last."""
-        call = self.call_record(f)
+        call, way = self.call_record(f), self.ways[-1]
         times = f.load(call, self.call_fields.index("times"), base=INT)
-        with self._each_tangent(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
-            member = self.to_int(f, f.lane(s.member, k))
+        with self._each_group(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
+            f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))
             with self._each_direction(f, p, k) as (direction, lane):
-                for x in "qv":
-                    self._read_state(f, f"d{x}", member, direction, lane, [f"state {x}"])
+                self._read_state(f, way, member, direction, f.given["tangent"], lane, ["state"])
                 row = (member * self._directions(f, call) + direction) * (2 * self.n)
                 to = f.at(f.load(call, self.call_fields.index("dend"), base=POINTER), row)
                 self.copy_lane(f, to, 0, "point3 q", lane, "tangent")
@@ -271,9 +306,27 @@ class Forward(Differentiated):
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         """Memory for all directions."""
-        size = self._groups(f, call) * (self.tangents.size * self.tangents.width)
+        size = self._groups(f, call) * (len(self.ways) * self.tangents.size * self.tangents.width)
         block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["tangents"] * f.width, base=POINTER)
         return [block]
+
+
+class ForwardTwice(Forward):
+    """A trajectory with its second derivatives along pairs of directions: the changes of its changes.
+
+    Of the sums of the stages, of the ends of steps and of outputs they are the same sums, and the programs of accelerations and
+    projections find them beside the changes along either direction.
+    """
+
+    mode = TWICE
+    ways = ("d", "e", "de")
+
+    def _project_end(self, f: Function, begin: Value):
+        # Newton's step from a state beside the manifold is right to first order, two are to second: only a first state may be
+        # moved off it.
+        super()._project_end(f, begin)
+        with f.if_(f.any_of(begin)):
+            super()._project_end(f, begin)

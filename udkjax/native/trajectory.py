@@ -37,8 +37,8 @@ from udkjax.native.steps import RUNNING
 class Trajectory(Module):
     """The code of whole trajectories."""
 
-    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = (), reverse: bool = False):
-        super().__init__(plan, differentiated, active, reverse)
+    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
+        super().__init__(plan, differentiated, active)
         self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
         self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
 
