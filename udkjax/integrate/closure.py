@@ -1,5 +1,7 @@
 """The closure of a mechanism as a function of its numbers: by machine code or by JAX, with derivatives of any order."""
 
+import operator
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -39,7 +41,12 @@ class AssemblyFunction(DifferentiableFunction):
 
     @property
     def orders(self) -> int:
-        return 1
+        return 2 if self._has_second else 1
+
+    @property
+    def _has_second(self) -> bool:
+        """True where machine code has second derivatives: where no rows contradict each other beside the manifold."""
+        return self.guess.rest[1].redundant_rows == ()
 
     def __call__(self, xs: list[Array]) -> list[Array]:
         return list(close_by_jax(*self.guess(xs))[:2])
@@ -62,6 +69,16 @@ class AssemblyFunction(DifferentiableFunction):
         found = native_closing.close_vjp(guess, _native_inputs(which), *ws)
         pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
         return [bar for m, bar in pairs if m is True]
+
+    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
+        guess, which = self._native(xs, tuple(map(operator.or_, active, others)))
+        if guess is None or not self._has_second:
+            return super().twice(xs, active, vs, others, us)
+        changes = (
+            (_native_inputs(self.guess.marks(mask)), _native_inputs(self.guess.changes(mask, dxs)))
+            for mask, dxs in ((active, vs), (others, us))
+        )
+        return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
 
     def _native(self, xs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
         """Return the arguments of machine code and the inputs with tangents; None where it has no such derivatives."""

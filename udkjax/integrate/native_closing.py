@@ -13,7 +13,7 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
-from udkjax.native.operations import Close, CloseCotangents, CloseTangents
+from udkjax.native.operations import Close, CloseCotangents, CloseSecondTangents, CloseTangents
 from udkjax.native.primitive import call_known, native_p, unsupported
 from udkjax.scene.mechanism import Mechanism
 
@@ -46,10 +46,21 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
     """Return the changes of q and v along a `change` of what is active of (mechanism, scales, tol, t, q, v)."""
-    (mechanism, *_, q, _), (*_, dq, dv) = guess, change
-    n, operation = len(q), CloseTangents(_close(mechanism).code, active_numbers(mechanism, active[0]))
-    numbers = jnp.asarray(numbers_as_vector(number_tangents(mechanism, active[0], change[0])))
-    along = [numbers, *(jnp.zeros(n) if dx is None else dx for dx in (dq, dv))]
+    operation = CloseTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
+    return _close_along(guess, operation, (active, change))
+
+
+def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
+    """Return the second derivatives of q and v along two changes, each of what is active in it."""
+    operation = CloseSecondTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
+    return _close_along(guess, operation, *changes)
+
+
+def _close_along(guess: Any, operation: CloseTangents, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
+    mechanism, n, along = guess[0], len(guess[-1]), []
+    for active, (numbers, dq, dv) in changes:
+        along.append(jnp.asarray(numbers_as_vector(number_tangents(mechanism, active[0], numbers))))
+        along += [jnp.zeros(n) if dx is None else dx for dx in (dq, dv)]
     dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), operation=operation, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
 

@@ -29,6 +29,7 @@ class Closing(Module):
 
     settings = ("length", "fallback_tol")
     results = ("state", "residuals", "rank")
+    further = 1  # corrections of a closed state, which change nothing but derivatives
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
         plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, written_out=False, steps=False)
@@ -108,7 +109,8 @@ class Closing(Module):
                     taken = scale.value * 2.0
                     limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
                     self._at_previous_state(f, "q", lambda: self._record_correction(f, "q", taken, limited))
-        self._record_correction(f, "q", f.const(1.0), f.const(0.0))
+        for _ in range(self.further):
+            self._record_correction(f, "q", f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):
             self._record_correction(f, "v", f.const(1.0), f.const(0.0))
             self._correct(f, "v")

@@ -2,18 +2,20 @@
 
 The coordinates change by -s times a correction; s, where it limits the step, is a function of it, too. Behind the last step there
 is one more correction, which changes nothing but the derivative: it returns it to the constraint manifold. Corrections
-are differentiated as corrections.py has it.
+are differentiated as corrections.py has it. Second derivatives take one correction more: the first leaves a state that changes by
+much beside the manifold by the square of that.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from udkjax.equations.differentiable_programs import FORWARD, REVERSE
+from udkjax.equations.differentiable_programs import FORWARD, REVERSE, TWICE
 from udkjax.equations.position_closure import CLOSURE_ITERATIONS, VELOCITIES
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.closing import CORRECTED, Closing
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Layout
+from udkjax.native.program_derivative import GIVEN, WAYS, ProgramDerivative
 from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 
 
@@ -42,14 +44,16 @@ class ClosingDerivative(Closing):
 
 
 class ClosingForward(ClosingDerivative):
-    """Closing along directions, each with memory of its own: a `tangent`."""
+    """Closing along directions, each with memory of its own: a tangent for each of the changes that are taken."""
 
-    inputs = ("dnumbers", "dq", "dv")
+    mode = FORWARD
+    ways = ("d",)  # the changes along a direction, and prefixes of inputs
     outputs = ("dstate",)
     directions_in = 1
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
+        self.inputs = tuple(f"{way}{x}" for way in self.ways if way in GIVEN for x in ("numbers", "q", "v"))
         self.tangents = w = Layout(1, self.plan.vector)
         w.add("numbers", code.number_count)
         w.add("constants", self.constants)
@@ -57,37 +61,53 @@ class ClosingForward(ClosingDerivative):
             w.add(name, self.n)
 
     def write_derivatives(self):
-        write_prologue_derivative(self, self.active, FORWARD)
-        for x, correction in self.corrections.items():
-            correction.write_adjoint()
-            correction.forward()
+        write_prologue_derivative(self, self.active, self.mode)
+        for x in self.corrections:
+            self._write_correction(x)
             self._write_push(x)
+
+    def _write_correction(self, x: str):
+        self.corrections[x].write_adjoint()
+        self.corrections[x].forward()
+
+    def _linearize(self, f: Function, x: str) -> Value:
+        """Evaluate a correction at the state; return the address of what its derivative needs to know."""
+        self._evaluate(f, x)
+        self.corrections[x].prepare_derivative(f)
+        return self.address(f, "correction")
 
     def _write_push(self, x: str):
         """Write push_x(work, scale, limited): the change of the state by so much of a correction, which was limited or not."""
         f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
-        self._evaluate(f, x)
-        self.corrections[x].prepare_derivative(f)
+        known = self._linearize(f, x)
         longest, which = self._longest(f, x)
         limits = (f.given["limited"] > 0.5) & (longest > 0.0)
-        with self._each_tangent(f):
-            f.call(f"forward_newton_{x}", f.given["work"], self.address(f, "correction"), f.given["tangent"], f.given["tangent"])
-            change = f.variable(0.0)  # of the longest step, over its length
+        with self._each_direction(f):
+            f.call(f"{self.mode}_newton_{x}", f.given["work"], known, f.given["d"], f.given["d"])
+            for way in self.ways:
+                with f.each(self.n) as i:
+                    self._increase(f, f"result {x}", i, -self._at(f, f"state {x}", i, way), way)
+            # Of the longest step, over its length: with it the limit changes.
+            shares = {
+                way: f.select(limits, self._at(f, f"result {x}", which, way) / self.change(f, x, which), 0.0) for way in self.ways
+            }
             with f.each(self.n) as i:
-                step = self._at(f, f"result {x}", i, "tangent") - self._at(f, f"state {x}", i, "tangent")
-                self._set(f, f"result {x}", i, step, "tangent")
-                change.value = f.select(i.is_(which), step / self.change(f, x, i), change.value)
-            share = f.select(limits, change.value, 0.0)
-            with f.each(self.n) as i:
-                step = self._at(f, f"result {x}", i, "tangent") - share * self.change(f, x, i)
-                self._increase(f, f"state {x}", i, f.given["scale"] * step, "tangent")
+                steps = {way: self._at(f, f"result {x}", i, way) for way in self.ways}
+                for way, step in self._limited(steps, shares, self.change(f, x, i)).items():
+                    self._increase(f, f"state {x}", i, f.given["scale"] * step, way)
+
+    def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
+        """Return the changes of a coordinate of a limited step c / c_j, times c_j: dc - a c, with the share a = dc_j / c_j."""
+        return {way: change - shares[way] * step for way, change in steps.items()}
 
     @contextmanager
-    def _each_tangent(self, f: Function) -> Iterator[Value]:
+    def _each_direction(self, f: Function) -> Iterator[Value]:
+        """Run the block for every direction, with the addresses of its tangents by their names."""
         call = f.load(f.given["work"], self.places["call"], base=POINTER)
         first = f.load(f.given["work"], self.places["tangents"], base=POINTER)
         with f.each(f.load(call, self.call_fields.index("directions"), base=INT)) as p:
-            f.given["tangent"] = f.at(first, p * self.tangents.size)
+            for k, way in enumerate(self.ways):
+                f.given[way] = f.at(first, p * (len(self.ways) * self.tangents.size) + k * self.tangents.size)
             yield p
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
@@ -96,34 +116,67 @@ class ClosingForward(ClosingDerivative):
     def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
         call, constants = self.call_record(f), self.address(f, "constants")
-        with self._each_tangent(f) as p:
-            for name, to, count in (
-                ("dnumbers", "numbers", self.code.number_count),
-                ("dq", "state q", self.n),
-                ("dv", "state v", self.n),
-            ):
-                start = self.member_address(f, call, name, member)
-                with f.each(count) as i:
-                    self._set(f, to, i, f.load(start, p * count + i), "tangent")
-            dnumbers, dconstants = (f.at(f.given["tangent"], self.tangents[x]) for x in ("numbers", "constants"))
-            f.call(PROLOGUE[FORWARD], self.member_address(f, call, "numbers", member), constants, dnumbers, dconstants)
+        with self._each_direction(f) as p:
+            for way in self.ways:
+                for name, to, count in (
+                    ("numbers", "numbers", self.code.number_count),
+                    ("q", "state q", self.n),
+                    ("v", "state v", self.n),
+                ):
+                    start = self.member_address(f, call, f"{way}{name}", member) if way in GIVEN else None
+                    with f.each(count) as i:
+                        self._set(f, to, i, f.load(start, p * count + i) if start else f.const(0.0), way)
+            changes = [f.at(f.given[way], self.tangents[x]) for x in ("numbers", "constants") for way in self.ways]
+            f.call(PROLOGUE[self.mode], self.member_address(f, call, "numbers", member), constants, *changes)
 
     def _finish_closing(self, f: Function, member: Value):
         call = self.call_record(f)
         directions = f.load(call, self.call_fields.index("directions"), base=INT)
-        with self._each_tangent(f) as p:
+        with self._each_direction(f) as p:
             to = f.at(f.load(call, self.call_fields.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
-                    f.store(self._at(f, f"state {x}", i, "tangent"), to, i + k * self.n)
+                    f.store(self._at(f, f"state {x}", i, self.ways[-1]), to, i + k * self.n)
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
-        size = f.load(call, self.call_fields.index("directions"), base=INT) * self.tangents.size
+        size = f.load(call, self.call_fields.index("directions"), base=INT) * (len(self.ways) * self.tangents.size)
         block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["tangents"], base=POINTER)
         return [block]
+
+
+class ClosingTwice(ClosingForward):
+    """Closing along pairs of directions, with its second derivatives.
+
+    Those of corrections are taken by elimination, which agrees with the least-norm solution wherever rows do not contradict each
+    other; so they are to first order.
+    """
+
+    mode = TWICE
+    ways = WAYS
+    further = 2
+
+    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+        super().__init__(code, vector, active)
+        self._eliminated = {x: ProgramDerivative(self, f"newton_{x}", "eliminated") for x in self.corrections}
+        self.places.add("linearization", max(x.stored for x in self._eliminated.values()))
+
+    def _write_correction(self, x: str):
+        self._eliminated[x].evaluation()
+        self._eliminated[x].forward()
+
+    def _linearize(self, f: Function, x: str) -> Value:
+        known = self.address(f, "linearization")
+        f.call(f"eliminated_newton_{x}", f.given["work"], f.given["work"], known)
+        self._evaluate(f, x)
+        return known
+
+    def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
+        (one, other, _), (a, b, _) = ([found[way] for way in self.ways] for found in (steps, shares))
+        moved = super()._limited(steps, shares, step)
+        return moved | {"de": moved["de"] - a * other - b * one + (a * b * 2.0) * step}
 
 
 class ClosingReverse(ClosingDerivative):

@@ -14,7 +14,7 @@ import numpy as np
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
-from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse
+from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
 from udkjax.native.formulations import FormulationCode
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, Plan
 from udkjax.native.marching import Marching
@@ -225,6 +225,18 @@ class CloseTangents(Close):
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         return [*super().outputs(inputs, members, times), (members, inputs[-1].shape[1], 2 * self.coordinates)]
+
+
+@dataclass(frozen=True)
+class CloseSecondTangents(CloseTangents):
+    """Close, with the second derivatives of the state along pairs of directions."""
+
+    @property
+    def tangents(self) -> int:
+        return 6
+
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        return ClosingTwice(self.code, vector, self.active)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.module import Module
 from udkjax.native.program import Place
 
+WAYS = ("d", "e", "de")  # the changes along two directions and along both, of which tangents hold one each
+GIVEN = ("d", "e")  # those of numbers and of the first state: along both they do not change
+
 
 class ProgramDerivative:
     """One of the differentiable programs of a scene with its derivative, in a module."""
@@ -26,9 +29,10 @@ class ProgramDerivative:
     stored: int
     """The number of values that its derivatives know of a state."""
 
-    def __init__(self, module: Module, name: str):
+    def __init__(self, module: Module, name: str, evaluation: str = "evaluation"):
         self._module, self._name = module, name
         self._suffix = "" if name == "accelerations" else f"_{name}"
+        self._evaluation = evaluation + self._suffix
         self._evaluated: DifferentiableProgram = module.code.differentiable[name]
         self._fixed = [] if module.moving else ["constants"]
         self._stored: dict[str, int] = {}  # the arrays of loops, and where they begin
@@ -67,7 +71,7 @@ class ProgramDerivative:
 
     def evaluation(self):
         at = self._at | {"a": ("out", 0)}
-        pointers, name = ("work", "out", "stored"), f"evaluation{self._suffix}"
+        pointers, name = ("work", "out", "stored"), self._evaluation
         if self._module.written_out:
             self._module.write_scalars(self._written_out.evaluation, name, pointers, at)
         else:

@@ -16,13 +16,11 @@ from udkjax.equations.differentiable_programs import FORWARD, TWICE
 from udkjax.native.dense_output import write_between, write_differences
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout, Plan
-from udkjax.native.program_derivative import ProgramDerivative
+from udkjax.native.program_derivative import GIVEN, WAYS, ProgramDerivative
 from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.samples import row_address
 from udkjax.native.steps import POINTS
 from udkjax.native.trajectory import Trajectory
-
-GIVEN = ("d", "e")  # of the changes that tangents hold: those along directions, not along two of them
 
 
 class Differentiated(Trajectory):
@@ -322,7 +320,7 @@ class ForwardTwice(Forward):
     """
 
     mode = TWICE
-    ways = ("d", "e", "de")
+    ways = WAYS
 
     def _project_end(self, f: Function, begin: Value):
         # Newton's step from a state beside the manifold is right to first order, two are to second: only a first state may be
