@@ -51,6 +51,7 @@ def of_pendulum(x, **choices):
 
 
 AT = {of_linkage: jnp.array([np.deg2rad(-50.0), 1.0]), of_pendulum: jnp.array([-0.3, 1.2])}
+FAST = ((of_pendulum, "hessian"), (of_linkage, "forward over forward"))
 BOTH = pytest.mark.parametrize("f", AT, ids=lambda f: f.__name__)
 
 
@@ -103,9 +104,14 @@ def test_first_derivatives_are_those_of_the_exact_solution(exact, slopes):
     assert_allclose(slopes[of_linkage](AT[of_linkage])[0], exact["dtheta_dtheta0"], rtol=1e-8)
 
 
-@pytest.mark.slow
-@BOTH
-@pytest.mark.parametrize("second", SECOND.values(), ids=SECOND)
+@pytest.mark.parametrize(
+    ("f", "second"),
+    [
+        pytest.param(f, second, id=f"{f.__name__}-{name}", marks=[] if (f, name) in FAST else pytest.mark.slow)
+        for f in AT
+        for name, second in SECOND.items()
+    ],
+)
 def test_second_derivatives(f, second, slopes):
     """In any order of modes: symmetric, and those of differences of first ones."""
     x = AT[f]
@@ -165,11 +171,12 @@ def test_other_solvers_have_both_modes(solver, slopes):
         assert_allclose(jax.jit(mode(f))(x), slopes[of_pendulum](x), rtol=1e-4)
 
 
-def assemble(x):
-    """What assembly makes of a rough guess of a redundant linkage: of the first link's angle, and the second link's length."""
-    mechanism = LINKAGE.with_parameters({"body.link1.angle": x[0], "body.coupler.mass": x[1]})
+def assemble(x, mechanism=LINKAGE):
+    """What assembly makes of a rough guess of a linkage: of the first body's angle, and the last one's mass."""
+    one, *_, last = mechanism.body_names
+    mechanism = mechanism.with_parameters({f"body.{one}.angle": x[0], f"body.{last}.mass": x[1]})
     state = udk.assemble(mechanism, throw=False)
-    return jnp.sum(jnp.cos(jnp.arange(12.0)) * (state.q.ravel() + 0.1 * state.v.ravel()))
+    return jnp.sum(jnp.cos(jnp.arange(float(state.q.size))) * (state.q.ravel() + 0.1 * state.v.ravel()))
 
 
 @pytest.mark.parametrize("second", [None, *(pytest.param(f, marks=pytest.mark.slow, id=n) for n, f in SECOND.items())])
@@ -182,3 +189,14 @@ def test_derivatives_of_assembly(second):
             assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
         return
     assert_allclose(jax.jit(second(assemble))(x), differences(slope, x, 1e-3), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.4], ids=["closed", "open"])
+def test_second_derivatives_of_assembly_by_machine_code(opening):
+    """Of a linkage without redundant rows, from a closed guess, and from an open one by steps that are limited."""
+    mechanism = udk.library.four_bar()
+    angle = mechanism.parameters()[f"body.{mechanism.body_names[0]}.angle"]
+    f, x = partial(assemble, mechanism=mechanism), jnp.array([float(angle) + opening, 1.3])
+    slope = jax.jit(jax.jacfwd(f))
+    found = jax.jit(jax.jacfwd(jax.jacfwd(f)))(x)
+    assert_allclose(found, differences(slope, x, 1e-3), rtol=1e-6, atol=1e-8)
