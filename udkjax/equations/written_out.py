@@ -146,14 +146,14 @@ class WrittenOut:
         group = "cotangent" if mode == REVERSE else "tangent"
         seeded, sought = (results, variables) if mode == REVERSE else (variables, results)
         seeds: Arrays = {}
-        for prefix, (x, places) in product(prefixes, seeded.items()):
-            seeds[prefix + x] = {k: self.graph.input((prefix + x, k), group) for k in places}
+        for prefix, x in product(prefixes, seeded):
+            seeds[prefix + x] = {k: self.graph.input((prefix + x, k), group) for k in seeded[x]}
         self._seeds |= {s: (x, i) for x, scalars in seeds.items() for i, s in enumerate(scalars.values())}
         found = self._unroll(program, arrays | seeds, None if mode == TWICE else group)
         changes = {}
-        for prefix, (x, places) in product(prefixes, sought.items()):
+        for prefix, x in product(prefixes, sought):
             some = found.get(prefix + x, {})
-            changes |= {(prefix + x, i): some.get(k, self.graph.constant(0.0)) for i, k in enumerate(places)}
+            changes |= {(prefix + x, i): some.get(k, self.graph.constant(0.0)) for i, k in enumerate(sought[x])}
         return _entries(arrays, ("a", "safe")), changes
 
 

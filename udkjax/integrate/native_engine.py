@@ -21,7 +21,7 @@ from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tang
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.formulations import formulation_tol
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
-from udkjax.native.operations import MarkRows, RunStates, RunTangents
+from udkjax.native.operations import MarkRows, RunStates
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
@@ -89,7 +89,7 @@ def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) 
 
 
 def _integrate_along(
-    problem: Problem, changes: Sequence[tuple[Any, Any]], operation: RunTangents
+    problem: Problem, changes: Sequence[tuple[Any, Any]], operation: RunStates
 ) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     n, samples, directions = len(problem.q), [], []
     for active, change in changes:
