@@ -130,3 +130,12 @@ def test_what_cannot_be_live_says_why(slider_crank, run):
     with_events: Any = SimpleNamespace(ts=run.ts, q=run.q, v=run.v, events=object())
     with pytest.raises(ValueError, match="events cannot be solved anew"):
         udk.animate(slider_crank, with_events, live=True)
+
+
+def test_pins_that_must_stay_in_line_have_no_sliders_unless_named():
+    lift = udk.library.scissor_lift()
+    assert {slider.name for slider in sliders_of(lift, True) if slider.unit == "m" and slider.section == "Pins"} == {
+        "pin.end[0]",
+        "pin.end[1]",
+    }
+    assert [slider.name for slider in sliders_of(lift, ["pin.middle0"])] == ["pin.middle0[0]", "pin.middle0[1]"]

@@ -9,6 +9,7 @@ import numpy as np
 from udkjax.equations import analyse
 from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene import Mechanism
+from udkjax.scene.drawing import Drawing
 from udkjax.scene.units import units_of
 from udkjax.show.player.packing import Json
 
@@ -65,9 +66,9 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
     ranges = live if isinstance(live, Mapping) else {}
     scales = analyse(mechanism).scales
     length, rate = float(scales.length), float(scales.rate) or 1.0
-    found = []
+    found, bound = [], pins_in_line(mechanism)
     for name, value in scalar_parameters(mechanism, wanted).items():
-        if wanted is None and ".profile." in name:  # the outline of a cam is drawn as it was
+        if wanted is None and (".profile." in name or _base(name) in bound):  # the outline of a cam is drawn as it was
             continue
         given = ranges.get(name) or ranges.get(_base(name))
         unit = units_of(mechanism, name)
@@ -76,6 +77,12 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not hold its value {value:g}")
         found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high)))
     return in_sections(found)
+
+
+def pins_in_line(mechanism: Mechanism) -> set[str]:
+    """Return the parameters of pins of bars that have more than two: one alone cannot move, but the others must stay in line."""
+    links = mechanism.drawing.links.values() if isinstance(mechanism.drawing, Drawing) else []
+    return {f"pin.{pin}" for link in links if link.kind == "bar" and len(link.pins) > 2 for pin in link.pins}
 
 
 def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
