@@ -603,6 +603,7 @@ def test_a_click_selects_while_it_runs_and_what_is_selected_can_be_deleted(studi
     studio.settle()
     studio.page.keyboard.press(" ")
     studio.until("studio.motion.t > 0.1")
+    studio.js("studio.motion.speed = 0.01")  # so that it is met
     name = studio.js("Object.keys(studio.document.pins)[1]")
     studio.page.mouse.click(*studio.pin(name))
     assert studio.js("[studio.motion.playing, studio.motion.posed, studio.selection[0].name]") == [True, None, name]
