@@ -121,3 +121,5 @@ _make = getattr(jax.extend.core, "create_call_primitive", None)  # of JAX 0.12 o
 deferred_p: Any = None if _make is None else _make("deferred_program")
 if deferred_p is not None:
     deferred_p.def_impl(_evaluate)
+    # What takes rules of derivatives is high to JAX, which would trace it again to leave them out before it is evaluated.
+    deferred_p.is_high = lambda *_, call_jaxpr: call_jaxpr.is_high and isinstance(jax.device_put(0.0), Tracer)

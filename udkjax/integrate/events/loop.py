@@ -87,6 +87,7 @@ def run_loop(
     """
     first = _first_loop_state(hybrid, ts, state, code, max_events)
 
+    @jax.jit  # traced once, for its shapes and for its results
     def integrate(loop: LoopState) -> WindowResult:
         window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
         held, known = hybrid.is_held(loop.state.phase), jnp.isfinite(loop.unresolved)
