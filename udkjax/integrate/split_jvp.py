@@ -39,23 +39,34 @@ def split_jvp(seen: Parts, run: Parts, at: PyTree, direction: PyTree, shapes: Sh
 
         return function
 
-    both = Both(flat(seen), flat(run), len(start), shapes)
+    both = Both(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ways], shapes)
     found = along_p.bind(*start, *ways, both=both)
     return list(found[: both.values]), list(found[both.values :])
 
 
 class Both:
-    """The two forms as functions of arrays: those of the place, `start` of them, then those of the direction."""
+    """The two forms as functions of arrays: `start` of the place, then those of the direction, of the shapes `ways`."""
 
-    def __init__(self, seen: Callable[..., list[Array]], run: Callable[..., list[Array]], start: int, shapes: Shapes):
-        self.seen, self.run, self.start, self.shapes = seen, run, start, shapes
+    def __init__(
+        self,
+        seen: Callable[..., list[Array]],
+        run: Callable[..., list[Array]],
+        start: int,
+        ways: Sequence[jax.ShapeDtypeStruct],
+        shapes: Shapes,
+    ):
+        self.seen, self.run, self.start, self.ways, self.shapes = seen, run, start, ways, shapes
         self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "Both":
         """Return both forms of a batch."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
-        return Both(seen, run, self.start, (value, change))
+        ways = [
+            x if axis is None else jax.ShapeDtypeStruct((*x.shape[:axis], size, *x.shape[axis:]), x.dtype)
+            for x, axis in zip(self.ways, axes[self.start :], strict=True)
+        ]
+        return Both(seen, run, self.start, ways, (value, change))
 
 
 def _avals(*xs: Array, both: Both) -> list[jax.core.ShapedArray]:
@@ -109,7 +120,7 @@ def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool],
 
 
 def _value(*xs: Array, both: Both) -> list[Array]:
-    return both.seen(*xs)[: both.values]
+    return both.seen(*xs, *(jnp.zeros(x.shape, x.dtype) for x in both.ways))[: both.values]
 
 
 def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int]]:

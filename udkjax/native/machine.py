@@ -20,7 +20,8 @@ LEVEL = 1  # of code generation: 2 takes a fifth longer, and runs take as long
 # Optimizations of the text before that. Programs come without common subexpressions and dead code: all that LLVM's own selection
 # of level 1 adds is two percent of a run's time, for half of the time of compiling.
 PASSES = ("sroa", "simplify_cfg")
-PART_LINES = 1_000  # of a function that is compiled by itself: 20 to 30 ms; smaller ones go together, each part costs 2 ms
+PART_LINES = 1_000  # of a function that is compiled by itself: 20 to 30 ms
+GROUP_LINES = 2_000  # of smaller ones that go together: 50 ms, so that all cores have something to do; each part costs 2 ms
 
 
 @cache
@@ -108,15 +109,22 @@ def split_module(text: str) -> list[str]:
     bodies = {match[1]: match[0] for match in re.finditer(r"^define [^@\n]*@(\w+)\(.*?^}\n", text, re.DOTALL | re.MULTILINE)}
     heads = {match[1]: match[0] for match in re.finditer(r"^(?:declare [^@\n]*)?@([\w.]+)[ (].*\n?", text, re.MULTILINE)}
     lines = {name: body.count("\n") for name, body in bodies.items()}
-    large = sorted((name for name in bodies if lines[name] >= PART_LINES), key=lambda name: -lines[name])
-    rest = [name for name in bodies if lines[name] < PART_LINES]
+    groups, size = [[name] for name in bodies if lines[name] >= PART_LINES], GROUP_LINES
+    for name in bodies:
+        if lines[name] < PART_LINES:
+            if size + lines[name] > GROUP_LINES:
+                groups.append([])
+                size = 0
+            groups[-1].append(name)
+            size += lines[name]
+    groups.sort(key=lambda names: -sum(lines[name] for name in names))
     heads |= {name: f"declare{body[len('define') : body.index(')') + 1]}\n" for name, body in bodies.items()}
     parts = []
-    for members in (*([name] for name in large), rest):
+    for members in groups:
         part = "".join(bodies[name] for name in members)
         used = sorted(set(re.findall(r"@([\w.]+)", part)) - {*members})
         parts.append("".join(heads[name] if heads[name].endswith("\n") else heads[name] + "\n" for name in used) + part)
-    return [part for part in parts if part]
+    return parts
 
 
 def compile_module(text: str) -> bytes:
