@@ -47,5 +47,7 @@ def test_nothing_is_compiled_by_xla(compilations):
         found = udk.kinematics(mechanism, driver, np.linspace(0.0, 0.1, 4) + float(np.asarray(mechanism.q0)[0, 2]))
         assert np.all(np.asarray(found.reached))
         udk.travel(mechanism, driver)
+        assert udk.equilibrium(mechanism).balanced
+        udk.modes(mechanism)
 
     assert len([seconds for seconds in compilations(ask) if seconds]) <= 2

@@ -9,7 +9,6 @@ from jaxtyping import ArrayLike, Float
 from udkjax.equations import energy, violation
 from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
-from udkjax.integrate.events.conditions import frames_of
 from udkjax.scene import GROUND, Mechanism, Revolute
 
 N_SAMPLES = 5  # times at which it is asked whether drivers move and potentials change
@@ -54,6 +53,8 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
     """Return whether nothing but errors changes the total energy: no driver moves, and all forces have potentials at rest."""
+    from udkjax.integrate.events.conditions import frames_of  # and with it events, which other studies do without
+
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
     ts = np.asarray(ts)  # of which JAX would compile a program to find the least
     times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
