@@ -122,7 +122,7 @@ def code_of(samples: int) -> list[str]:
     run = compiled.plan.operation
     assert run is not None
     reverse = run.with_cotangents((True,) * run.code.number_count, STORED)
-    return [generate(operation, 1, False).written_text for operation in (run, reverse)]
+    return [generate(operation, 1, 1).written_text for operation in (run, reverse)]
 
 
 def test_the_code_does_not_depend_on_how_many_samples_there_are():

@@ -59,8 +59,8 @@ def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tup
 def _close_along(guess: Any, operation: CloseTangents, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
     mechanism, n, along = guess[0], len(guess[-1]), []
     for active, (numbers, dq, dv) in changes:
-        along.append(jnp.asarray(numbers_as_vector(number_tangents(mechanism, active[0], numbers))))
-        along += [jnp.zeros(n) if dx is None else dx for dx in (dq, dv)]
+        along.append(number_tangents(mechanism, active[0], numbers))
+        along += [np.zeros(n) if dx is None else dx for dx in (dq, dv)]
     dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), operation=operation, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
 

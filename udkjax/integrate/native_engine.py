@@ -94,8 +94,7 @@ def _integrate_along(
     n, samples, directions = len(problem.q), [], []
     for active, change in changes:
         tangents = number_tangents(_numbers_of(problem), _active_of(problem, active), _numbers_of(problem, change))
-        state = (jnp.zeros(n) if dx is None else dx for dx in (change.q, change.v))
-        directions += [jnp.asarray(numbers_as_vector(tangents)), *state]
+        directions += [tangents, *(np.zeros(n) if dx is None else dx for dx in (change.q, change.v))]
         samples += [problem.compiled.samples.changes(change.textbook.mechanism)] if operation.sampled else []
     *found, dys, dend = native_p.bind(
         *_inputs(problem, operation),

@@ -121,7 +121,7 @@ class KnownRates:
             raise ValueError(f"there is no machine code for {type(method).__name__} of this mechanism")
         numbers = np.asarray(_numbers(equations, None, operation))
         given = _inputs(operation, compiled.equations, equations, numbers, 0.0, np.zeros(n), np.zeros(n), np)
-        self._call = machine_code(operation, 1, False).prepare(given, operation.shapes(given, 2))
+        self._call = machine_code(operation, 1, 1).prepare(given, operation.shapes(given, 2))
         self._t, self._q, self._v = (self._call.inputs[INPUTS.index(name)][0] for name in ("ts", "q", "v"))
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from types import ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
@@ -59,10 +60,13 @@ def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, 
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
 
-def number_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array]) -> list[Any]:
-    """Return the tangents of all numbers and of two thresholds, in order: zeros of those that are not active."""
+def number_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array]) -> Array:
+    """Return the tangents of all numbers of a tree, and of two thresholds, as one vector: zeros of those that are not active."""
     leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active, change)), strict=True)
-    return [*(dx if m is True else np.zeros(np.shape(x)) for x, m, dx in leaves if x is not None), np.zeros(2)]
+    moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
+    which = np.array(active_numbers(numbers, active))
+    # Two operations, however many pieces there are: each would take XLA as long as a hundred steps of a small scene.
+    return jnp.concatenate([*moving, np.zeros(1)])[np.where(which, np.cumsum(which) - 1, np.sum(which))]
 
 
 def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool]) -> PyTree[Array]:

@@ -66,12 +66,12 @@ class Operation(ABC):
         return 0
 
     @abstractmethod
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         """Return the module in so many lanes.
 
         Args:
             width: The number of lanes.
-            several: Whether several directions of a single member may be side by side.
+            beside: How many directions of a single member are side by side.
             vector: How many float64 numbers a register holds.
         """
 
@@ -136,7 +136,7 @@ class RunStates(Operation):
         """The fields of the same operation with derivatives."""
         return {each.name: getattr(self, each.name) for each in fields(self)} | {"code": self.code.for_derivatives}
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -154,8 +154,8 @@ class RunTangents(RunStates):
     def tangents(self) -> int:
         return 4 if self.sampled else 3
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
-        return Forward(self.plan(width, vector), self.active, vector if several else width)
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return Forward(self.plan(width, vector), self.active, max(width, beside))
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         directions, n = inputs[-1].shape[1], self.coordinates
@@ -171,8 +171,8 @@ class RunSecondTangents(RunTangents):
     def tangents(self) -> int:
         return 2 * super().tangents
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
-        return ForwardTwice(self.plan(width, vector), self.active, vector if several else width)
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return ForwardTwice(self.plan(width, vector), self.active, max(width, beside))
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class RunCotangents(RunStates):
     points: int = STORED  # that the record of a run has room for
     is_reverse: ClassVar[bool] = True
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return Reverse(self.plan(width, vector), self.active)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -203,7 +203,7 @@ class Close(Operation):
     in_lanes: ClassVar[bool] = False
     results: ClassVar[int] = len(Closing.results)
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return Closing(self.code, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -220,7 +220,7 @@ class CloseTangents(Close):
     def tangents(self) -> int:
         return 3
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingForward(self.code, vector, self.active)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -235,7 +235,7 @@ class CloseSecondTangents(CloseTangents):
     def tangents(self) -> int:
         return 6
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingTwice(self.code, vector, self.active)
 
 
@@ -245,7 +245,7 @@ class CloseCotangents(Close):
 
     active: tuple[bool, ...] = ()
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingReverse(self.code, vector, self.active)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -267,7 +267,7 @@ class StateOperation(Operation):
     def all_settings(self) -> tuple[str, ...]:
         return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -298,7 +298,7 @@ class MarkRows(Operation):
 
     settings: ClassVar[tuple[str, ...]] = RowMarks.settings
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return RowMarks(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
@@ -311,7 +311,7 @@ class March(Operation):
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 
-    def module(self, width: int, several: bool, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Module:
         return Marching(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:

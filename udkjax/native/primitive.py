@@ -32,12 +32,12 @@ FEW = 2  # members up to which one follows another: eight lanes take as long as 
 
 
 @lru_cache(maxsize=256)
-def generate(operation: Operation, width: int, several: bool) -> Module:
+def generate(operation: Operation, width: int, beside: int) -> Module:
     """The module of an operation in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
 
-    `several`: whether there may be more than one direction of a single member, which then are side by side.
+    `beside`: how many directions of a single member are side by side.
     """
-    module = operation.module(width, several, machine.lanes())
+    module = operation.module(width, beside, machine.lanes())
     handlers = handler(module, "call_frame")
     declared = sorted(set().union(*(f.declared for f in handlers)))
     module.written_text = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])
@@ -63,8 +63,8 @@ def unsupported(code: ScenePrograms) -> str:
 class LoadedCode:
     """The machine code of one operation, in so many lanes."""
 
-    def __init__(self, operation: Operation, width: int, several: bool):
-        self._module, self._in_passes = generate(operation, width, several), operation.is_reverse
+    def __init__(self, operation: Operation, width: int, beside: int):
+        self._module, self._in_passes = generate(operation, width, beside), operation.is_reverse
         self.name, self._run = load(self._module.written_text)
         self._fields = self._module.call_fields
 
@@ -135,14 +135,14 @@ def load(text: str) -> tuple[str, Any]:
 
 
 @lru_cache(maxsize=256)
-def machine_code(operation: Operation, width: int, several: bool) -> LoadedCode:
+def machine_code(operation: Operation, width: int, beside: int) -> LoadedCode:
     """The machine code of an operation."""
-    return LoadedCode(operation, width, several)
+    return LoadedCode(operation, width, beside)
 
 
 def call_known(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
     """Run an operation on numbers that are known, of one member: nothing is traced for it."""
-    return machine_code(operation, 1, False)(inputs, operation.shapes(inputs, times))
+    return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 
 
 # --- as a primitive of JAX
@@ -150,8 +150,9 @@ def call_known(operation: Operation, inputs: Sequence[np.ndarray], times: int) -
 
 def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     few = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
-    several = bool(operation.tangents) and few and inputs[-1].shape[1] > 1 and operation.code.is_small
-    return machine_code(operation, 1 if few else machine.lanes(), several)
+    directions = inputs[-1].shape[1] if operation.tangents and few and operation.code.is_small else 1
+    beside = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are the faster ones
+    return machine_code(operation, 1 if few else machine.lanes(), beside)
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
@@ -188,8 +189,9 @@ def _batch(
     if operation.tangents and all(axis is None for axis in axes[:shared]):
 
         def directions(x: Any, axis: int | None) -> Any:
-            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else x
-            x = jnp.moveaxis(x, 0, 1)
+            xp = np if isinstance(x, np.ndarray) else jnp
+            x = xp.broadcast_to(x, (size, *x.shape)) if axis is None else x
+            x = xp.moveaxis(x, 0, 1)
             return x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:])
 
         given = [directions(x, axis) for x, axis in zip(first[shared:], axes[shared:], strict=True)]

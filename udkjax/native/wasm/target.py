@@ -38,7 +38,7 @@ def wasm_module(operation: Operation) -> WasmModule:
     Raises:
         UnsupportedError: the operation takes what machine code has no instruction for.
     """
-    module = operation.module(1, False, LANES)
+    module = operation.module(1, 1, LANES)
     module.written_text = module.text()
     return WasmModule(compile_wasm(module.written_text, ("run",)), module)
 
