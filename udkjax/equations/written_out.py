@@ -97,6 +97,15 @@ class WrittenOut:
         evaluation = self._program(results | {place: s for s, place in at.items()}, {})
         return WrittenOutDerivative(evaluation, self._program(outputs, at | self._seeds))
 
+    def evaluations(self, names: Sequence[str]) -> WrittenOutProgram:
+        """Return what the derivatives of several differentiable programs need of one state, as "stored" and a program's name."""
+        found: dict[Place, Scalar] = {}
+        for name in names:
+            evaluation = self.derivative(name).evaluation
+            scalars = zip(evaluation.outputs, evaluation.program.outputs, strict=True)
+            found |= {(f"stored {name}", k): s for (x, k), s in scalars if x == "stored"}
+        return self._program(found, {})
+
     def prologue_derivative(self, active: Sequence[bool], mode: str) -> WrittenOutProgram:
         """Return the program from the changes of the active numbers to those of the moving constants, or its transpose."""
         graph, layout = self.graph, self._arrays["constants"]

@@ -77,9 +77,8 @@ class Reverse(Recorded):
             )
 
     def _pull_projection(self, f: Function, mask: Value):
-        """Pull `bar result` through the projection that led to the state, to `bar state`."""
+        """Pull `bar result` through the projection that led to the state, which has been evaluated, to `bar state`."""
         if self.of_projection:
-            self._evaluate_end(f)
             f.call("reverse_projection", f.given["work"], self.address(f, "projection linearization"), f.given["work"])
             self._accumulate_constants(f, mask)
         else:
@@ -154,7 +153,7 @@ class Reverse(Recorded):
         with f.each(self.rowcount) as r:
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
-        f.call("evaluation", f.given["work"], self.address(f, "corrected q"), self.address(f, f"stage{last} linearization"))
+        self._evaluate_end(f)
         self._pull_accelerations(f, f"stage{last} linearization", "bar point3 a", active)
         with f.each(self.rowcount) as r:
             for x in "qv":
@@ -277,6 +276,7 @@ class Reverse(Recorded):
                 with f.each(n) as i:
                     f.store(f.load(state, i), f.given["work"], i * f.width + k + self.start(f"state {x}", "work"))
         setattr(s, "state t", s.next)
+        self._evaluate_projection(f)
         self._pull_projection(f, mask)
         ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
         with f.each(self.rowcount) as r:

@@ -52,6 +52,10 @@ class Differentiated(Trajectory):
         super().write_programs()
         for each in self._linearizations:
             each.evaluation()
+        if self.written_out and self.of_projection:
+            names = ("accelerations", "projection")
+            at = {f"stored {name}": (name, 0) for name in names} | self.arrays
+            self.write_scalars(self.written_out.evaluations(names), "evaluation_end", ("work", *names), at)
 
     @property
     def _linearizations(self) -> list[ProgramDerivative]:
@@ -59,6 +63,15 @@ class Differentiated(Trajectory):
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
     def _evaluate_end(self, f: Function):
+        """Evaluate accelerations and a projection at the end of a step, for their derivatives: by the same factors."""
+        accelerations = self.address(f, f"stage{self.last} linearization")
+        if self.written_out and self.of_projection:
+            f.call("evaluation_end", f.given["work"], accelerations, self.address(f, "projection linearization"))
+        else:
+            f.call("evaluation", f.given["work"], self.address(f, "corrected q"), accelerations)
+            self._evaluate_projection(f)
+
+    def _evaluate_projection(self, f: Function):
         """Evaluate a projection at the state, which lies on the manifold, for its derivatives."""
         if self.of_projection:
             f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "projection linearization"))
@@ -161,6 +174,10 @@ class Forward(Differentiated):
             self._along(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
 
     def record_step(self, f: Function, s: Lane, accept: Value):
+        with f.if_(f.any_of(accept)):
+            self._change_end(f, s, accept)
+
+    def _change_end(self, f: Function, s: Lane, accept: Value):
         """Compute the changes of point 3, from those of point 2, where the step began."""
         step = f.select(s.begin > 0.5, 0.0, s.t1 - s.point2_t)
         h, begin = self.broadcast(f, step), s.begin > 0.5
@@ -174,7 +191,6 @@ class Forward(Differentiated):
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
-        f.call("evaluation", f.given["work"], self.address(f, "corrected q"), self.address(f, f"stage{self.last} linearization"))
         with self._each_tangent(f):
             self._change_stage(f, self.last, h, "point2")
             with f.each(self.registers("tangent")) as r:
@@ -214,7 +230,7 @@ class Forward(Differentiated):
     def record_output(self, f: Function, s: Lane):
         with f.each(self.rowcount) as r:
             self.put(f, "state v", r, self.vector(f, "result v", r))  # the programs look for states there
-        self._evaluate_end(f)
+        self._evaluate_projection(f)
         with self._each_tangent(f):
             f.call("tangent_differences", f.given["work"], f.given["tangent"])
             f.call("tangent_between", f.given["work"], f.given["tangent"])
