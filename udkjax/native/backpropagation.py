@@ -15,13 +15,14 @@ Members walk back side by side, in lanes; the next ones follow when all are back
 from collections.abc import Sequence
 
 from udkjax.equations.differentiable_programs import REVERSE
+from udkjax.native.dense_output import write_differences_back
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.record import Recorded
 from udkjax.native.runge_kutta import stage_state
 from udkjax.native.samples import ARGUMENTS, count_breakpoints, numbers_of_row
-from udkjax.native.steps import DONE, POINTS, STRETCH
+from udkjax.native.steps import DONE, POINTS
 
 
 class Reverse(Recorded):
@@ -55,7 +56,7 @@ class Reverse(Recorded):
             each.reverse()
         if self.count:
             write_prologue_derivative(self, self.active, REVERSE)
-        self._write_transposed_differences()
+        write_differences_back(self)
         self._write_step_back()
         self._write_leave_row()
         if self.plan.sampled:
@@ -90,52 +91,6 @@ class Reverse(Recorded):
         """Pull cotangents of accelerations through the equations at the state, to `bar state`."""
         f.call("reverse", f.given["work"], self.address(f, stored), self.address(f, bar))
         self._accumulate_constants(f, mask)
-
-    def _write_transposed_differences(self):
-        """Write `differences_back`: from cotangents of divided differences, which are cleared, to those of the points."""
-        f, s = self.function("differences_back")
-        active = s.at > 0.5
-        times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
-        step = times[0] - times[1]
-        inverse, used = {}, [None, None]
-        for i in range(POINTS):
-            for j in range(i + 1, POINTS):
-                d = times[j] - times[i]
-                inverse[i, j] = self.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
-        sofar = None
-        for k in range(1, POINTS - 1):
-            near = (times[k] - times[k + 1]) * STRETCH >= step
-            sofar = near if sofar is None else sofar & near
-            used.append(sofar)
-        zero, count = f.const(0.0, DOUBLE, self.plan.vector), 3 * POINTS
-        with f.each(self.rowcount) as r:
-            bars: dict[str, list[Value]] = {x: [zero] * POINTS for x in "qva"}
-            column: list[Value] = []
-            for degree in reversed(range(count)):
-                length = count - degree
-                mask = used[degree // 3]
-                mine = self.vector(f, f"bar difference{degree}", r)
-                mine = mine if mask is None else f.select(mask, mine, 0.0)
-                here = [zero] * length
-                for i, bar in enumerate(column):  # of the column after this one
-                    one, two = i // 3, (i + degree + 1) // 3
-                    if one == two:
-                        x, share = ("v", bar) if degree == 0 else ("a", bar * 0.5)
-                        bars[x][one] = bars[x][one] + share
-                    else:
-                        part = bar * inverse[one, two]
-                        here[i + 1] = here[i + 1] + part
-                        here[i] = here[i] - part
-                here[0] = here[0] + mine
-                column = here
-                self.put(f, f"bar difference{degree}", r, zero)
-            for i, bar in enumerate(column):
-                bars["q"][i // 3] = bars["q"][i // 3] + bar
-            for k in range(POINTS):
-                for x in "qva":
-                    name = f"bar point{POINTS - 1 - k} {x}"
-                    old = self.vector(f, name, r)
-                    self.put(f, name, r, f.select(active, old + bars[x][k], old))
 
     def _write_step_back(self):
         """Write `step_back`: from the cotangents of point 3 to those of point 2, of lanes that are not yet back (`at`)."""

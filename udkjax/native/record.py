@@ -6,9 +6,9 @@ record and walks back at once; a member whose record was too long for its place 
 
 from collections.abc import Callable
 
+from udkjax.native.differentiated import Differentiated
 from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
-from udkjax.native.tangents import Differentiated
 
 FIRST = 32  # points that a record has room for while a member runs, before it grows
 STORED = 200  # points up to which a record is given to the second call: as much memory as 300 outputs
