@@ -12,9 +12,9 @@ How the code of a run is made, and where to look:
    the motion is not smooth), `dense_output` (states between steps), `members` (which member runs in which lane).
 5. `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination, where one is asked for;
    `formulations` finds accelerations in another way than by the Udwadia-Kalaba equation.
-6. `tangents` (forward mode, to second order) and `backpropagation` (reverse mode) add derivatives on top of `differentiated`, with
-   the programs of `program_derivative` and `prologue`; `closing`, `closing_derivatives` and `corrections` are a module that assembles a mechanism
-   instead, `marching` one that follows its positions.
+6. `tangents` (forward mode, to second order) and `backpropagation` (reverse mode) add derivatives to what `differentiated` has of
+   both, with the programs of `program_derivative` and `prologue`; `closing`, `closing_derivatives` and `corrections` are a module
+   that assembles a mechanism instead, `marching` one that follows its positions.
 7. `positions` is a module of its own: batches of positions with derivatives, from the programs of equations/position_programs.py.
 8. `ffi` writes the entry point that XLA calls; `machine` compiles the text, or finds it on disk; `operations` says what modules
    and shapes there are; `primitive` makes them a primitive of JAX with its batching rule. `udkjax.integrate` calls that and knows

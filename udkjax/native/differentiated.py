@@ -1,4 +1,4 @@
-"""What forward and reverse mode of a trajectory have in common: the programs whose derivatives they take, at their states."""
+"""The base of forward and reverse mode of a trajectory: the programs whose derivatives both take, at their states."""
 
 from udkjax.native.ir import Function
 from udkjax.native.layout import Plan
