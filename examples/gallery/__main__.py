@@ -27,6 +27,7 @@ NAMES = (
     "double_pendulum_map",
     "neural_friction",
     "designed_paths",
+    "six_bar_dwell",
 )
 DRAWINGS = {"toggle_press": 1.0, "quick_return": 2.0, "cam_follower": 0.5, "door_closer": 6.0, "scissor_lift_spring": 2.0}  # s
 PLAYER = "player.js"  # what moves their pages

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.design.design_problem import Trials
 from udkjax.study.design.search import loss_of
+from udkjax.study.design.trials import Trials
 
 DATA = json.loads((Path(__file__).parents[2] / "data" / "path_synthesis.json").read_text())["cases"]
 FOUR_BAR = udk.Drawing(
@@ -282,3 +282,18 @@ def test_mistakes_are_named():
         udk.design(FOUR_BAR, goal, transmission=2.0)
     with pytest.raises(TypeError, match="drawing must be"):
         udk.design("four_bar.toml", goal)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_curve_that_wants_dead_points_has_designs_and_failures_say_why():
+    """A heart's best four-bars pass dead points; what is found stays away from them, and its motion bears it out."""
+    a = np.linspace(0.0, 2.0 * np.pi, 17)
+    heart = np.stack([16 * np.sin(a) ** 3, 13 * np.cos(a) - 5 * np.cos(2 * a) - 2 * np.cos(3 * a) - np.cos(4 * a)], 1)
+    found = udk.design(FOUR_BAR, udk.PathGoal("P", heart), starts=60, results=2)
+    assert len(found) and not found.reason and found[0].loss < 0.05 * 32.0**2
+    path = udk.path(found[0].mechanism, udk.kinematics(found[0].mechanism, "motor", found[0].values), "P")
+    np.testing.assert_allclose(np.sum((np.asarray(path) - heart) ** 2), found[0].loss, rtol=1e-6)
+    apart = {("O", "A"): (2000.0, 3000.0), ("O", "C"): (1.0, 2.0)}
+    none = udk.design(
+        FOUR_BAR, udk.PathGoal("P", heart), bounds={"pin.A": (-50.0, 50.0), "pin.O": (-50.0, 50.0)}, lengths=apart, starts=8
+    )
+    assert not len(none) and "exceeds the length O-A" in none.reason and "nothing was found" in str(none)

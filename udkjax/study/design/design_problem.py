@@ -1,7 +1,6 @@
 """A design as a least-squares problem, evaluated for batches of trials by machine code in lanes."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,64 +15,16 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.design.goals import Goal, goal_scale, place_of
 from udkjax.study.design.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
 from udkjax.study.design.motion_goals import MotionTerm
-from udkjax.study.design.motion_terms import TURN, CompiledTerm
+from udkjax.study.design.motion_terms import CompiledTerm
+from udkjax.study.design.trials import TrialResiduals, Trials, Turn
 from udkjax.study.drive import Drive, drive
 from udkjax.study.free_numbers import FreeNumbers, position_model
+from udkjax.study.kinematics import FULL_TURN
 
 TURN_VALUES = 72  # of a turn from which searches start
 FINE_VALUES = 720  # of a turn that is to be made, in the end
 MARGIN_WEIGHT = 10.0  # of limits of transmission beside those of lengths: beyond them there is no mechanism
 CHECK_VALUES = 24  # of a turn at which transmission is looked at in a search; between them the worst is interpolated
-
-
-class Trials(NamedTuple):
-    """M trials: unknowns x (M, P), values s (M, J) and positions q (M, J, n) of the driver at each position of the goal."""
-
-    x: np.ndarray
-    s: np.ndarray
-    q: np.ndarray
-
-    def take(self, which: np.ndarray) -> "Trials":
-        """Return some of them."""
-        return Trials(*(a[which] for a in self))
-
-
-class TrialResiduals(NamedTuple):
-    """Residuals of M trials with their derivatives.
-
-    Attributes:
-        q: positions (M, J, n).
-        r: residuals (M, J, G).
-        by_value: their derivatives by s (M, J, G).
-        by_unknowns: their derivatives by x (M, J, G, P).
-        terms: residuals of motion goals (M, T).
-        terms_by_unknowns: their derivatives by x (M, T, P).
-        transmission: (M, J), with the sign of the branch.
-        limits: rows (M, K) that must not exceed zero, in the unit of residuals.
-        limits_by_unknowns: their derivatives by x (M, K, P).
-        is_there: whether all positions exist (M,).
-    """
-
-    q: np.ndarray
-    r: np.ndarray
-    by_value: np.ndarray
-    by_unknowns: np.ndarray
-    terms: np.ndarray
-    terms_by_unknowns: np.ndarray
-    transmission: np.ndarray
-    limits: np.ndarray
-    limits_by_unknowns: np.ndarray
-    is_there: np.ndarray
-
-
-class Turn(NamedTuple):
-    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and how many were reached."""
-
-    s: np.ndarray
-    measures: np.ndarray
-    q: np.ndarray
-    transmission: np.ndarray
-    reached: np.ndarray
 
 
 class DesignProblem:
@@ -241,7 +192,7 @@ class DesignProblem:
     @property
     def period(self) -> float:
         """The range of values that a search looks at: a turn, or of a length its scale."""
-        return TURN if self.driven.is_angle else self.scale
+        return FULL_TURN if self.driven.is_angle else self.scale
 
     @property
     def longest(self) -> float:

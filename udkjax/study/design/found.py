@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.study.channels import locate
-from udkjax.study.design.design_problem import TURN, DesignProblem
+from udkjax.study.design.design_problem import DesignProblem
 from udkjax.study.drive import Drive
 from udkjax.study.free_numbers import FreeNumbers
-from udkjax.study.kinematics import Kinematics, kinematics
+from udkjax.study.kinematics import FULL_TURN, Kinematics, kinematics
 
 AGREEMENT = 1e-6  # relative difference, and of the squared scale, between the loss of a search and that of the motion
 
@@ -49,7 +49,7 @@ class FoundDesign(PrintsTable):
         Args:
             count: of values.
         """
-        last = self.values[0] + TURN if self.turns else self.values[-1]
+        last = self.values[0] + FULL_TURN if self.turns else self.values[-1]
         return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
 
     @property
@@ -114,7 +114,7 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
     values = s + float(problem.goal.origin(mechanism)) + (x[problem.free.count] if problem.shifted else 0.0)
     drawn = float(problem.drawn(mechanism))
     if problem.driven.is_angle:
-        values = values + TURN * np.round((drawn - values[0]) / TURN)
+        values = values + FULL_TURN * np.round((drawn - values[0]) / FULL_TURN)
     moved = follow(mechanism, problem.driver, values)
     numbers = FreeNumbers(mechanism, problem.free.names)
     unknowns = np.append(numbers.vector, x[problem.free.count :])

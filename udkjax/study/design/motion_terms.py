@@ -18,9 +18,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.design.motion_goals import MotionPoint, MotionTerm
 from udkjax.study.drive import Drive, Driven
 from udkjax.study.free_numbers import FreeNumbers, position_model
-from udkjax.study.kinematics import kinematics
-
-TURN = 2.0 * np.pi
+from udkjax.study.kinematics import FULL_TURN, kinematics
 
 
 class TermResiduals(NamedTuple):
@@ -121,7 +119,7 @@ class CompiledTerm:
         if self._span is not None:
             return np.tile(np.linspace(*self._span, count), (len(x), 1))
         # Fixed values, so that they do not change with the drawing; the first is the next one to it.
-        step, drawn = TURN / count, np.asarray(self._drawn.by_numpy(list(x.T))[0])
+        step, drawn = FULL_TURN / count, np.asarray(self._drawn.by_numpy(list(x.T))[0])
         return step * (np.ceil(drawn / step)[:, None] + np.arange(count))
 
     def measure_motion(self, mechanism: Mechanism, x: np.ndarray, origin: float) -> np.ndarray | None:

@@ -8,9 +8,10 @@ differences of gradients, all of which are trials of one batch. Steps go downhil
 
 import numpy as np
 
-from udkjax.study.design.design_problem import DesignProblem, TrialResiduals, Trials
+from udkjax.study.design.design_problem import DesignProblem
 from udkjax.study.design.search import ROUNDING, SearchState, goes_on, harden, merit_of
 from udkjax.study.design.steps import ACTIVE_SETS
+from udkjax.study.design.trials import TrialResiduals, Trials
 
 DIFFERENCE = 1e-7  # of the unknowns' scales: small enough for mechanisms that just turn; rounding leaves 1e-8 of a Hessian
 FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, of the largest eigenvalue
@@ -38,7 +39,7 @@ def _newton_step(
     done: np.ndarray,
     threads: int | None,
 ):
-    trials, found = state.trials.take(active), TrialResiduals(*(a[active] for a in state.found))
+    trials, found = state.trials.take(active), state.found.take(active)
     u, weight = state.multipliers[active], state.weight[active]
     z, units = _join(problem, trials)
     pressed = found.limits + u > 0
@@ -68,7 +69,7 @@ def _newton_step(
     merit = np.where(exists, merit_of(there, u, weight), np.inf)
     better = merit < state.merit[active]
     taken, kept = active[better], active[~better]
-    state.accept(problem, taken, new.take(better), TrialResiduals(*(a[better] for a in there)), merit[better])
+    state.accept(problem, taken, new.take(better), there.take(better), merit[better])
     promised = np.abs(np.einsum("mk,mk->m", g, dz))
     small = promised <= CONVERGED * state.merit[active] + ROUNDING * problem.scale**2
     shift[taken] = np.maximum(0.1 * shift[taken], LEAST_SHIFT)

@@ -5,12 +5,14 @@ a trial has settled. Where valleys are narrow and bend, steps bend with them: be
 residuals along it, by one more evaluation, gives the acceleration of the geodesic (Transtrum and Sethna 2012, arXiv:1201.5885).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from udkjax.study.design.design_problem import MARGIN_WEIGHT, DesignProblem, TrialResiduals, Trials
+from udkjax.study.design.design_problem import MARGIN_WEIGHT, DesignProblem
 from udkjax.study.design.steps import StepEquations, in_order
+from udkjax.study.design.trials import TrialResiduals, Trials
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
 RELAX, TIGHTEN = 0.2, 4.0  # of the damping, after a step that is taken and one that is not
@@ -46,11 +48,9 @@ class SearchState:
 
     def take(self, which: np.ndarray) -> "SearchState":
         """Return some of them."""
-        found = TrialResiduals(*(a[which] for a in self.found))
-        rest = (self.multipliers, self.weight, self.margin, self.least, self.damping, self.merit, self.settled)
-        return SearchState(
-            self.trials.take(which), found, *(a[which] for a in rest), self.kept.take(which), self.kept_loss[which]
-        )
+        every = ((field.name, getattr(self, field.name)) for field in fields(self))
+        taken: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in every}
+        return SearchState(**taken)
 
     def accept(self, problem: DesignProblem, which: np.ndarray, trials: Trials, found: TrialResiduals, merit: np.ndarray):
         """Take new places of some trials, and remember the best one of each that is within all limits."""
@@ -61,7 +61,7 @@ class SearchState:
 
     def keep(self, problem: DesignProblem, which: np.ndarray):
         """Remember trials that are within all limits, where they are better than what is remembered."""
-        found = TrialResiduals(*(a[which] for a in self.found))
+        found = self.found.take(which)
         loss = np.where(found.is_there & (self.excess(problem, which) <= 0), loss_of(found), np.inf)
         better = loss < self.kept_loss[which]
         for a, b in zip(self.kept, self.trials, strict=True):
@@ -118,7 +118,7 @@ def _pressure(limits: np.ndarray, multipliers: np.ndarray, weight: np.ndarray) -
 
 
 def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: np.ndarray, threads: int | None):
-    trials, found = state.trials.take(active), TrialResiduals(*(a[active] for a in state.found))
+    trials, found = state.trials.take(active), state.found.take(active)
     equations = StepEquations(problem, trials, found, state.multipliers[active], state.weight[active], state.damping[active])
     new = _stepped(problem, trials, *_bent_step(problem, equations, threads))
     before, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
@@ -131,7 +131,7 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     merits = np.where(exists, merit_of(there, u, weight), np.inf)
     better, fall = merits < before, before - merits
     taken, kept = active[better], active[~better]
-    state.accept(problem, taken, new.take(better), TrialResiduals(*(a[better] for a in there)), merits[better])
+    state.accept(problem, taken, new.take(better), there.take(better), merits[better])
     slow = fall[better] < PRESSED * before[better]
     settled = fall[better] < SETTLED * before[better]
     settled[slow] |= goes_on(problem, state, taken[slow])
@@ -201,12 +201,12 @@ def raise_walls(problem: DesignProblem, state: SearchState):
 
 def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
     """Return the unit of the weights of some trials."""
-    return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(TrialResiduals(*(a[which] for a in state.found)))))
+    return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(state.found.take(which))))
 
 
 def _reweigh(problem: DesignProblem, state: SearchState, which: np.ndarray, weight: np.ndarray):
     """Change weights of some trials, by which limits press on as hard as before."""
     state.multipliers[which] *= (state.weight[which] / weight)[:, None] ** 2
     state.weight[which] = weight
-    merit = merit_of(TrialResiduals(*(a[which] for a in state.found)), state.multipliers[which], weight)
+    merit = merit_of(state.found.take(which), state.multipliers[which], weight)
     state.merit[which] = np.where(np.isfinite(state.merit[which]), merit, np.inf)

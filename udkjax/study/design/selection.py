@@ -8,15 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.study.design.design_problem import DesignProblem, Trials
+from udkjax.study.design.design_problem import DesignProblem
 from udkjax.study.design.found import FoundDesign, verified
 from udkjax.study.design.polish import polish
 from udkjax.study.design.search import KEPT_TO, SearchState, begin, improve, loss_of
+from udkjax.study.design.trials import Trials
 
 POLISHING = 40  # Newton steps, of which some five are usual at each hardness of the limits
 ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are one
 RETREATS = (0.01, 0.03, 0.1)  # least transmissions (sines) for which refused trials go on, in turn
 RETREAT = 40  # steps of each
+REFUSALS = 3  # before all go on: following a motion takes longer than improving sixteen trials
 
 
 class _Candidates(NamedTuple):
@@ -41,17 +43,13 @@ def select(problem: DesignProblem, state: SearchState, results: int, threads: in
     if not len(losses):
         return Selection([], losses, _what_is_exceeded(problem, state))
     found: list[tuple[FoundDesign, np.ndarray]] = []
-    count = 0
     for least in (*RETREATS, None):
-        refused = _verify(problem, candidates, results, found)
-        count += len(refused)
-        if least is None or not len(refused):
+        open_ones = _verify(problem, candidates, results, found, len(candidates.loss) if least is None else REFUSALS)
+        if least is None or not len(open_ones):
             break
-        state = begin(problem, candidates.trials.take(refused), threads, least)
+        state = begin(problem, candidates.trials.take(open_ones), threads, least)
         candidates = _within_limits(problem, polish(problem, improve(problem, state, RETREAT, threads), POLISHING, threads))
-    reason = (
-        f"the motions of all {count} trials within the limits, when followed again, leave their branches or come to dead points"
-    )
+    reason = "the motions of the trials within the limits, when followed again, leave their branches or come to dead points"
     return Selection([design for design, _ in found], losses, "" if found else f"{reason}: ask for more transmission")
 
 
@@ -67,25 +65,30 @@ def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:
 
 
 def _verify(
-    problem: DesignProblem, candidates: _Candidates, results: int, found: list[tuple[FoundDesign, np.ndarray]]
+    problem: DesignProblem, candidates: _Candidates, results: int, found: list[tuple[FoundDesign, np.ndarray]], most: int
 ) -> np.ndarray:
-    """Add verified designs that differ to those found, and sort; return which candidates are refused that are better than all."""
-    refused = []
+    """Add verified designs that differ to those found, and sort; return which candidates promise more than the best of them.
+
+    After so many refusals, at most, no more candidates are looked at.
+    """
+    refused: list[np.ndarray] = []
     for k, loss in enumerate(candidates.loss):
-        if len(found) >= results and loss >= found[results - 1][0].loss:
+        if len(refused) == most or (len(found) >= results and loss >= found[results - 1][0].loss):
             break
         x, s, q = (a[k] for a in candidates.trials)
         signature = np.append(problem.signature(x, q[0]), 0.0)
-        if any(np.max(np.abs(signature - other)) < ALIKE * problem.scale for _, other in found):
+        known = [*refused, *(other for _, other in found)]
+        if any(np.max(np.abs(signature - other)) < ALIKE * problem.scale for other in known):
             continue
         one = verified(problem, x, s, q, float(loss))
         if one is None:
-            refused += [k] if not found or loss < found[0][0].loss else []
+            refused.append(signature)
         else:
             found.append((one, signature))
             found.sort(key=lambda pair: pair[0].loss)
     del found[results:]
-    return np.array(refused, int)
+    best = found[0][0].loss if found else np.inf
+    return np.flatnonzero(candidates.loss < best * (1.0 - ALIKE)) if refused else np.zeros(0, int)
 
 
 def _what_is_exceeded(problem: DesignProblem, state: SearchState) -> str:

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.study.design.design_problem import TURN_VALUES, DesignProblem, Trials, Turn
+from udkjax.study.design.design_problem import TURN_VALUES, DesignProblem
+from udkjax.study.design.trials import Trials, Turn
 
 PHASES = 12  # first values that are tried, around a turn
 SPANS = (1.0, 0.6, 0.3)  # of a turn, from the first value to the last, that are tried for open curves

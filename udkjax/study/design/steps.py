@@ -11,12 +11,13 @@ them stay.
 
 import numpy as np
 
-from udkjax.study.design.design_problem import DesignProblem, TrialResiduals, Trials
+from udkjax.study.design.design_problem import DesignProblem
+from udkjax.study.design.trials import TrialResiduals, Trials
 
 LONGEST_MOVE = 0.5  # scales: of an unknown in one step
 ACTIVE_SETS = 5  # rounds in which a step finds out which limits it will press on
 GAP_SHARE = 0.45  # of the gap to the next value that a value may move by in one step: so that their order stays
-EPS = float(np.finfo(float).eps)
+REGULAR = float(np.finfo(float).eps)  # of the largest diagonal entry: keeps matrices regular where nothing else does
 
 
 class StepEquations:
@@ -42,7 +43,7 @@ class StepEquations:
         if problem.local:
             self.w = np.einsum("mjg,mjgp->mjp", found.by_value, found.by_unknowns)
             h = np.einsum("mjg,mjg->mj", found.by_value, found.by_value)
-            self.h = h * (1.0 + damping[:, None]) + EPS * problem.scale**2
+            self.h = h * (1.0 + damping[:, None]) + REGULAR * problem.scale**2
             self.A = self.A - (self.w / self.h[..., None]).transpose(0, 2, 1) @ self.w
 
     def find(self) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +63,7 @@ class StepEquations:
             gradient = b[which] + ((force * excess)[:, None] @ C)[:, 0]
             size = self.diagonal[which] + (force[:, None] @ C**2)[:, 0]
             steepest = np.max(size, axis=1, keepdims=True)
-            matrix[:, places, places] += self.damping[which, None] * size + EPS * (steepest + (steepest == 0))
+            matrix[:, places, places] += self.damping[which, None] * size + REGULAR * (steepest + (steepest == 0))
             held = (low[which] & (gradient > 0)) | (high[which] & (gradient < 0))
             matrix = _held_out(matrix, held)
             change = -np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None])[..., 0]

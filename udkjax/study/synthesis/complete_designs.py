@@ -12,9 +12,8 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.study.drive import Drive
-from udkjax.study.kinematics import Kinematics, kinematics
+from udkjax.study.kinematics import FULL_TURN, Kinematics, kinematics
 
-TURN = 2.0 * np.pi
 NEARLY_REAL = 1e-4  # of the extent: singular ends are known to the root of rounding, and less
 
 
@@ -62,7 +61,7 @@ class CompleteDesign(PrintsTable):
         """
         on_branch = self.values[self.branches == 0]
         farthest = on_branch[np.argmax(np.abs(on_branch - self.values[0]))]
-        last = self.values[0] + TURN if self.turns else farthest if len(on_branch) > 1 else self.values[0]
+        last = self.values[0] + FULL_TURN if self.turns else farthest if len(on_branch) > 1 else self.values[0]
         return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
 
     @property

@@ -1,0 +1,59 @@
+"""Trials of a design side by side, what is evaluated of them, and their turns."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Trials(NamedTuple):
+    """M trials: unknowns x (M, P), values s (M, J) and positions q (M, J, n) of the driver at each position of the goal."""
+
+    x: np.ndarray
+    s: np.ndarray
+    q: np.ndarray
+
+    def take(self, which: np.ndarray) -> "Trials":
+        """Return some of them."""
+        return Trials(*(a[which] for a in self))
+
+
+class TrialResiduals(NamedTuple):
+    """Residuals of M trials with their derivatives.
+
+    Attributes:
+        q: positions (M, J, n).
+        r: residuals (M, J, G).
+        by_value: their derivatives by s (M, J, G).
+        by_unknowns: their derivatives by x (M, J, G, P).
+        terms: residuals of motion goals (M, T).
+        terms_by_unknowns: their derivatives by x (M, T, P).
+        transmission: (M, J), with the sign of the branch.
+        limits: rows (M, K) that must not exceed zero, in the unit of residuals.
+        limits_by_unknowns: their derivatives by x (M, K, P).
+        is_there: whether all positions exist (M,).
+    """
+
+    q: np.ndarray
+    r: np.ndarray
+    by_value: np.ndarray
+    by_unknowns: np.ndarray
+    terms: np.ndarray
+    terms_by_unknowns: np.ndarray
+    transmission: np.ndarray
+    limits: np.ndarray
+    limits_by_unknowns: np.ndarray
+    is_there: np.ndarray
+
+    def take(self, which: np.ndarray) -> "TrialResiduals":
+        """Return some of them."""
+        return TrialResiduals(*(a[which] for a in self))
+
+
+class Turn(NamedTuple):
+    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and how many were reached."""
+
+    s: np.ndarray
+    measures: np.ndarray
+    q: np.ndarray
+    transmission: np.ndarray
+    reached: np.ndarray
