@@ -200,3 +200,22 @@ def test_second_derivatives_of_assembly_by_machine_code(opening):
     slope = jax.jit(jax.jacfwd(f))
     found = jax.jit(jax.jacfwd(jax.jacfwd(f)))(x)
     assert_allclose(found, differences(slope, x, 1e-3), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("stabilization", [None, udk.Projection(), udk.Baumgarte(5.0, 5.0)], ids=lambda x: type(x).__name__)
+def test_second_derivatives_of_outputs_in_a_batch(stabilization):
+    """Between steps, of states that are projected or not; members side by side are those alone."""
+    mechanism = udk.library.four_bar()
+    one, start = mechanism.body_names[0], udk.assemble(mechanism)
+
+    def states(x):
+        changed = mechanism.with_parameters({f"body.{one}.mass": x[0], f"body.{one}.inertia": x[1]})
+        choices = {"rtol": 1e-10, "atol": 1e-10, "throw": False, "stabilization": stabilization}
+        solution = udk.simulate(changed, np.linspace(0.0, 0.5, 4), udk.State(start.q, start.v), **choices)
+        return jnp.concatenate([solution.q[:, :, 2].ravel(), solution.v[:, 1, 2]])
+
+    x = jnp.array([1.2, 0.1])
+    batch = jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(states))))(x + jnp.array([[0.0, 0.0], [0.1, 0.0], [0.2, 0.01]]))
+    expected = differences(jax.jit(jax.jacfwd(states)), x, 1e-3)
+    assert_allclose(batch[0], expected, atol=1e-6 * np.abs(expected).max())
+    assert_allclose(batch[2], jax.jit(jax.jacfwd(jax.jacfwd(states)))(x + jnp.array([0.2, 0.01])), rtol=1e-7, atol=1e-9)

@@ -105,11 +105,13 @@ class Forward(Differentiated):
         if self.of_projection:
             self._along(f, f"{self.mode}_projection", "projection linearization")
         else:
-            for k in range(len(self.ways)):
-                f.given["tangent"] = f.at(f.given["tangent"], min(k, 1) * self.tangents.size * self.tangents.width)
+            group = f.given["tangent"]
+            for way in self.ways:
+                f.given["tangent"] = f.at(group, self.ways.index(way) * self.tangents.size * self.tangents.width)
                 with f.each(self.registers("tangent")) as r:
                     for x in "qv":
                         self.put(f, f"result {x}", r, self.vector(f, f"state {x}", r, "tangent"), "tangent")
+            f.given["tangent"] = group
 
     def record_stage(self, f: Function, s: Lane, i: int):
         """Compute the changes of the stage's accelerations."""
