@@ -17,8 +17,10 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
+from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.native.conditions import HEAD, Conditions
 from udkjax.native.formulations import formulation_tol
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
 from udkjax.native.operations import MarkRows, RunStates
@@ -55,6 +57,41 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
     none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     found = native_p.bind(*_inputs(problem, operation), *none, operation=operation, times=times)
     return _output(found[: len(OUTPUTS)]), found[-1][0]
+
+
+class WatchedRun(NamedTuple):
+    """A run up to the first crossing of conditions, or to where one cannot be ruled out."""
+
+    output: IntegratorOutput
+    event: Any  # the condition that crosses; -1: none
+    t: Any  # the time up to which it is certain that nothing else happens (s)
+    q: Any  # the state there
+    v: Any
+    violation: Any  # the largest on the way
+    sides: Any  # of zero: of what crosses that before
+
+
+def watch(problem: Problem, conditions: Conditions, given: Any) -> WatchedRun:
+    """Integrate a problem up to the first crossing of conditions; `given` is what `watch_inputs` returns."""
+    operation = _operation(problem).watching(conditions)
+    inputs = [*_inputs(problem, operation), stop_gradients(given)[None]]
+    *found, crossing = native_p.bind(*inputs, operation=operation, times=len(problem.ts))
+    return _watched(found, crossing[0], conditions, len(problem.q))
+
+
+def watch_known(problem: Problem, conditions: Conditions, given: np.ndarray) -> WatchedRun:
+    """Do the same with numbers that are all known, without tracing anything."""
+    operation = _operation(problem).watching(conditions)
+    inputs = [*_inputs(problem, operation, np), given[None]]
+    *found, crossing = call_known(operation, inputs, len(problem.ts))
+    return _watched(found, crossing[0], conditions, len(problem.q))
+
+
+def _watched(found: Sequence[Any], crossing: Any, conditions: Conditions, n: int) -> WatchedRun:
+    event, t, violation = (crossing[k] for k in range(HEAD))
+    sides = crossing[HEAD : HEAD + conditions.count].astype(int)
+    q, v = crossing[-2 * n : -n], crossing[-n:]
+    return WatchedRun(_output(found), event.astype(int), t, q, v, violation, sides)
 
 
 def serves_derivatives(active: Problem) -> bool:

@@ -9,7 +9,7 @@ from udkjax.native.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.manifold import largest_violation, project_output
 from udkjax.native.module import Module
 from udkjax.native.samples import enter_first_row, write_enter
-from udkjax.native.steps import DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
+from udkjax.native.steps import CROSSED, DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
 
 
 def write_begin(module: Module):
@@ -74,7 +74,7 @@ def write_finish(module: Module):
     p, width, call, work = module.places, module.plan.width, f.given["call"], f.given["work"]
     times = f.load(call, module.call_fields.index("times"), base=INT)
     # Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else.
-    stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT))
+    stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT)) & (s.code < float(CROSSED))
     with f.if_(f.any_of(stopped)):
         for share in (0.0, LOOK_AHEAD):
             later = (s.end - s.start) * share

@@ -15,6 +15,7 @@ from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
+from udkjax.native.conditions import Conditions
 from udkjax.native.formulations import FormulationCode
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, Plan
 from udkjax.native.marching import Marching
@@ -26,6 +27,7 @@ from udkjax.native.state_functions import StateAccelerations, StateFunction, Sta
 from udkjax.native.tableau import Method
 from udkjax.native.tangents import Forward, ForwardTwice
 from udkjax.native.trajectory import Trajectory
+from udkjax.native.watching import Watching
 
 Shape = tuple[int, ...]
 
@@ -131,6 +133,10 @@ class RunStates(Operation):
         """Return the operation that walks back to the numbers that are active, by a record of so many points."""
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
+    def watching(self, conditions: Conditions) -> "RunWatched":
+        """Return the operation that integrates up to the first crossing of conditions."""
+        return RunWatched(**{each.name: getattr(self, each.name) for each in fields(self)}, conditions=conditions)
+
     @property
     def _for_derivatives(self) -> dict[str, Any]:
         """The fields of the same operation with derivatives."""
@@ -142,6 +148,21 @@ class RunStates(Operation):
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
         n = self.coordinates
         return [(members, times, n), (members, times, n), (members, times), (members, len(INFO) + 2 * n)]
+
+
+@dataclass(frozen=True)
+class RunWatched(RunStates):
+    """Integrate up to the first crossing of conditions, or to where one cannot be ruled out."""
+
+    conditions: Conditions | None = None
+
+    def module(self, width: int, several: bool, vector: int) -> Module:
+        assert self.conditions is not None
+        return Watching(self.plan(width, vector), self.conditions)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        assert self.conditions is not None
+        return [*super().outputs(inputs, members, times), (members, self.conditions.output_count(self.coordinates))]
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,8 @@ SHORTEST_LAST = 0.25
 STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
 
 # The states of a run. `NOT_FINITE`: its step became too small because of a number that is not finite. `LOST`: it left the
-# constraint manifold.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST = range(6)
+# constraint manifold. Of runs that watch conditions: `CROSSED`: at the time at which one crosses zero. `UNSURE`: one may.
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, CROSSED, UNSURE = range(8)
 # Each row of Psi over its scale, after a step whose end was projected, which leaves some 1e-12: a row so far open is one that no
 # position near it closes, as where a driver asks for more than a linkage reaches. Behind that there is no motion to follow.
 LOST_TOL = 1e-2

@@ -59,6 +59,12 @@ class Trajectory(Module):
             self.invoke(f, FORMULATE, "result a")
             self.copy(f, "saved v", "state v")
 
+    def before_step(self, f: Function, s: Lane):
+        """Hook: called before each attempt at a step, once it is planned."""
+
+    def after_step(self, f: Function, s: Lane):
+        """Hook: called behind each attempt at a step, once it is known up to when outputs are due."""
+
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_programs()
@@ -91,8 +97,10 @@ class Trajectory(Module):
         else:
             s.stepping = s.active
         aim(self, f, s)
+        self.before_step(f, s)
         f.call("attempt", work)
         f.call("decide", work)
+        self.after_step(f, s)
         f.call("outputs", work, call)
         ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
         with f.if_(f.any_of(ended)):

@@ -1,7 +1,5 @@
 """Crossings of zero: the side of zero of each condition, the events that happen, and the roots of Hermite's cubics."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,7 @@ from udkjax.integrate.events.hybrid import ConditionValues, Hybrid
 # Of a condition's scale, that is what a displacement of L or a turn of one radian changes in it: below it the condition is zero,
 # and so are its first and second rate, per T and T^2. Rounding errors of a state are some 1e-15 of it.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
-BISECTIONS = 40  # to a root of a cubic, which Newton's method on the event time then improves
+PARTS, DIVISIONS = 32, 6  # that a bracket of a root of a cubic is divided into, and how often: to 1e-9 of it
 NO_EVENT = -1  # no index of an event
 
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1
@@ -55,12 +53,8 @@ def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: 
 
 def carry_signs(first: Int[Array, "E"], signs: Int[Array, "G E"]) -> Int[Array, "G E"]:
     """Replace each zero of signs along a grid by the sign before it."""
-
-    def step(side: Array, sign: Array) -> tuple[Array, Array]:
-        side = jnp.where(sign != 0, sign, side)
-        return side, side
-
-    return jax.lax.scan(step, first, signs)[1]
+    known = jnp.where(signs != 0, np.arange(1, len(signs) + 1)[:, None], 0)
+    return jnp.take_along_axis(jnp.concatenate([first[None], signs]), jax.lax.cummax(known, axis=0), axis=0)
 
 
 def cubic_value(cubic: Cubic, x: Array) -> Array:
@@ -77,18 +71,19 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 def cubic_extremum(cubic: Cubic, side: Array) -> Array:
     """Return where a cubic on `side` of zero is nearest to it, or farthest beyond, if it approaches at 0 and leaves at 1."""
-    zero = jnp.zeros_like(cubic[0])
-    return bisect(lambda x: cubic_slope(cubic, x) * side < 0, zero, zero + 1)
+    a, da, b, db = cubic
+    # The slope c + 2 h x + k x^2 is below zero at 0 and above it at 1: so the root is real, and the larger one.
+    c, h, k = side * da, side * (3 * (b - a) - 2 * da - db), side * 3 * (2 * (a - b) + da + db)
+    root = jnp.sqrt(jnp.maximum(h**2 - k * c, 0.0))
+    above, below = jnp.where(h > 0, -c, root - h), jnp.where(h > 0, root + h, k)
+    return jnp.clip(above / jnp.where(below != 0, below, 1.0), 0.0, 1.0)
 
 
-def bisect(is_before: Callable[[Array], Array], low: Array, high: Array) -> Array:
-    """Return where `is_before` changes from true to false between `low` and `high`."""
-
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        middle = (low + high) / 2
-        before = is_before(middle)
-        return jnp.where(before, middle, low), jnp.where(before, high, middle)
-
-    low, high = jax.lax.fori_loop(0, BISECTIONS, halve, (low, high))
-    return (low + high) / 2
+def cubic_root(cubic: Cubic, side: Array) -> Array:
+    """Return where a cubic that is on `side` of zero at 0, and beyond it at 1, crosses zero."""
+    low, width, places = jnp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
+    for _ in range(DIVISIONS):
+        width /= PARTS
+        x = low + width * places.reshape(-1, *[1] * low.ndim)
+        low = low + width * jnp.sum(cubic_value(cubic, x) * side > 0, axis=0)
+    return low + width / 2

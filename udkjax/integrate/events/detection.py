@@ -14,23 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.integrate.events.crossings import ZERO, Cubic, bisect, carry_signs, crosses, cubic_extremum, cubic_slope, cubic_value
+from udkjax.integrate.events.crossings import (
+    ZERO,
+    Cubic,
+    carry_signs,
+    crosses,
+    cubic_extremum,
+    cubic_root,
+    cubic_slope,
+    cubic_value,
+)
+from udkjax.native.conditions import FAR, MISS, RESOLVED
 
 INTERVALS = 32  # of a window
 # The nodes, of a window's length: not quite uniform, so that no oscillation is zero at all of them.
 _shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
 NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
-# Of what a condition changes in an interval: if the cubic's error may be more, the interval is too coarse. So an oscillation has
-# 7 intervals in a period at least, and no two of its zeros lie in one; smaller numbers take more windows for the same events.
-RESOLVED = 0.05
-# Of the error over two intervals: the error that counts for one. Of a cubic it is 1/16, by the fourth power of the length, where
-# the interval is fine; four times that is on the safe side where it is not yet. Where rates are differences, it counts whole.
-MISS = 1 / 4
 BENDS = 3.0  # times as much as beside it a smooth condition bends in an interval that is fine enough, at most
-# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same: what it would have
-# to change to get there would be resolved.
-FAR = 1 / RESOLVED
 INTERVALS_OF_JUMP = 6  # that are too coarse for a jump or a kink, at every scale
 
 BESIDE = 4  # intervals before one that is too coarse that are done again
@@ -122,8 +123,7 @@ def detect(
     coarse_place = jnp.argmax(jnp.any(coarse, axis=1))
     last_sure = jnp.maximum(coarse_place - BESIDE, 0)  # those before may only look as if they were fine enough
     cubic, side, here, enters, leaves, lowest = jax.tree.map(lambda x: x[place], (cubic, before, found, enters, leaves, lowest))
-    root = bisect(lambda x: cubic_value(cubic, x) * side > 0, jnp.zeros_like(lowest), jnp.ones_like(lowest))
-    root = jnp.where(enters | leaves, lowest, root)
+    root = jnp.where(enters | leaves, lowest, cubic_root(cubic, side))
     event = jnp.argmin(jnp.where(here, root, jnp.inf))
     seeks = jnp.where(enters, FIRST_OF_TWO, jnp.where(leaves, SECOND_OF_TWO, ROOT))
     is_found = jnp.any(found)

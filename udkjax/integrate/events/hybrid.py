@@ -19,11 +19,13 @@ from udkjax.integrate import native_engine
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, RunPlan
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.events.actions import Action, Impact, Log, Stop
-from udkjax.integrate.events.conditions import Gap, WithinLimit, frames_of
+from udkjax.integrate.events.condition_program import conditions_of
+from udkjax.integrate.events.conditions import Gap, WithinLimit
 from udkjax.integrate.events.event import Event, sees_velocity
 from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.native.conditions import Conditions
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.joints import Joint
 
@@ -68,6 +70,7 @@ class Hybrid(eqx.Module):
     formulation: Formulation | None
     max_steps: int = eqx.field(static=True)
     plans: tuple[RunPlan, ...] = eqx.field(static=True)  # of each phase
+    watched: Conditions | None = eqx.field(static=True)  # by machine code; None: it cannot
 
     # --- what is known of the events
 
@@ -228,8 +231,7 @@ class Hybrid(eqx.Module):
 
     def conditions(self, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "E"]:
         """Return the conditions of all events."""
-        frames = frames_of(self.names, q, v)
-        return jnp.stack([jnp.asarray(e.condition(t, frames), float) for e in self.events])
+        return conditions_of(self.events, self.names, t, q, v)
 
     def conditions_and_rates(self, t: Array, q: Array, v: Array) -> tuple[Float[Array, "E"], Float[Array, "E"]]:
         """Return the conditions, and the rates of those that depend on positions alone."""

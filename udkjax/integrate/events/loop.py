@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.integrate.events.actions import Stop
+from udkjax.integrate.events.branches import branch
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO, first_crossing, side_of_zero
 from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
+from udkjax.integrate.events.sweep import SweepResult, can_sweep, sweep
 from udkjax.integrate.events.window import (
-    FINER,
     Search,
     WindowResult,
     choose,
@@ -27,6 +28,7 @@ from udkjax.integrate.events.window import (
     step_search,
 )
 from udkjax.integrate.solution import Result
+from udkjax.native.conditions import FINER
 
 BEGIN = -2  # instead of an event: the conditions at the start are not known yet
 
@@ -55,6 +57,7 @@ class LoopState(NamedTuple):
     pending: Int[Array, ""]  # the event that happens now; or NO_EVENT, or BEGIN
     search: Search
     reach: Float[Array, ""]  # how far the next window goes (s)
+    sweeps: Bool[Array, ""]  # whether machine code is to run as far as it can first
     quiet: Float[Array, "2E"]  # the time up to which each condition has no crossings in pairs
     unresolved: Float[Array, "2E"]  # the time from which on a condition varies too quickly to be sure of its crossings, or inf
     undefined: Bool[Array, "E"]  # the conditions that are not a number where the run ends by that
@@ -87,31 +90,57 @@ def run_loop(
     """
     first = _first_loop_state(hybrid, ts, state, code, max_events)
 
-    @jax.jit  # traced once, for its shapes and for its results
-    def integrate(loop: LoopState) -> WindowResult:
-        window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
-        held, known = hybrid.is_held(loop.state.phase), jnp.isfinite(loop.unresolved)
-        watched = jnp.append(~held & ~loop.carried, held)
-        looked_at = loop.sides, loop.values.scale, watched, loop.search, loop.quiet, known
-        return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol)
+    sweepable, fixed = can_sweep(hybrid), (hybrid, ts, drift_tol)
 
     def body(loop: LoopState) -> LoopState:
         happens = loop.pending != NO_EVENT
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(integrate, loop))
-        jumped = jax.lax.cond(loop.pending >= 0, lambda: _apply_pending(hybrid, loop, max_events), lambda: loop)
-        result = jax.lax.cond(happens, lambda: nothing, lambda: integrate(loop))
-        values = hybrid.values(choose(happens, jumped.state, result.end))
+        sweeps = loop.sweeps & ~happens & (loop.search.event < 0) & (ts[-1] - loop.state.t > 2 * hybrid.smallest)
+        sweeps = sweeps & jnp.array(sweepable)[loop.state.phase]
+        apply = lambda hybrid, loop: _apply_pending(hybrid, loop, max_events)  # noqa: E731
+        jumped = branch((loop.pending >= 0).astype(int), [lambda _, loop: loop, apply], hybrid, loop)
+        result = branch((happens | sweeps).astype(int), [_integrate, None], fixed, loop)
+        at, swept = choose(happens, jumped.state, result.end), None
+        if sweepable.any():
+            swept = branch(sweeps.astype(int), [None, _sweep], fixed, loop, sweeps)
+            at = choose(sweeps, swept.state, at)
+        values = hybrid.values(at)
         scale = jnp.where(jnp.isfinite(values.scale), values.scale, 0.0)  # beyond where a condition is a number it has no scale
         values = values._replace(scale=jnp.maximum(scale, loop.values.scale))
-        loop = jax.lax.cond(
-            happens, lambda: _after_event(hybrid, loop, jumped, values), lambda: _after_window(hybrid, loop, result, values)
-        )
+        after = [
+            lambda hybrid, loop, result, jumped, swept, values: _after_window(hybrid, loop, result, values),
+            lambda hybrid, loop, result, jumped, swept, values: _after_event(hybrid, loop, jumped, values),
+            lambda hybrid, loop, result, jumped, swept, values: _after_sweep(hybrid, loop, swept, values),
+        ]
+        which = jnp.where(happens, 1, jnp.where(sweeps, 2, 0))
+        loop = branch(which, after if swept is not None else after[:2], hybrid, loop, result, jumped, swept, values)
         more = (loop.state.t < ts[-1]) | (loop.pending >= 0)
         too_long = (loop.totals[0] >= hybrid.max_steps) & loop.running & more
         code = jnp.where(too_long, Result.step_limit, loop.code)
         return loop._replace(code=code, running=loop.running & more & ~too_long)
 
     return _fill_end(jax.lax.while_loop(lambda loop: loop.running, body, first), ts)
+
+
+Fixed = tuple[Hybrid, Float[Array, "T"], Float[Array, ""]]  # the system, the output times, the violation that ends a run
+
+
+def _watched(hybrid: Hybrid, loop: LoopState) -> Bool[Array, "2E"]:
+    """Tell which conditions and contact forces count."""
+    held = hybrid.is_held(loop.state.phase)
+    return jnp.append(~held & ~loop.carried, held)
+
+
+def _integrate(fixed: Fixed, loop: LoopState) -> WindowResult:
+    hybrid, ts, drift_tol = fixed
+    window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
+    looked_at = loop.sides, loop.values.scale, _watched(hybrid, loop), loop.search, loop.quiet, jnp.isfinite(loop.unresolved)
+    return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol)
+
+
+def _sweep(fixed: Fixed, loop: LoopState, runs: Bool[Array, ""]) -> SweepResult:
+    hybrid, ts, drift_tol = fixed
+    looked_at = loop.sides, loop.values.scale, _watched(hybrid, loop)
+    return sweep(hybrid, ts, loop.state, *looked_at, loop.written, drift_tol, runs)
 
 
 def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, code: Int[Array, ""], max_events: int) -> LoopState:
@@ -128,6 +157,7 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
         pending=jnp.array(BEGIN),
         search=no_search(ts[0]),
         reach=ts[-1] - ts[0],
+        sweeps=jnp.array(True),
         quiet=jnp.full(2 * E, ts[0]),
         unresolved=jnp.full(2 * E, jnp.inf),
         undefined=jnp.zeros(E, bool),
@@ -143,7 +173,7 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
 
 def _after_event(hybrid: Hybrid, loop: LoopState, jumped: LoopState, values: ConditionValues) -> LoopState:
     """Return the loop after an event, or at the start, with the event that happens at once."""
-    new = jax.lax.cond(loop.pending == BEGIN, lambda: _begin(hybrid, jumped, values), lambda: jumped)
+    new = choose(loop.pending == BEGIN, _begin(hybrid, jumped, values), jumped)
     # The contacts that were closed are settled: what they do next takes time.
     settled = (loop.pending >= 0) & (new.record.closed[jnp.maximum(new.record.count - 1, 0)] > OPEN)
     now = jnp.where(jnp.append(settled, jnp.zeros_like(settled)), new.sides, side_of_zero(values, hybrid.rate))
@@ -162,6 +192,24 @@ def _begin(hybrid: Hybrid, loop: LoopState, values: ConditionValues) -> LoopStat
     code = jnp.where(beyond, Result.beyond_contact, loop.code)
     code = jnp.where(jnp.any(undefined), Result.undefined_condition, code)
     return loop._replace(sides=sides, undefined=undefined, code=code, running=loop.running & (code == Result.successful))
+
+
+def _after_sweep(hybrid: Hybrid, loop: LoopState, swept: SweepResult, values: ConditionValues) -> LoopState:
+    """Return the loop after a sweep: an event is pending, the run is over, or windows go on."""
+    now, k = side_of_zero(values, hybrid.rate), swept.event
+    others = (np.arange(2 * hybrid.count) != k) & (jnp.abs(values.h) > ZERO * values.scale)
+    at_end = first_crossing(hybrid, swept.state.phase, loop.carried, swept.sides, now)
+    return loop._replace(
+        state=swept.state,
+        values=values,
+        sides=jnp.where((k >= 0) & others, now, swept.sides),
+        pending=jnp.where(swept.ends, at_end, k),
+        sweeps=k >= 0,
+        q=loop.q.at[swept.rows].set(swept.q, mode="drop"),
+        v=loop.v.at[swept.rows].set(swept.v, mode="drop"),
+        written=loop.written + jnp.sum(swept.rows < len(loop.q)),
+        totals=loop.totals + swept.totals,
+    )
 
 
 def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values: ConditionValues) -> LoopState:
@@ -193,6 +241,7 @@ def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values:
         pending=jnp.where(result.fails, NO_EVENT, pending),
         search=search,
         reach=reach,
+        sweeps=is_over & (length >= result.window.full / 2),
         quiet=loop.quiet.at[k].set(jnp.where(step.is_lost, result.search.until, loop.quiet[k])),
         unresolved=jnp.where(result.unresolved & jnp.isinf(loop.unresolved), state.t, loop.unresolved),
         undefined=result.undefined,

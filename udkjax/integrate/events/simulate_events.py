@@ -15,7 +15,9 @@ from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import Closure, State
-from udkjax.integrate.compiled_mechanism import compile_mechanism
+from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
+from udkjax.integrate.events.at_once import run_at_once
+from udkjax.integrate.events.condition_program import condition_programs
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events
 from udkjax.integrate.events.hybrid import Hybrid
 from udkjax.integrate.events.phases import Phases, phases_of
@@ -72,7 +74,7 @@ def simulate_events(
     listed, phases = _prepare(mechanism, events, analysis)
     given = Given(phases, listed, ts, state, closure, choices, max_events)
     run = _run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run
-    found, reasons = run(given)
+    found, reasons = _run_at_once(mechanism, analysis, given) or run(given)
     names = tuple(e.name for e in listed)
     if is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
@@ -82,6 +84,18 @@ def simulate_events(
         fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
     return jax.device_put(_solution(mechanism, names, given, found, reasons, int(found.count)))
+
+
+def _run_at_once(mechanism: Mechanism, analysis: Analysis, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
+    """Return what `_run` does, where machine code alone finds it: of known numbers, and of events that change nothing."""
+    if not mechanism.is_concrete or is_traced(given) or is_within_jit() or jax.config.jax_disable_jit:
+        return None
+    compiled = compile_known(mechanism, analysis, *given.choices.of_mechanism)
+    if not compiled.plan.is_native:
+        return None
+    run = prepare_run(compiled, analysis, np.asarray(given.ts), given.state, given.closure, given.choices, np)
+    found = run_at_once(run, given.events, mechanism.body_names, float(given.choices.drift_tol), given.max_events)
+    return None if found is None else (found, (compiled.plan.why_not_native,))
 
 
 Prepared = tuple[tuple[Event, ...], Phases]
@@ -111,7 +125,9 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     phases, events, ts, state, closure, choices, max_events = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)
-    problem, stabilization = run.problem, choices.stabilization
+    problem, stabilization, programs = run.problem, choices.stabilization, None
+    if any(x.plan.is_native for x in compiled):
+        programs = condition_programs(events, phases.mechanisms[0].body_names)
     hybrid = Hybrid(
         phases=phases,
         events=events,
@@ -126,6 +142,7 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
         formulation=choices.formulation,
         max_steps=choices.max_steps,
         plans=tuple(x.plan for x in compiled),
+        watched=None if programs is None else programs.watched,
     )
     code = jnp.where(run.is_closed, Result.successful, Result.could_not_assemble)
     if closure is None:

@@ -18,12 +18,9 @@ from udkjax.integrate.events.detection import INTERVALS, NODES, ROOT, SECOND_OF_
 from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
+from udkjax.native.conditions import FINEST, PER_TIME, SHORT
 from udkjax.native.steps import DONE, LOST, NOT_FINITE, STEP_LIMIT
 
-PER_TIME = 16  # intervals in the shortest time in which anything changes
-FINER = 8  # times as fine as a window that is too coarse is the next one
-SHORT = 1e-6  # T: within a window of that length a condition has a jump or a kink, or varies all along
-FINEST = 1e-9  # T: what varies within a window of that length is not resolved any more
 MOST_OUTPUTS = 32  # output times of a window
 MOST_TRIES = 60  # of Newton's method, safeguarded by bisection
 LAST_CHANGE = 1e-7  # of the event time, in T: Taylor's step makes an error of its square
@@ -51,6 +48,7 @@ class Window(NamedTuple):
     nodes: Float[Array, "G"]
     output: Int[Array, "N"]  # their numbers; of any value beyond the last
     due: Float[Array, "N"]
+    full: Float[Array, ""]  # the length that it would have if nothing ended it before (s)
 
 
 class WindowResult(NamedTuple):
@@ -110,7 +108,7 @@ def plan_window(
     end = jnp.minimum(end, jnp.min(jnp.where(quiet > t, quiet, jnp.inf)))
     end = jnp.where(search.event >= 0, search.time, end)
     nodes = (t + (end - t) * NODES).at[-1].set(end)
-    return Window(jnp.sort(jnp.concatenate([nodes, jnp.clip(due, t, end)])), nodes, output, due)
+    return Window(jnp.sort(jnp.concatenate([nodes, jnp.clip(due, t, end)])), nodes, output, due, full)
 
 
 def integrate_window(

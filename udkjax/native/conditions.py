@@ -1,0 +1,67 @@
+"""Conditions that a run watches (watching.py): their program, what a run is given besides, and how finely it looks at them."""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+from udkjax.expressions import ScalarProgram
+
+PER_TIME = 16  # intervals in the shortest time in which anything changes
+# Of what a condition changes in an interval: if the cubic's error may be more, the interval is too coarse. So an oscillation has
+# 7 intervals in a period at least, and no two of its zeros lie in one; smaller numbers take more windows for the same events.
+RESOLVED = 0.05
+# Of the error over two intervals: the error that counts for one. Of a cubic it is 1/16, by the fourth power of the length, where
+# the interval is fine; four times that is on the safe side where it is not yet. Where rates are differences, it counts whole.
+MISS = 1 / 4
+# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same: what it would have
+# to change to get there would be resolved.
+FAR = 1 / RESOLVED
+FINER = 8  # times as fine as an interval that is too coarse is the next one
+SHORT = 1e-6  # T: within intervals of that length a condition has a jump or a kink, or varies all along
+FINEST = 1e-9  # T: what varies within a window of that length is not resolved any more
+MOST_JUMPS = 3  # of conditions, before intervals are as long again as they were: of more, some are oscillations
+# Two intervals meet at this share of them, and are shorter than they may be by up to another, which turns by the golden ratio, so
+# that no oscillation is zero at all nodes.
+MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
+MOST_STUCK = 4  # times in a row that intervals become finer: before a jump, some of the finer ones are clear
+FIRST, SECOND, THIRD = range(3)  # which node of two intervals is next
+LAST_CHANGE = 1e-7  # of the event time, in T: Taylor's step makes an error of its square
+MOST_LANDINGS = 5  # steps that end at a crossing: one, as a rule
+LEAST_STEP = 10  # times the smallest, to a crossing: the next may be a fifth as long
+WANTED, UNDER_WAY = 1, 2  # the states of a landing: from the point before the crossing a step is to be taken, or is being taken
+SHORTEST_SPAN = 100  # times the smallest step: shorter ones are not told from one another
+VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is not resolved, or not a number
+HEAD = 3  # numbers of what is told of a run before its sides: the event, or -1; the time; the largest violation at a node
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The program of all conditions: g and their rates, of t, q, v, a and numbers of their own. Equal where `key` is."""
+
+    key: Hashable
+    program: ScalarProgram = field(compare=False)
+    count: int = field(compare=False)
+    number_count: int = field(compare=False)
+
+    def output_count(self, n: int) -> int:
+        """Return how many numbers a run of n coordinates tells of its end."""
+        return HEAD + self.count + 2 * n
+
+
+def watch_inputs(
+    xp: ModuleType, numbers: Sequence[Any], sides: Any, watched: Any, floors: Any, directions: Any, rate: Any
+) -> Any:
+    """Return what a run is given besides.
+
+    Args:
+        xp: jax.numpy or NumPy.
+        numbers: those of the conditions.
+        sides: of zero, 0 where it is not known.
+        watched: whether each condition counts.
+        floors: below which each is zero.
+        directions: in which zeros count, 0 for either.
+        rate: that of the scene (1/s).
+    """
+    parts = (*numbers, sides, watched, floors, directions, xp.reshape(rate, (1,)))
+    return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])
