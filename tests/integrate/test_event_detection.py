@@ -13,6 +13,8 @@ import pytest
 from scipy.optimize import brentq
 
 import udkjax as udk
+from udkjax.integrate import native_engine
+from udkjax.integrate.events import simulate_events
 
 POINT = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 0])}, gravity=[0, 0])  # x = t
 
@@ -63,6 +65,7 @@ def test_no_crossing_is_lost_at_any_frequency():
         assert sol.code == udk.Result.successful and count == len(expected), numbers
         assert np.abs(positions(sol)[:count] - expected).max(initial=0) < 1e-9
         assert np.isinf(sol.events.unresolved).all()
+    assert int(sol.stats["steps"]) < 10  # where nothing happens it is one run of the integrator, whatever the condition
 
 
 @pytest.mark.slow
@@ -99,14 +102,22 @@ def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
     assert len(sol.events.of("kink")) == len(expected) and np.abs(sol.events.of("kink") - expected).max() < 1e-12
 
 
-def test_smooth_conditions_cost_what_they_did():
-    """Right-hand sides of a pendulum that logs where it passes and where it turns: 5,021 before windows were refined."""
+def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
+    """A pendulum that logs where it passes and where it turns: machine code runs once for each event, and nothing else."""
+    runs, watch = [], native_engine.watch_known
+    monkeypatch.setattr(native_engine, "watch_known", lambda *given: runs.append(0) or watch(*given))
+    monkeypatch.setattr(simulate_events, "_deferred_run", None)
     pendulum = udk.Mechanism(
         {"link": udk.Body(1.0, 0.1, position=(0.5, 0.0))}, {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])}
     )
-    events = [udk.Event(lambda t, at: at["link"].x, udk.Log()), udk.Event(lambda t, at: at["link"].omega, udk.Log())]
-    sol = udk.simulate(pendulum, np.linspace(0, 8, 40), events=events, max_events=60)
-    assert sol.events.count == 16 and int(sol.stats["right_hand_sides"]) < 1.05 * 5021
+    events, ts = (lambda t, at: at["link"].x, lambda t, at: at["link"].omega), np.linspace(0, 8, 40)
+    found = udk.simulate(pendulum, ts, events=[udk.Event(condition, udk.Log()) for condition in events], max_events=60)
+    assert found.events.count == 16 and len(runs) == 17
+    never = udk.simulate(pendulum, ts, events=udk.Event(lambda t, at: at["link"].y - 3.0))
+    plain = udk.simulate(pendulum, ts)
+    assert len(runs) == 18 and np.array_equal(never.q, plain.q) and never.stats["steps"] == plain.stats["steps"]
+    work = [int(sol.stats["right_hand_sides"]) for sol in (plain, never, found)]
+    assert work[1] == work[0] and work[2] < work[0] + 16 * 60  # a step to the event, and the first ones behind it
 
 
 def test_what_is_too_fast_is_said():

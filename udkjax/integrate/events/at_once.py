@@ -25,7 +25,7 @@ from udkjax.native.steps import CROSSED, DONE
 class Look(NamedTuple):
     """All conditions at one state."""
 
-    sides: np.ndarray  # of zero
+    sides: np.ndarray  # of zero, or 0 at zero
     floors: np.ndarray  # below which a condition is zero
     clear: np.ndarray  # whether each is a number, and not zero
 
@@ -54,9 +54,9 @@ class PlainRun:
 
     @property
     def may_begin(self) -> bool:
-        """True if no condition is zero where the run begins, and no contact beyond its line."""
+        """True if all conditions are numbers where the run begins, and all contacts open. Others that are zero leave it."""
         impacts = np.array([isinstance(e.action, Impact) for e in self._events])
-        return bool(self.look.clear.all()) and not np.any(impacts & (self.look.sides < 0))
+        return bool(np.all(np.isfinite(self.look.sides)) and np.all(self.look.sides[impacts] > 0))
 
     def advance(self) -> int | None:
         """Run to the next event, which is returned, or to the end, -1; return None where it is another than such a run has."""
@@ -101,7 +101,8 @@ class PlainRun:
         sizes = [by_t * max(1 / rate, abs(self.t)), by_q * np.maximum(unit, np.abs(q)), by_v * np.maximum(unit * rate, np.abs(v))]
         scales = np.maximum(scales, np.max(np.abs(np.concatenate(sizes, axis=1)), axis=1))
         g, floors = g[:, 0], ZERO * scales
-        return Look(np.sign(g), floors, np.isfinite(g) & (np.abs(g) > floors))
+        clear = np.isfinite(g) & (np.abs(g) > floors)
+        return Look(np.where(np.isfinite(g), np.sign(g) * clear, g), floors, clear)
 
 
 def run_at_once(
