@@ -49,8 +49,8 @@ def _programs(names: tuple[str, ...], *events: Event) -> ConditionPrograms | Non
         return jnp.stack(jax.jvp(of(numbers), (t, q, v), (jnp.ones(()), v, a)))
 
     def with_derivatives(t: Array, q: Array, v: Array, *numbers: Array) -> Array:
-        g, parts = of(numbers)(t, q, v), jax.jacfwd(of(numbers), (0, 1, 2))(t, q, v)
-        return jnp.concatenate([g[:, None], parts[0][:, None], *parts[1:]], axis=1)
+        along = lambda d: jax.jvp(of(numbers), (t, q, v), (d[0], d[1 : n + 1], d[n + 1 :]))[1]  # noqa: E731
+        return jnp.concatenate([of(numbers)(t, q, v)[:, None], jax.vmap(along)(np.eye(1 + 2 * n)).T], axis=1)
 
     state, shapes = [(), (n,), (n,)], [np.shape(x) for x in leaves]
     watched = _scalar_program(with_rates, [*state, (n,), *shapes])
