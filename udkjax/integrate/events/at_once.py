@@ -79,15 +79,18 @@ class PlainRun:
         projections = problem.compiled.plan.projected * (int(out.tried) + 2 * len(times) - 2)
         self.totals += [int(out.tried), int(out.accepted), int(out.evaluations), projections]
         self.t, self.state = float(found.t), (found.q, found.v)
-        return self._note(int(found.event))
+        return self._note(int(found.event), found.sides)
 
-    def _note(self, event: int) -> int | None:
-        """Note an event, or the end, at the present state; return None where another condition is zero there, too."""
+    def _note(self, event: int, sides: np.ndarray) -> int | None:
+        """Note an event, or the end, at the present state; return None where another condition is zero there, too.
+
+        `sides` are those before it.
+        """
         look = self._look(self.look.floors / ZERO)
         if event >= 0:
             if not isinstance(self._events[event].action, Log | Stop):
                 return None
-            look.sides[event] = -self.look.sides[event]
+            look.sides[event] = -sides[event]
             look.clear[event] = True
             self.noted.append((self.t, event, self.state[0], self.state[1]))
         self.look = look
