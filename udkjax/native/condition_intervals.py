@@ -12,7 +12,7 @@ from udkjax.native.conditions import (
     MOST_STUCK,
     RESOLVED,
     SECOND,
-    SHORT,
+    SHORT_PAIR,
     SHORTEST_SPAN,
     UNDEFINED,
     VARIES_FAST,
@@ -58,7 +58,7 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unsure: lis
     behind_break = s.fresh > s.first_t  # the polynomial is that of another piece of the motion
     span = s.look - s.first_t
     length, jumps = span * s.omega, f.variable(0.0)
-    may_jump = (length <= SHORT) & (s.jumps < float(MOST_JUMPS)) & (s.stuck < float(MOST_STUCK))
+    may_jump = (length <= SHORT_PAIR) & (s.jumps < float(MOST_JUMPS)) & (s.stuck < float(MOST_STUCK))
     is_finest = (length <= FINEST) | (span <= s.smallest * SHORTEST_SPAN)
     s.stops, s.seeks = zero, zero
     s.low, s.high = s.first_t, s.middle_t
@@ -67,7 +67,7 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unsure: lis
         is_jump = mask & fault.is_(VARIES_FAST) & may_jump
         jumps.value = f.select(is_jump, one, jumps.value)
         unclear = mask & (fault > 0.0) & ~is_jump
-        finer = unclear & ~(is_finest | (fault.is_(VARIES_FAST) & (length <= SHORT)))
+        finer = unclear & ~(is_finest | (fault.is_(VARIES_FAST) & (length <= SHORT_PAIR)))
         is_hit = mask & (hits[k].value > 0.5) & ~unclear
         stops = (unclear & ~finer) | (is_hit & behind_break)
         seeks = is_hit & ~stops

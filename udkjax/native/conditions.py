@@ -18,7 +18,8 @@ MISS = 1 / 4
 # to change to get there would be resolved.
 FAR = 1 / RESOLVED
 FINER = 8  # times as fine as an interval that is too coarse is the next one
-SHORT = 1e-6  # T: within intervals of that length a condition has a jump or a kink, or varies all along
+SHORT = 1e-6  # T: within a window of that length a condition has a jump or a kink, or varies all along
+SHORT_PAIR = SHORT / 16  # T: two of the 32 intervals of a window of that length
 FINEST = 1e-9  # T: what varies within a window of that length is not resolved any more
 MOST_JUMPS = 3  # of conditions, before intervals are as long again as they were: of more, some are oscillations
 # Two intervals meet at this share of them, and are shorter than they may be by up to another, which turns by the golden ratio, so
