@@ -24,7 +24,7 @@ def branch(index: Int[Array, ""], functions: Sequence[Callable[..., T] | None], 
     leaves, tree = jax.tree.flatten(dynamic)
 
     def as_flat(function: Callable[..., T]) -> Callable[..., T]:
-        return lambda *leaves: function(*eqx.combine(jax.tree.unflatten(tree, leaves), static))
+        return jax.jit(lambda *leaves: function(*eqx.combine(jax.tree.unflatten(tree, leaves), static)))  # traced once
 
     known = [None if function is None else as_flat(function) for function in functions]
     shapes = jax.eval_shape(next(filter(None, known)), *leaves)

@@ -89,7 +89,6 @@ def run_loop(
         max_events: how many events may happen.
     """
     first = _first_loop_state(hybrid, ts, state, code, max_events)
-
     sweepable, fixed = can_sweep(hybrid), (hybrid, ts, drift_tol)
 
     def body(loop: LoopState) -> LoopState:
