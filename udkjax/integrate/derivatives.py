@@ -91,7 +91,8 @@ class DifferentiableRun(DifferentiableFunction):
 
     @property
     def orders(self) -> int:
-        return 2 if self.native else 0
+        operation = self.problem.rest.compiled.plan.operation if self.native else None
+        return 0 if operation is None else 1 if operation.sampled else 2
 
     def fast(self, xs: list[Array]) -> IntegratorOutput:
         """Return the run by machine code, which has no derivatives, if that serves."""
@@ -123,10 +124,12 @@ class DifferentiableRun(DifferentiableFunction):
 
     def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
         either, problem = tuple(map(operator.or_, active, others)), self.problem(xs)
-        if not self._is_native(xs, either) or problem.compiled.plan.operation.sampled:
+        which = self.problem.marks(either)
+        moves_samples = any(x is True for x in jax.tree.leaves(which.textbook.mechanism.samples))
+        if moves_samples or not self._is_native(xs, either):  # splines are not linear in their knots
             return super().twice(xs, active, vs, others, us)
         changes = ((self.problem.marks(which), self.problem.changes(which, dxs)) for which, dxs in ((active, vs), (others, us)))
-        return list(native_engine.second_derivative(problem, self.problem.marks(either), *changes))
+        return list(native_engine.second_derivative(problem, which, *changes))
 
     def run_and_jvp(self, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """Return the run, and the change of its states along v of those of x that are active: by machine code, if that serves."""
