@@ -6,7 +6,7 @@ import {test} from "node:test";
 const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
-const {applyFix} = await page("fixes");
+const {applyFix} = await page("fixes"), {shapeProblem} = await page("checks");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("mover"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
@@ -255,4 +255,38 @@ test("texts can be read on all grounds", async () => {
     assert.ok(contrast(mix(accent, ink, 0.25), mix(panel, accent, 0.14)) >= 4.5);  // what is pressed
     assert.ok(contrast(onAccent, accent) >= 4.5);
   }
+});
+
+test("whatever stands in a file is drawn, or said not to be a drawing", () => {
+  const whole = {
+    format: 2, units: {length: "mm", angle: "deg"}, ground: ["A", "D"], pins: {A: [0, 0], B: [30, 40], C: [120, 90], D: [100, 0], E: [60, 60]},
+    link: [{name: "crank", pins: ["A", "B"], density: 7850, width: 15, thickness: 5}, {name: "plate", pins: ["B", "C", "E"], mass: "1 kg", centre: [70, 60], outline: [[0, 0], [1, 0], [0, 1]]},
+      {name: "rocker", pins: ["D", "C"], mass: 1, inertia: 1}, {name: "disc", pins: ["A"], density: 1, width: 4}, {name: "block", pins: ["E"], mass: 1}],
+    slide: [{link: "block", direction: [1, 0]}, {link: "block", along: ["A", "D"], on: "crank"}], slot: [{pin: "E", along: ["A", "B"], on: "crank"}, {pin: "E", direction: 30}],
+    gear: [{links: ["disc", "rocker"], teeth: [20, 30]}, {links: ["disc", "rocker"], radii: [20, 80]}],
+    cam: [{pins: ["A", "E"], links: ["disc", "plate"], profile: {angle: [0, 120, 240], radius: [10, 12, 11]}}],
+    motor: [{pin: "A", speed: "60 rpm", of: ["ground", "crank"]}, {slide: "slide1", speed: 1}], spring: [{between: ["A", "C"], stiffness: 1}, {pin: "A", stiffness: 1}],
+    damper: [{between: ["A", "C"], damping: 1}, {pin: "A", damping: 1}], load: [{pin: "C", force: ["1 N", "2 N"]}, {link: "plate", torque: 1}],
+  };
+  const look = document => {
+    symbolsOf(document, 1e-3);
+    shapes.extentPoints(document);
+    d.settle(document);
+    for (const kind of d.LISTS) d.list(document, kind).forEach((_, index) => d.removeElements(document, [{kind, index}]));
+    for (const pin of Object.keys(d.pinsOf(document))) d.removeElements(document, [{kind: "pin", name: pin}]);
+  };
+  let refused = 0, drawn = 0;
+  const attempt = document => {
+    if (shapeProblem(document)) refused++;
+    else { look(document); drawn++; }
+  };
+  const odd = ["x", "", 5, NaN, true, null, [], ["x"], [5], [[1, 2]], {}, {x: 1}];
+  const vary = (value, put) => {
+    for (const other of odd) attempt(put(other));
+    if (Array.isArray(value)) value.forEach((part, k) => vary(part, other => put(value.with(k, other))));
+    else if (value && typeof value === "object") for (const [key, part] of Object.entries(value)) vary(part, other => put({...value, [key]: other}));
+  };
+  assert.equal(shapeProblem(whole), "");
+  for (const [key, value] of Object.entries(whole)) vary(value, other => ({...whole, [key]: other}));
+  assert.ok(refused > 100 && drawn > 500, `${refused} ${drawn}`);
 });

@@ -1,6 +1,7 @@
 // Files: new, open, save, export. What changed on disk meanwhile is never overwritten unasked.
 
 import {ask} from "./api.js";
+import {shapeProblem} from "./checks.js";
 import {EMPTY} from "./document.js";
 import {make} from "./player/elements.js";
 
@@ -89,8 +90,9 @@ export class FileActions {
 
   async open(request, failed) {
     try {
-      const {text, document, path, revision, problems, drawn} = await ask("open", request);
-      if (!document) {
+      const {text, document, path, revision, problems: said, drawn} = await ask("open", request);
+      const problems = document ? [shapeProblem(document)].filter(Boolean) : said;
+      if (!document || problems.length) {
         this.studio.say(problems.join("; "), true);
         this.dialog(`${path} cannot be drawn`, make("ul", {class: "problems"}, ...problems.map(problem => make("li", {}, problem))), this.buttons(["Close"]));
         return;

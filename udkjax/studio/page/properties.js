@@ -2,6 +2,7 @@
 
 import {groundOf, list, nameOf, pinsOf, renameElement, renamePin, toggleGround, withKey} from "./document.js";
 import {readValue, valueText} from "./values.js";
+import {shapeProblem} from "./checks.js";
 import {copy, remove} from "./keys.js";
 import {swapPair} from "./actions.js";
 import {length} from "./units.js";
@@ -57,8 +58,11 @@ export class PropertiesPanel {
   }
 
   set(document, select = null) {
+    const problem = shapeProblem(document);
+    if (problem) return this.refuse(problem);
     this.studio.say("");
     if (!this.studio.commit(document, select)) this.again();
+    return undefined;
   }
 
   /** Show the fields as they were, and say why nothing changed. */
@@ -117,7 +121,7 @@ export class PropertiesPanel {
     const fields = (KEYS[kind] ?? []).map(([path, quantity]) => {
       const [key, sub] = path.split("."), value = sub ? entry[key]?.[sub] : entry[key], plain = value === undefined || typeof [value].flat(2)[0] === "number";
       const take = text => {
-        const next = readValue(text, ["name", "names"].includes(quantity));
+        const value = readValue(text, ["name", "names"].includes(quantity)), next = quantity === "names" && typeof value === "string" ? [value] : value;
         this.set(withKey(document, kind, index, key, sub ? {...entry[key], [sub]: next} : next));
       };
       const unit = plain ? unitOf(document, quantity) : "";

@@ -1,6 +1,7 @@
 // The text of the file beside the drawing, which may be edited as well: what is typed becomes a step of undo when it is TOML.
 
 import {ask} from "./api.js";
+import {shapeProblem} from "./checks.js";
 import {make} from "./player/elements.js";
 
 const PAUSE = 500;  // ms after the last key
@@ -56,9 +57,10 @@ export class SourcePanel {
       const found = text === state.text ? {document: state.document} : await ask("compile", {text});
       if (this.area.value !== text) return undefined;
       this.timer = null;
-      this.broken = found.document && this.studio.state === state ? null : state;
+      const problems = found.document ? [shapeProblem(found.document)].filter(Boolean) : found.problems;
+      this.broken = !problems.length && this.studio.state === state ? null : state;
       if (this.studio.state !== state) return void this.show();  // drawn meanwhile
-      if (this.broken) return void this.say(`${found.problems.join("\n")}\n`, ["Back to the text of the drawing", () => this.put(this.studio.state.text ?? "")]);
+      if (this.broken) return void this.say(`${problems.join("\n")}\n`, ["Back to the text of the drawing", () => this.put(this.studio.state.text ?? "")]);
       this.say("");
       if (text === state.text) return undefined;
       const isNew = this.studio.commit(found.document, null, text);

@@ -1,0 +1,35 @@
+// What a document must be before the page can draw it: its tables are tables, and its lists are lists. The server says all else.
+
+import {LISTS} from "./document.js";
+
+const TABLES = ["pins", "units", "velocities"], NAMES = ["pins", "along", "between", "links", "of"], NUMBERS = ["teeth", "radii", "force", "outline", "centre"];
+
+const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
+const isNames = value => Array.isArray(value) && value.every(name => typeof name === "string");
+
+/** Why the page cannot draw a document, in words; an empty text where it can. */
+export function shapeProblem(document) {
+  const table = TABLES.find(key => key in document && !isTable(document[key]));
+  if (table) return `${table}: must be a table`;
+  if ("ground" in document && !isNames(document.ground)) return "ground: must be a list of pins";
+  for (const section of LISTS.filter(key => key in document)) {
+    const entries = document[section];
+    if (!Array.isArray(entries) || !entries.every(isTable)) return `${section}: must be a list of tables`;
+    for (const [k, entry] of entries.entries()) {
+      const problem = entryProblem(section, entry);
+      if (problem) return `${section}[${k}].${problem}`;
+    }
+  }
+  return "";
+}
+
+function entryProblem(section, entry) {
+  if ("name" in entry && typeof entry.name !== "string") return "name: must be a text";
+  if (section === "link" && !("pins" in entry)) return "pins: missing: a link goes through pins";
+  const names = NAMES.find(key => key in entry && !isNames(entry[key])), numbers = NUMBERS.find(key => key in entry && !Array.isArray(entry[key]));
+  if (names) return `${names}: must be a list of names, such as A, B`;
+  if (numbers) return `${numbers}: must be a list, such as [1, 2]`;
+  if (!("profile" in entry)) return "";
+  const isProfile = isTable(entry.profile) && ["angle", "radius"].every(key => !(key in entry.profile) || Array.isArray(entry.profile[key]));
+  return isProfile ? "" : "profile: its angles and radii must be lists";
+}
