@@ -5,12 +5,12 @@ where W is one. Numbers meet wide values by being repeated. Of W lanes no branch
 is chosen (`select`), and a condition of all of them is `any_of`.
 """
 
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Union
+from typing import Any
 
-DOUBLE, INT, BOOL, POINTER = "double", "i64", "i1", "ptr"
+from udkjax.native.values import BOOL, DOUBLE, INT, POINTER, Operand, Value, literal, llvm_type
+
 _COMPARE = {
     "lt": ("olt", "slt"),
     "le": ("ole", "sle"),
@@ -19,87 +19,6 @@ _COMPARE = {
     "eq": ("oeq", "eq"),
     "ne": ("une", "ne"),
 }
-Operand = Union["Value", float, int, bool]
-
-
-def literal(number: Any, base: str) -> str:
-    """A number as LLVM writes it."""
-    if base == DOUBLE:
-        return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
-    return str(int(number)) if base != BOOL else str(bool(number)).lower()
-
-
-class Value:
-    """One value of a function: its name there, and what it is a vector of."""
-
-    __slots__ = ("base", "f", "name", "width")
-
-    def __init__(self, f: "Function", name: str, base: str, width: int = 1):
-        self.f, self.name, self.base, self.width = f, name, base, width
-
-    @property
-    def type(self) -> str:
-        return llvm_type(self.base, self.width)
-
-    def __add__(self, other):
-        return self.f.arithmetic("add", self, other)
-
-    def __radd__(self, other):
-        return self.f.arithmetic("add", other, self)
-
-    def __sub__(self, other):
-        return self.f.arithmetic("sub", self, other)
-
-    def __rsub__(self, other):
-        return self.f.arithmetic("sub", other, self)
-
-    def __mul__(self, other):
-        return self.f.arithmetic("mul", self, other)
-
-    def __rmul__(self, other):
-        return self.f.arithmetic("mul", other, self)
-
-    def __truediv__(self, other):
-        return self.f.arithmetic("div", self, other)
-
-    def __rtruediv__(self, other):
-        return self.f.arithmetic("div", other, self)
-
-    def __neg__(self):
-        return self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
-
-    def __lt__(self, other):
-        return self.f.compare("lt", self, other)
-
-    def __le__(self, other):
-        return self.f.compare("le", self, other)
-
-    def __gt__(self, other):
-        return self.f.compare("gt", self, other)
-
-    def __ge__(self, other):
-        return self.f.compare("ge", self, other)
-
-    def is_(self, other: Operand) -> "Value":
-        """Equality; `==` is Python's own."""
-        return self.f.compare("eq", self, other)
-
-    def is_not(self, other: Operand) -> "Value":
-        """Inequality; true of what is not a number."""
-        return self.f.compare("ne", self, other)
-
-    def __and__(self, other):
-        return self.f.logic("and", self, other)
-
-    __rand__ = __and__
-
-    def __or__(self, other):
-        return self.f.logic("or", self, other)
-
-    __ror__ = __or__
-
-    def __invert__(self):
-        return self.f.logic("xor", self, True)
 
 
 class Variable:
@@ -367,8 +286,3 @@ class Function:
         with self.while_(lambda: k.value < last):
             yield k.value
             k.value = k.value + 1
-
-
-def llvm_type(base: str, width: int) -> str:
-    """The type of so many lanes."""
-    return base if width == 1 else f"<{width} x {base}>"

@@ -1,0 +1,92 @@
+"""Values of functions in LLVM's text (ir.py): numbers and vectors of W lanes, with operators that write instructions."""
+
+import struct
+from typing import Any, Union
+
+DOUBLE, INT, BOOL, POINTER = "double", "i64", "i1", "ptr"
+Operand = Union["Value", float, int, bool]
+
+
+def literal(number: Any, base: str) -> str:
+    """A number as LLVM writes it."""
+    if base == DOUBLE:
+        return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
+    return str(int(number)) if base != BOOL else str(bool(number)).lower()
+
+
+class Value:
+    """One value of a function: its name there, and what it is a vector of."""
+
+    __slots__ = ("base", "f", "name", "width")
+
+    def __init__(self, f: Any, name: str, base: str, width: int = 1):
+        self.f, self.name, self.base, self.width = f, name, base, width
+
+    @property
+    def type(self) -> str:
+        return llvm_type(self.base, self.width)
+
+    def __add__(self, other):
+        return self.f.arithmetic("add", self, other)
+
+    def __radd__(self, other):
+        return self.f.arithmetic("add", other, self)
+
+    def __sub__(self, other):
+        return self.f.arithmetic("sub", self, other)
+
+    def __rsub__(self, other):
+        return self.f.arithmetic("sub", other, self)
+
+    def __mul__(self, other):
+        return self.f.arithmetic("mul", self, other)
+
+    def __rmul__(self, other):
+        return self.f.arithmetic("mul", other, self)
+
+    def __truediv__(self, other):
+        return self.f.arithmetic("div", self, other)
+
+    def __rtruediv__(self, other):
+        return self.f.arithmetic("div", other, self)
+
+    def __neg__(self):
+        return self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
+
+    def __lt__(self, other):
+        return self.f.compare("lt", self, other)
+
+    def __le__(self, other):
+        return self.f.compare("le", self, other)
+
+    def __gt__(self, other):
+        return self.f.compare("gt", self, other)
+
+    def __ge__(self, other):
+        return self.f.compare("ge", self, other)
+
+    def is_(self, other: Operand) -> "Value":
+        """Equality; `==` is Python's own."""
+        return self.f.compare("eq", self, other)
+
+    def is_not(self, other: Operand) -> "Value":
+        """Inequality; true of what is not a number."""
+        return self.f.compare("ne", self, other)
+
+    def __and__(self, other):
+        return self.f.logic("and", self, other)
+
+    __rand__ = __and__
+
+    def __or__(self, other):
+        return self.f.logic("or", self, other)
+
+    __ror__ = __or__
+
+    def __invert__(self):
+        return self.f.logic("xor", self, True)
+
+
+def llvm_type(base: str, width: int) -> str:
+    """The type of so many lanes."""
+    return base if width == 1 else f"<{width} x {base}>"
