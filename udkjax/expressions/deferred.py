@@ -50,7 +50,9 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
             program, out = _trace(function, tree, tuple(fixed), fixed_tree, types, jax.config.jax_enable_x64)
         except _ClosesOverError:
             return by_jit(*args, **kwargs)
-        found = deferred_p.bind(*leaves, call_jaxpr=program)
+        # Bound, JAX would trace a program with rules of derivatives again, to leave them out before it is evaluated.
+        is_known = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
+        found = (_evaluate if is_known else deferred_p.bind)(*leaves, call_jaxpr=program)
         return eqx.combine(jax.tree.unflatten(out.tree, found), out.static)
 
     return run
@@ -121,5 +123,3 @@ _make = getattr(jax.extend.core, "create_call_primitive", None)  # of JAX 0.12 o
 deferred_p: Any = None if _make is None else _make("deferred_program")
 if deferred_p is not None:
     deferred_p.def_impl(_evaluate)
-    # What takes rules of derivatives is high to JAX, which would trace it again to leave them out before it is evaluated.
-    deferred_p.is_high = lambda *_, call_jaxpr: call_jaxpr.is_high and isinstance(jax.device_put(0.0), Tracer)
