@@ -38,7 +38,7 @@ class Selection(NamedTuple):
 
 def select(problem: DesignProblem, state: SearchState, results: int, threads: int | None) -> Selection:
     """Return the best designs that differ, of a state in which a search ends."""
-    candidates = _within_limits(problem, state)
+    candidates = first = _within_limits(problem, state)
     losses = candidates.loss
     if not len(losses):
         return Selection([], losses, _what_is_exceeded(problem, state))
@@ -49,6 +49,9 @@ def select(problem: DesignProblem, state: SearchState, results: int, threads: in
             break
         state = begin(problem, candidates.trials.take(open_ones), threads, least)
         candidates = _within_limits(problem, polish(problem, improve(problem, state, RETREAT, threads), POLISHING, threads))
+    if found and len(found) < results:  # beside the best one
+        rest = np.flatnonzero(losses > found[0][0].loss)
+        _verify(problem, _Candidates(first.trials.take(rest), losses[rest]), results, found, REFUSALS)
     reason = "the motions of the trials within the limits, when followed again, leave their branches or come to dead points"
     return Selection([design for design, _ in found], losses, "" if found else f"{reason}: ask for more transmission")
 
