@@ -1,6 +1,7 @@
 """A mechanism with events as a hybrid system: a flow in each phase, and conditions along it. `jumps` leads between phases."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import reduce
 from typing import NamedTuple, TypeVar
 
@@ -184,14 +185,17 @@ class Hybrid(eqx.Module):
             marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate),
         )
 
-    def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
-        """Integrate from a state over the times `ts`, the first of which is its own; with `derivatives`, differentiably."""
+    def flow(
+        self, ts: Float[Array, "T"], state: RunState, derivatives: bool, runs: Bool[Array, ""] | None = None
+    ) -> IntegratorOutput:
+        """Integrate from a state over the times `ts`, from its own on; a member of a batch only where it `runs`."""
 
         def of_phase(phase: int, ts: Array, q: Array, v: Array, added: Added) -> IntegratorOutput:
             problem = self.problem(phase, ts, q, v, added)
             if derivatives or not self.plans[phase].is_native:
                 return differentiable(problem)
-            return native_engine.integrate(problem)
+            most = self.max_steps if runs is None else jnp.where(runs, self.max_steps, 0)
+            return native_engine.integrate(replace(problem, max_steps=most))
 
         return self.in_phase(state.phase, of_phase, ts, state.q, state.v, state.added)
 

@@ -97,7 +97,7 @@ def run_loop(
         sweeps = sweeps & jnp.array(sweepable)[loop.state.phase]
         apply = lambda hybrid, loop: _apply_pending(hybrid, loop, max_events)  # noqa: E731
         jumped = branch((loop.pending >= 0).astype(int), [lambda _, loop: loop, apply], hybrid, loop)
-        result = branch((happens | sweeps).astype(int), [_integrate, None], fixed, loop)
+        result = branch((happens | sweeps).astype(int), [_integrate, None], fixed, loop, ~happens & ~sweeps)
         at, swept = choose(happens, jumped.state, result.end), None
         if sweepable.any():
             swept = branch(sweeps.astype(int), [None, _sweep], fixed, loop, sweeps)
@@ -129,11 +129,11 @@ def _watched(hybrid: Hybrid, loop: LoopState) -> Bool[Array, "2E"]:
     return jnp.append(~held & ~loop.carried, held)
 
 
-def _integrate(fixed: Fixed, loop: LoopState) -> WindowResult:
+def _integrate(fixed: Fixed, loop: LoopState, runs: Bool[Array, ""]) -> WindowResult:
     hybrid, ts, drift_tol = fixed
     window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
     looked_at = loop.sides, loop.values.scale, _watched(hybrid, loop), loop.search, loop.quiet, jnp.isfinite(loop.unresolved)
-    return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol)
+    return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol, runs)
 
 
 def _sweep(fixed: Fixed, loop: LoopState, runs: Bool[Array, ""]) -> SweepResult:
