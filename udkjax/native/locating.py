@@ -7,7 +7,7 @@ from udkjax.native.watch_memory import WatchMemory
 
 
 def write_locate(module: WatchMemory):
-    """`locate(work)`: the crossing between `low` and `high` of lanes that are `seeking`, by bisection."""
+    """`locate(work)`: the crossing between `low` and `high` of lanes that seek one, by bisection."""
     f, s = module.function("locate")
     work, one, zero = f.given["work"], f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
 
