@@ -1,10 +1,7 @@
 const mount = (() => {
 "use strict";
-// Motions: packed tables, and where the bodies of a run are at any time.
-
 const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const floats = text => new Float32Array(bytesOf(text).buffer);
-
 /** A packed table (udkjax/show/player/packing.py), row by row. Sums stay below 2^53: no bit operations, which have 32 bits. */
 function unpack({rows, steps, bytes}) {
   const table = new Float64Array(rows * steps.length), source = bytesOf(bytes);
@@ -25,16 +22,13 @@ function unpack({rows, steps, bytes}) {
   }
   return table;
 }
-
 /** 1, 2 or 5 times a power of ten, at least x. */
 function nice(x) {
   const power = 10 ** Math.floor(Math.log10(x));
   return power * [1, 2, 5, 10].find(k => k * power >= x * (1 - 1e-9));
 }
-
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
-
 /** The interval of times that holds t: its ends, its length, and where in it t is, from 0 to 1. */
 function interval(ts, t, count = ts.length) {
   let low = 0, high = count - 1;
@@ -45,7 +39,6 @@ function interval(ts, t, count = ts.length) {
   const h = ts[high] - ts[low];
   return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
 }
-
 /** The state {t, q, v} of a run of n coordinates at a time: cubic between its instants, whose rates are known. */
 function stateAt({ts, q, v, count, frame = 1}, t, n) {
   const [i, j, h, s] = interval(ts, t, count), r = 1 - s, found = {t, q: new Float64Array(n), v: new Float64Array(n)};
@@ -56,7 +49,6 @@ function stateAt({ts, q, v, count, frame = 1}, t, n) {
   }
   return found;
 }
-
 /** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
 class Run {
   constructor(record) {
@@ -73,17 +65,13 @@ class Run {
     this.fine = 4;  // points of a path for each instant
     this.now = new Float64Array(this.size);
   }
-
   /** Another motion of the same bodies. */
   replace(ts, q, v, measures, frame) {
     Object.assign(this, {ts, q, v, measures, frame, paths: null, fine: 1});
   }
-
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
-
   find(t) { return interval(this.ts, t); }
-
   /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
   pose(t, amplitude = 1) {
     const out = this.now;
@@ -100,13 +88,11 @@ class Run {
     }
     return out;
   }
-
   /** Forces x, y of each anchor of reactions. */
   force(t) {
     const [i, j, , s] = this.find(t), n = 2 * this.reactions.anchors.length;
     return Array.from({length: n}, (_, k) => this.forces[i * n + k] * (1 - s) + this.forces[j * n + k] * s);
   }
-
   /** The paths of its traces: for each, its points at times that are evenly spaced. */
   trace() {
     if (!this.paths) {
@@ -121,18 +107,14 @@ class Run {
     return this.paths;
   }
 }
-
 /** Where the anchor [body, x, y] is; body -1 is the ground. */
 function place(pose, [body, x, y]) {
   if (body < 0) return [x, y];
   const cos = Math.cos(pose[3 * body + 2]), sin = Math.sin(pose[3 * body + 2]);
   return [pose[3 * body] + cos * x - sin * y, pose[3 * body + 1] + sin * x + cos * y];
 }
-
 const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
-
 const FITTED = 300;  // instants that bounds are of
-
 /** Left, bottom, right, top (m) of all that is drawn of a run, at least `least` to each side of its middle. */
 function boundsOf(run, least) {
   const anchors = run.marks.flatMap(m => {
@@ -149,11 +131,6 @@ function boundsOf(run, least) {
   const grow = low.map((x, k) => Math.max(0, least - (high[k] - x) / 2));
   return [...low.map((x, k) => x - grow[k]), ...high.map((x, k) => x + grow[k])];
 }
-
-// Painting on a canvas: themes, lines and circles, arrows, texts, the grid, traces and reactions.
-
-
-// Okabe and Ito's colours, which everyone tells apart, and one more; on dark grounds, lighter.
 const THEMES = {
   light: {
     back: "#ffffff", panel: "#f5f7f9", ink: "#1b2430", soft: "#5a6676", line: "#d5dbe3", grid: "#edf0f4", accent: "#0067b0",
@@ -166,13 +143,10 @@ const THEMES = {
     bodies: ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
   },
 };
-
 const FORCES = [[1e6, "MN"], [1e3, "kN"], [1, "N"], [1e-3, "mN"]];
 const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
-
 const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
 const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
-
 /** The contrast of two colours, 1 to 21, as WCAG 2 defines it. */
 function contrast(one, two) {
   const linear = x => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
@@ -180,19 +154,16 @@ function contrast(one, two) {
   const [a, b] = [light(one), light(two)];
   return Math.max(a, b) / Math.min(a, b);
 }
-
 /** A colour in which texts can be read on all grounds of a theme: nearer to that of its ink, where need be. */
 function readable(colour, {back, panel, ink}) {
   let found = colour;
   for (let t = 0; Math.min(contrast(found, back), contrast(found, panel)) < READABLE && t < 1; t += 0.05) found = mix(colour, ink, t);
   return found;
 }
-
 /** A colour on the way to another one: t from 0 to 1. */
 function mix(one, two, t) {
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
-
 /** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
 function contextOf(canvas) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
@@ -204,33 +175,26 @@ function contextOf(canvas) {
   context.lineCap = context.lineJoin = "round";
   return {context, width, height};
 }
-
 /** Draws at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
 class Painter {
   constructor(context, view, theme, pt, pose) {
     Object.assign(this, {context, view, theme, pt, pose});
   }
-
   /** Pixels of a place in metres. */
   px([x, y]) {
     return [this.view.x + this.view.scale * x, this.view.y - this.view.scale * y];
   }
-
   anchor(anchor) {
     return this.px(place(this.pose, anchor));
   }
-
   at(mark) {
     return this.anchor([mark.body, ...mark.at]);
   }
-
   colour(body) {
     return body < 0 ? this.theme.soft : this.theme.bodies[body % this.theme.bodies.length];
   }
-
   /** The colour of a body's name. */
   textColour(body) { return readable(this.colour(body), this.theme); }
-
   line(points, width, colour, {closed = false, fill = null, dash = []} = {}) {
     const c = this.context;
     c.beginPath();
@@ -245,7 +209,6 @@ class Painter {
       c.setLineDash([]);
     }
   }
-
   circle([x, y], radius, {fill = null, stroke = null, width = 1.5, from = 0, to = 2 * Math.PI} = {}) {
     const c = this.context;
     c.beginPath();
@@ -253,19 +216,16 @@ class Painter {
     if (fill) { c.fillStyle = fill; c.fill(); }
     if (stroke) { c.lineWidth = width * this.pt; c.strokeStyle = stroke; c.stroke(); }
   }
-
   head([x, y], angle, colour) {
     const size = 7.5 * this.pt, wide = 0.42;
     const corner = turn => [x - size * Math.cos(angle + turn), y - size * Math.sin(angle + turn)];
     this.line([[x, y], corner(wide), corner(-wide)], 0, colour, {closed: true, fill: colour});
   }
-
   arrow([x0, y0], [x1, y1], colour, dash = []) {
     const angle = Math.atan2(y1 - y0, x1 - x0), length = Math.hypot(x1 - x0, y1 - y0), back = Math.min(5 * this.pt, length);
     this.line([[x0, y0], [x1 - back * Math.cos(angle), y1 - back * Math.sin(angle)]], 2.2, colour, {dash});
     if (length > 2 * this.pt) this.head([x1, y1], angle, colour);
   }
-
   text(words, [x, y], colour, {align = "left", size = 12, weight = 400, halo = true, back = this.theme.back} = {}) {
     const c = this.context;
     c.font = `${weight} ${size * Math.max(1, this.pt)}px system-ui, -apple-system, "Segoe UI", Roboto, sans-serif`;
@@ -279,7 +239,6 @@ class Painter {
     c.fillStyle = colour;
     c.fillText(words, x, y);
   }
-
   grid(width, height) {
     const step = nice(80 / this.view.scale), c = this.context;
     c.beginPath();
@@ -298,7 +257,6 @@ class Painter {
     c.stroke();
     return step;
   }
-
   /** How long one step of the grid is. */
   bar(step, height) {
     const {soft} = this.theme, length = step * this.view.scale, x = 14, y = height - 14;
@@ -307,7 +265,6 @@ class Painter {
       : step >= 1e-3 ? [step * 1e3, "mm"] : [step * 1e6, "µm"];
     this.text(`${+value.toPrecision(3)} ${unit}`, [x + length + 7, y], soft, {size: 11 / Math.max(1, this.pt)});
   }
-
   traces(run, t) {
     const c = this.context, {first, last, count, lines} = run.trace();
     const now = clamp((t - first) / (last - first || 1) * (count - 1), 0, count - 1), tail = Math.max(2, 0.06 * count);
@@ -329,7 +286,6 @@ class Painter {
       stroke(Math.max(0, Math.ceil(now - tail)), Math.floor(now), 2.4, 0.8);
     });
   }
-
   /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
   reactions(run, t, width, height) {
     const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
@@ -344,7 +300,6 @@ class Painter {
     const end = width - 14 - this.context.measureText(words).width - 7;
     this.arrow([end - length * told / usual, y], [end, y], colour);
   }
-
   names(run) {
     run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.textColour(body), {align: "center", weight: 600}));
     for (const mark of run.marks) {
@@ -354,10 +309,6 @@ class Painter {
     }
   }
 }
-
-// Symbols (udkjax/show/player/symbols.py): lines and circles in frames that move with bodies.
-
-
 /** Tell whether a point is within a closed line, or nearer to a line than `reach`. */
 function isNear([x, y], corners, closed, reach) {
   const ends = closed ? [...corners, corners[0]] : corners;
@@ -370,7 +321,6 @@ function isNear([x, y], corners, closed, reach) {
   }
   return inside && Boolean(closed);
 }
-
 /** Draws symbols at a pose. */
 class SymbolPainter extends Painter {
   draw(symbols) {
@@ -380,7 +330,6 @@ class SymbolPainter extends Painter {
       else this.line(corners, symbol.width, stroke, {closed: symbol.closed, fill});
     }
   }
-
   /** Where a symbol is (px): the centre and the radius of a circle, or the corners of a line. */
   outline({frame, radius, points}) {
     const [[x0, y0], cos, sin, scale] = this.axes(frame), {pt} = this;
@@ -394,14 +343,12 @@ class SymbolPainter extends Painter {
     });
     return {corners};
   }
-
   /** Whether a symbol is at a place (px), or nearer than `reach`. */
   holds(symbol, x, y, reach) {
     const {centre, size, corners} = this.outline(symbol);
     if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
     return isNear([x, y], corners, symbol.closed, symbol.width * this.pt / 2 + reach);
   }
-
   /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */
   axes(frame) {
     if (frame.length === 2) {
@@ -411,7 +358,6 @@ class SymbolPainter extends Painter {
     const [body, x, y, angle, turns] = frame, turned = angle + (turns ? angleOf(this.pose, body) : 0);
     return [this.anchor([body, x, y]), Math.cos(turned), Math.sin(turned), this.view.scale];
   }
-
   /** A colour by its name. */
   tone(name) {
     const [kind, number] = name.split(":"), edge = number && this.colour(+number);
@@ -420,15 +366,9 @@ class SymbolPainter extends Painter {
     return {edge, tint, spoke: mix(edge, tint, 0.25)}[kind];
   }
 }
-
-// The strip below the scene: curves of a measure over time.
-
-
 const LEFT = 12, RIGHT = 68;  // px beside the curves; at the right stand the least and the largest value
-
 /** The part of the timeline at x (px) in a strip of some width, from 0 to 1. */
 const stripPart = (x, width) => clamp((x - LEFT) / (width - LEFT - RIGHT), 0, 1);
-
 /** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
 function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
   const left = LEFT, right = width - RIGHT, top = 40, bottom = height - 10;
@@ -464,7 +404,6 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
   const ends = {size: 11, halo: false}, back = value => (log ? 10 ** value : value);
   painter.text(short(back(high)), [right + 7, top], theme.soft, ends);
   painter.text(short(back(low)), [right + 7, bottom - 1], theme.soft, ends);
-  // Values at this time, from the right: one for each run, in its colour; without the runs' names where there is no room.
   const now = runs.map((run, k) => {
     const [i, j, , s] = run.find(t), value = found[k]?.values[s < 0.5 ? i : j];
     return {value, words: found[k] ? `${Number.isFinite(value) ? short(value) : "–"}${found[k].unit && " " + found[k].unit}` : ""};
@@ -481,9 +420,6 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
     edge -= context.measureText(words).width + 18;
   }
 }
-
-// The look of the player's elements.
-
 const STYLE = `
 :host { display: block; }
 .player { --radius: 8px; box-sizing: border-box; display: flex; flex-direction: column; font: 14px/1.4 system-ui, -apple-system, "Segoe UI",
@@ -535,9 +471,6 @@ input[type="range"] { accent-color: var(--accent); height: 32px; margin: 0; curs
 .help dd { margin: 0; color: var(--soft); }
 @media (pointer: coarse) { button, select { height: 38px; } button.icon { width: 40px; } button.primary { width: 44px; height: 44px; } }
 `;
-
-// Elements of a page: how they are made, and what is written on them.
-
 const SPEEDS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
 const ICONS = {
   play: "M7 4.5v15l13-7.5z",
@@ -550,9 +483,7 @@ const HELP = [
   ["+ −", "faster, slower"], ["T", "traces"], ["N", "names"], ["R", "reactions"], ["L", "repeat"], ["D", "dark or light"],
   ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
 ];
-
 const LIVE_HELP = [["Drag a body", "pull at it"], ["G", "first motion"], ["Backspace", "reset the numbers"]];
-
 /** An element with properties and children; texts are texts. */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -564,13 +495,10 @@ function make(tag, properties = {}, ...children) {
   element.append(...children);
   return element;
 }
-
 function button(content, title, action, kind = "") {
   return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
 }
-
 const icon = name => svgIcon(ICONS[name]);
-
 /** An icon of a path that is filled, or drawn as a line. */
 function svgIcon(shape, isLine = false) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(svg.namespaceURI, "path");
@@ -582,7 +510,6 @@ function svgIcon(shape, isLine = false) {
   svg.append(path);
   return svg;
 }
-
 /** Let a click on a button leave the keys to what is shown: else the space bar would press the button again. */
 function keepKeys(root, focused) {
   root.addEventListener("mousedown", event => {
@@ -591,9 +518,6 @@ function keepKeys(root, focused) {
     focused.focus({preventScroll: true, focusVisible: false});
   });
 }
-
-// Fingers, mouse and wheel on a canvas.
-
 /** Drag moves the view, or pulls at the body that is there, where the canvas shows the run of a live page;
  *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
 function followPointers(player, canvas, liveRun) {
@@ -645,33 +569,15 @@ function followPointers(player, canvas, liveRun) {
     player.draw();
   }, {passive: false});
 }
-
-// The engine of one mechanism in a page: the data of udkjax/integrate/portable, run by WebAssembly.
-//
-//   const engine = await loadEngine(data)      throws where there is no WebAssembly
-//   engine.parameters                          a list of {name, unit, value}
-//   engine.values                              their values as they are in the scene, in the same order
-//   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
-//   engine.mark(parameters, state)             -> a number for each row of Psi, one where it is independent near a state; or null
-//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
-//   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
-//
-// Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
-// of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
-
-
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
 const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed"};
 const EPS = 2 ** -52;
-
 const numbersOf = text => new Float64Array(bytesOf(text).buffer);
 const largest = (x, unit) => x.reduce((most, value, k) => Math.max(most, Math.abs(value) / unit(k)), 0);
-
 async function inflate(text) {
   const stream = new Blob([bytesOf(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Response(stream).arrayBuffer();
 }
-
 /** One module with a memory of its own: constants, stack, and behind them what a call takes, which the next call overwrites. */
 class Instance {
   static async load(module) {
@@ -685,9 +591,7 @@ class Instance {
     found.exports = instance.exports;
     return found;
   }
-
   begin() { this.end = this.start; }
-
   /** The address of so many bytes. */
   reserve(size) {
     const place = this.end;
@@ -696,15 +600,12 @@ class Instance {
     if (missing > 0) this.memory.grow(Math.ceil(missing / PAGE));
     return place;
   }
-
   put(numbers) {
     const place = this.reserve(8 * numbers.length);
     new Float64Array(this.memory.buffer, place, numbers.length).set(numbers);
     return place;
   }
-
   view(place, count) { return new Float64Array(this.memory.buffer, place, count); }
-
   /** Call `run` for one member: its inputs are arrays by name, and so are the results, by how many numbers they have. */
   run(inputs, results, counts) {
     this.begin();
@@ -718,10 +619,8 @@ class Instance {
     return Object.fromEntries(this.module.results.map(name => [name, this.view(given[name], results[name]).slice()]));
   }
 }
-
 const MATHS = {exp2: x => 2 ** x};
 for (const name of ["exp", "log", "pow", "tanh", "tan", "sinh", "cosh", "asin", "acos", "atan", "atan2"]) MATHS[name] = Math[name];
-
 class Engine {
   constructor(data, instances) {
     this.data = data;
@@ -733,7 +632,6 @@ class Engine {
     this.size = 3 * data.bodies.length;
     this.row = data.sampled.length;
   }
-
   /** All numbers of the scene; behind them the times where the motion is not smooth. */
   numbers(parameters) {
     if (!parameters || !this.parameters.length) return this.base.slice();
@@ -743,9 +641,7 @@ class Engine {
     module.exports.numbers(given, to);
     return module.view(to, this.base.length).slice();
   }
-
   breaks(numbers) { return numbers.slice(this.data.count).sort(); }
-
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
    *  that hold at a time. */
   dressed(numbers, thresholds, t, marks = null) {
@@ -757,14 +653,11 @@ class Engine {
     this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
     return found;
   }
-
   guess(numbers) {
     const {q, v} = this.data.guess;
     return {t: 0, q: Float64Array.from(q, k => numbers[k]), v: Float64Array.from(v, k => numbers[k])};
   }
-
   unit = k => (k % 3 === 2 ? 1 : this.data.scales.length);
-
   /** Close the loops from a guess {t, q, v}, which by default is the scene's: the nearest closed state.
    *
    *  Returns t, q and v; `violation` of Psi and `rate` of Psi_dot, the largest of their rows in units of the scene; the `rank` of
@@ -782,7 +675,6 @@ class Engine {
     const closed = violation <= tol && rate <= tol * Math.max(data.scales.rate, largest(v, this.unit));
     return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
   }
-
   /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
   mark(parameters, {t, q, v}) {
     const {data} = this;
@@ -792,7 +684,6 @@ class Engine {
     const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
   }
-
   /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
    *
    *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
@@ -821,7 +712,6 @@ class Engine {
     return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
       steps: ended.accepted, tried: ended.tried, limited, last, marks};
   }
-
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
    *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
    *  whose shares would be a choice. */
@@ -855,23 +745,18 @@ class Engine {
     }
     return found;
   }
-
   /** Forces x, y of each joint at the state that was evaluated last. */
   forces(work, {x0, psi_q}) {
     const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
     return this.data.forces.flatMap(({x, y}) => [sum(x), sum(y)]);
   }
 }
-
 /** The engine of a mechanism, from its data. */
 async function loadEngine(data) {
   if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
   const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
   return new Engine(data, Object.fromEntries(await Promise.all(loaded)));
 }
-
-// Symbols that follow the numbers of a scene (udkjax/show/player/followers.py).
-
 /** Moves the places of a run's symbols, marks and traces to where the numbers say. */
 class Follower {
   constructor(run, rows) {
@@ -883,7 +768,6 @@ class Follower {
     run.arrows = structuredClone(run.reactions);
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
-
   follow(numbers) {
     const {run, rows} = this, put = (anchor, start, x, y) => { anchor[start] = numbers[x]; anchor[start + 1] = numbers[y]; };
     for (const [k, which, x, y] of rows.frames) put(which < 0 ? run.symbols[k].frame : run.symbols[k].frame[which], 1, x, y);
@@ -900,13 +784,9 @@ class Follower {
     run.paths = null;
   }
 }
-
-// A hand that pulls at a body by a spring, through the mechanism's own dynamics and in time.
-
 const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second of the screen, with half of all masses on it
 const DAMPING = 0.7;  // of the critical one
 const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
-
 /** Pulls while it is held; `live` is the run, which has the engine and shows what comes of it. */
 class Hand {
   constructor(live, held, target) {
@@ -919,14 +799,12 @@ class Hand {
     live.record(this.state);
     this.request = requestAnimationFrame(now => this.frame(now));
   }
-
   frame(now) {
     this.request = requestAnimationFrame(later => this.frame(later));
     const seconds = this.before === null ? 0 : Math.min((now - this.before) / 1000, LONGEST_FRAME);
     this.before = now;
     if (seconds > 0) this.advance(seconds * this.live.player.speed);
   }
-
   advance(step) {
     const {live, state, held, spring, target} = this, t = state.t + step;
     const pull = {body: held.body, point: held.point, target, ...spring};
@@ -936,15 +814,12 @@ class Hand {
     live.append(this.state, run.violation[1]);
     return null;
   }
-
   move(target) { this.target = target; }
-
   release() {
     cancelAnimationFrame(this.request);
     this.live.letGo(this.state);
   }
 }
-
 /** The body that is drawn at a place of the screen, the uppermost first, and the point in its frame; null where there is none. */
 function bodyAt(painter, symbols, [x, y], reach) {
   for (const symbol of [...symbols].reverse()) {
@@ -956,13 +831,8 @@ function bodyAt(painter, symbols, [x, y], reach) {
   }
   return null;
 }
-
-// The panel of a live page: sliders in sections, what is said about the motion, and what one can do with it.
-
-
 const STEPS = 500;  // of a slider by keys
 const DIGITS = 5;  // of a number beside it
-
 /** Builds the panel of some sliders; `changed(k, value)` is called while one moves, and actions by their names. */
 class SliderPanel {
   constructor(sliders, changed, actions) {
@@ -980,7 +850,6 @@ class SliderPanel {
     this.element = make("aside", {class: "live", "aria-label": "numbers of the scene"},
       make("div", {class: "actions"}, ...Object.values(this.buttons)), this.note, make("div", {class: "rows"}, ...parts));
   }
-
   row(slider, changed) {
     const {label, unit, low, high} = slider, step = (high - low) / STEPS;
     const range = make("input", {type: "range", min: low, max: high, step, "aria-label": label, "aria-valuetext": `${slider.value} ${unit}`});
@@ -1012,27 +881,22 @@ class SliderPanel {
     set(slider.value);
     return {slider, element, set, range, number};
   }
-
   show(values) {
     values.forEach((value, k) => this.rows[k].set(value));
   }
-
   say(words, bad = false) {
     this.note.textContent = words;
     this.note.classList.toggle("bad", bad);
   }
-
   enable(on) {
     for (const input of this.element.querySelectorAll("input, button")) input.disabled = !on;
   }
 }
-
 function grouped(rows) {
   const found = new Map();
   for (const row of rows) found.set(row.slider.section, [...(found.get(row.slider.section) ?? []), row]);
   return found;
 }
-
 const LIVE_STYLE = `
 .middle { display: flex; min-height: 0; }
 .fill .middle { flex: 1; }
@@ -1057,25 +921,18 @@ const LIVE_STYLE = `
 .panel canvas.holds { cursor: pointer; }
 @media (pointer: coarse) { .live .slider input[type="range"] { height: 34px; } .live input[type="number"] { height: 34px; } }
 `;
-
-// The numbers of a live page in its address, so that whoever opens it sees the same motion.
-
 class Address {
   constructor(live) { this.live = live; }
-
   /** Whether the page has an address of its own: not within another page. */
   get exists() { return Boolean(this.live.player.options.fill) && location.protocol !== "about:"; }
-
   /** The numbers that are not those of the scene. */
   get words() {
     const {data: {sliders}, values} = this.live, changed = sliders.map((s, k) => [s, values[k]]).filter(([s, x]) => x !== s.value);
     return new URLSearchParams(changed.map(([s, x]) => [s.name, String(x)])).toString();
   }
-
   write() {
     if (this.exists) history.replaceState(null, "", `#${this.words}`);
   }
-
   read() {
     if (!this.exists) return;
     const given = new URLSearchParams(location.hash.slice(1)), numbers = {};
@@ -1085,7 +942,6 @@ class Address {
     }
     if (Object.keys(numbers).length) this.live.change(numbers);
   }
-
   async copy() {
     const {live, words} = this;
     this.write();
@@ -1097,18 +953,11 @@ class Address {
     }
   }
 }
-
-// One run of a live page: its first motion, and the motion of other numbers, which its engine solves a part at a time.
-
-
 const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
 const GHOST = 0.28;  // how much one sees of the first motion
 const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
-// Of code times steps that a processor of today runs in 5 ms, a third of the time of a picture: the same on each machine, so that the
-// same numbers give the same motion.
 const STEP_BYTES = 4e7;
 const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
-
 class LiveRun {
   /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
   constructor(live, run, record, data) {
@@ -1118,32 +967,25 @@ class LiveRun {
     this.follower = new Follower(run, data.follow);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
   }
-
   use(engine) {
     this.engine = engine;
     this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // of one picture
     this.usual = this.freedoms(this.close(null), null);
   }
-
   /** The numbers of this run's sliders; those that nobody has moved are its own. */
   get values() {
     const {values, data: {sliders}} = this.live;
     return Float64Array.from(this.data.sliders, ([k, own]) => (values[k] === sliders[k].value ? own : values[k]));
   }
-
   get end() { return this.run.ts[this.run.ts.length - 1]; }
-
   close(values) { return this.engine.close(values, {t: this.times[0], ...this.data.start}); }
-
   /** The degrees of freedom near a closed state, whose marks are found; null where branches of the motion meet. */
   freedoms(state, values) {
     this.marks = state.marks = this.engine.mark(values, state);
     const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
     return this.marks && state.rank < rank && rank === this.marks.length ? null : this.engine.size - rank;
   }
-
   lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
-
   reset() {
     const {ts, q, v, measures, frame, reactions, forces} = this.first;
     this.drop();
@@ -1152,9 +994,6 @@ class LiveRun {
     this.follower.follow(this.engine.numbers(null));
     this.changed = false;
   }
-
-  // Solving
-
   /** Begin to solve the motion of the numbers as they are; returns words where its loops do not close. */
   begin() {
     this.drop();
@@ -1165,7 +1004,6 @@ class LiveRun {
     this.follower.follow(engine.numbers(values));
     return "";
   }
-
   /** Solve on for as many steps as fit into one picture; returns what is said, and whether it ended too early. */
   goOn() {
     const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
@@ -1187,16 +1025,12 @@ class LiveRun {
     const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
     return {words, bad: !part.done};
   }
-
   drop() {
     this.job = null;
     const {hand} = this;
     this.hand = null;
     if (hand) cancelAnimationFrame(hand.request);
   }
-
-  // What is shown
-
   show(run) {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
@@ -1205,7 +1039,6 @@ class LiveRun {
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
-
   /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
   reactions(forces) {
     const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
@@ -1217,13 +1050,11 @@ class LiveRun {
     const usual = largest[Math.floor(USUAL * (largest.length - 1))] || largest[largest.length - 1];
     return usual > 0 ? {...this.run.arrows, usual} : null;
   }
-
   showReactions(reactions, forces) {
     Object.assign(this.run, {reactions, forces});
     const button = this.player.buttons.reactions;
     if (button) button.disabled = !this.player.runs.some(run => run.reactions);
   }
-
   /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
   measures(run, found) {
     const {length} = this.engine.data.scales;
@@ -1233,15 +1064,11 @@ class LiveRun {
       "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
     return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
   }
-
-  // The hand
-
   /** The state at the time that is shown. */
   stateNow() {
     const t = this.player.t, {q, v} = this.run.state(t);
     return {...this.engine.close(this.values, {t, q, v}), t};
   }
-
   /** What is on a panel's canvas at a place (px), if a hand can grasp it. */
   bodyAt(canvas, point, pointer = "mouse") {
     if (!this.engine) return null;
@@ -1249,7 +1076,6 @@ class LiveRun {
     painter.pose = this.run.pose(this.player.t);
     return bodyAt(painter, this.run.symbols, point, REACH[pointer] ?? REACH.touch);
   }
-
   grasp(canvas, point, pointer) {
     const held = this.bodyAt(canvas, point, pointer);
     if (!held) return false;
@@ -1258,20 +1084,16 @@ class LiveRun {
     this.hand = new Hand(this, held, this.metres(canvas, point));
     return true;
   }
-
   move(canvas, point) { this.hand?.move(this.metres(canvas, point)); }
-
   release() {
     const {hand} = this;
     this.hand = null;
     hand?.release();
   }
-
   metres(canvas, [x, y]) {
     const view = this.player.view(canvas.clientWidth, canvas.clientHeight);
     return [(x - view.x) / view.scale, (view.y - y) / view.scale];
   }
-
   /** Begin a record that a hand goes on with: of what was until now. */
   record(state) {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
@@ -1281,7 +1103,6 @@ class LiveRun {
     this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation);
   }
-
   /** Add one state to the record, and show it. */
   append({t, q, v}, violation) {
     const {past} = this;
@@ -1294,12 +1115,10 @@ class LiveRun {
     this.player.t = t;
     this.player.draw();
   }
-
   showPast() {
     const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
     this.show({...run, count: run.ts.length});
   }
-
   /** Solve on from where the hand lets go, for as long as the first motion is. */
   letGo(state) {
     const {engine, past} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
@@ -1315,9 +1134,6 @@ class LiveRun {
     this.live.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
     this.player.play();
   }
-
-  // Pictures
-
   paintGhost(painter, context, t) {
     if (!this.changed || !this.player.show.ghost) return;
     painter.pose = this.ghost.pose(Math.min(t, this.first.ts[this.first.ts.length - 1]));
@@ -1325,7 +1141,6 @@ class LiveRun {
     painter.draw(this.ghost.symbols);
     context.globalAlpha = 1;
   }
-
   paintHand(painter) {
     const {hand} = this;
     if (!hand) return;
@@ -1334,16 +1149,10 @@ class LiveRun {
     painter.circle(from, 3.2 * painter.pt, {fill: painter.theme.accent});
     painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
   }
-
   /** Left, bottom, right, top (m) of all that is drawn of the motion as it is now. */
   bounds() { return boundsOf(this.run, 0.1 * this.engine.data.scales.length); }
 }
-
-// A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motions are closed and solved anew.
-
-
 const SETTLED = 150;  // ms without a change until the address says the numbers
-
 class Live {
   constructor(player, data) {
     Object.assign(this, {player, data: data.live, firstEnd: data.end, dirty: false});
@@ -1360,7 +1169,6 @@ class Live {
     this.panel.enable(false);
     this.ready = this.load();
   }
-
   async load() {
     try {
       if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
@@ -1376,35 +1184,26 @@ class Live {
     this.address.read();
     return true;
   }
-
   get changed() { return this.runs.some(run => run.changed); }
   get isSolving() { return this.runs.some(run => run.job); }
   get end() { return Math.max(...this.runs.map(run => run.end)); }
-
   keys() {
     return {g: () => this.player.toggle("ghost"), Backspace: () => this.isReady && this.reset()};
   }
-
   greet() { this.say(`Move a slider, or pull at a body: the ${this.runs.length > 1 ? "motions are" : "motion is"} solved anew.`); }
-
   say(words, bad = false) { this.panel.say(words, bad); }
-
-  // Numbers
-
   set(k, value) {
     this.values[k] = value;
     this.solveSoon();
     clearTimeout(this.settling);
     this.settling = setTimeout(() => this.address.write(), SETTLED);
   }
-
   /** Change numbers by the names of their parameters, and solve at once. */
   change(numbers) {
     this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
     this.panel.show(this.values);
     this.solve();
   }
-
   reset() {
     cancelAnimationFrame(this.request);
     this.dirty = false;
@@ -1416,9 +1215,6 @@ class Live {
     this.greet();
     this.player.draw();
   }
-
-  // Motion
-
   /** Solve before the next picture, once for all changes until then. */
   solveSoon() {
     if (this.dirty) return;
@@ -1426,7 +1222,6 @@ class Live {
     cancelAnimationFrame(this.request);  // what was being solved is of other numbers
     this.request = requestAnimationFrame(() => this.solve());
   }
-
   solve() {
     cancelAnimationFrame(this.request);
     this.dirty = false;
@@ -1434,7 +1229,6 @@ class Live {
     if (this.isSolving) this.player.setEnd(Math.max(...this.runs.map(run => (run.job ? run.times[run.times.length - 1] : run.end))));
     this.goOn();
   }
-
   /** Solve on until the time of one picture is over, and so on until the end. */
   goOn() {
     this.runs.forEach((run, k) => { if (run.job) this.said[k] = run.goOn(); });
@@ -1443,7 +1237,6 @@ class Live {
     if (this.isSolving) this.request = requestAnimationFrame(() => this.goOn());
     this.player.draw();
   }
-
   /** Solve all that is still to be solved. */
   finish() {
     if (this.dirty) this.solve();
@@ -1451,7 +1244,6 @@ class Live {
     while (this.isSolving) this.goOn();
     cancelAnimationFrame(this.request);
   }
-
   /** What the whole view shows: all that is drawn of the motions as they are now. */
   fit() {
     const {bounds} = this.player.data, all = this.runs.map(run => run.bounds());
@@ -1459,10 +1251,6 @@ class Live {
     bounds.splice(0, 4, ...(this.changed ? [0, 1, 2, 3].map(k => Math[k < 2 ? "min" : "max"](...all.map(one => one[k]))) : this.firstBounds));
   }
 }
-
-// The player's elements, what they do, and how they look.
-
-
 class Player {
   constructor(element, data, options) {
     if (data.format !== 1) throw new Error(`this player reads format 1, not ${data.format}`);
@@ -1490,7 +1278,6 @@ class Player {
     this.layout();
     if (options.autoplay && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play();
   }
-
   build(element) {
     const {data} = this, shadow = element.shadowRoot ?? element.attachShadow({mode: "open"});
     const toggle = (name, words, key) => button(words, `${words} (${key})`, () => this.toggle(name));
@@ -1535,7 +1322,6 @@ class Player {
     for (const name of Object.keys(this.buttons)) this.press(name);
     this.setPlaying(false);
   }
-
   panel(run, k) {
     const canvas = make("canvas", {role: "img", tabindex: 0, "aria-label": `${this.data.title} ${run.label}: motion`});
     const caption = make("figcaption");
@@ -1545,7 +1331,6 @@ class Player {
     followPointers(this, canvas, () => this.live?.runs[k]);
     return panel;
   }
-
   strip() {
     this.stripCanvas = make("canvas", {"aria-hidden": "true"});
     const select = this.measureSelect = make("select", {"aria-label": "measure", onchange: () => { this.measure = select.value; this.draw(); }});
@@ -1565,34 +1350,26 @@ class Player {
     this.zoom.y = (this.zoom.y + cy - y) * ratio + y - cy;
     this.zoom.factor = next;
   }
-
   whole() {
     this.zoom = {factor: 1, x: 0, y: 0};
     this.live?.fit();
     this.draw();
   }
-
-  // What happens
-
   on(listener) {
     this.listeners.push(listener);
   }
-
   tell() {
     for (const listener of this.listeners) listener(this);
   }
-
   toggle(name) {
     if (name === "playing") return this.playing ? this.pause() : this.play();
     this.show[name] = !this.show[name];
     this.press(name);
     this.draw();
   }
-
   press(name) {
     this.buttons[name]?.setAttribute("aria-pressed", this.show[name]);
   }
-
   setPlaying(playing) {
     this.playing = playing;
     const words = playing ? "pause (space)" : "play (space)";
@@ -1600,12 +1377,10 @@ class Player {
     this.playButton.title = words;
     this.playButton.setAttribute("aria-label", words);
   }
-
   setSpeed(speed) {
     this.speed = speed;
     this.speedSelect.value = speed;
   }
-
   play() {
     if (this.playing) return;
     if (this.t >= this.data.end) this.t = this.data.start;
@@ -1620,13 +1395,11 @@ class Player {
     this.request = requestAnimationFrame(frame);
     this.tell();
   }
-
   /** The end of the timeline. */
   setEnd(end) {
     this.data.end = end;
     this.t = Math.min(this.t, end);
   }
-
   advance(seconds) {
     const {start, end} = this.data;
     let t = this.t + seconds * this.speed;
@@ -1635,29 +1408,24 @@ class Player {
     this.draw();
     if (this.t >= end) this.pause();
   }
-
   pause() {
     if (!this.playing) return;
     cancelAnimationFrame(this.request);
     this.setPlaying(false);
     this.tell();
   }
-
   seek(t) {
     this.t = clamp(t, this.data.start, this.data.end);
     this.draw();
     this.tell();
   }
-
   switchTheme() {
     this.chosen = this.themeName() === "dark" ? "light" : "dark";
     this.retheme();
   }
-
   themeName() {
     return this.chosen ?? (this.media.matches ? "dark" : "light");
   }
-
   retheme() {
     this.theme = THEMES[this.themeName()];
     const {back, panel, ink, soft, line, accent, onAccent, force} = this.theme;
@@ -1667,11 +1435,9 @@ class Player {
     if (this.options.fill) document.body.style.background = back;
     this.draw();
   }
-
   toggleHelp() {
     this.help.hidden = !this.help.hidden;
   }
-
   key(event) {
     const [target] = event.composedPath();
     if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(target.tagName) && target !== this.scrub) return;
@@ -1689,9 +1455,6 @@ class Player {
     event.preventDefault();
     action();
   }
-
-  // How it looks
-
   layout() {
     const width = this.root.clientWidth;
     if (!width) return;
@@ -1704,7 +1467,6 @@ class Player {
     }
     this.draw();
   }
-
   /** Pixels of a place in metres in a panel: x + scale X, y - scale Y. */
   view(width, height) {
     const [left, bottom, right, top] = this.data.bounds;
@@ -1713,13 +1475,11 @@ class Player {
     const scale = fit * this.zoom.factor;
     return {scale, x: width / 2 - scale * (left + right) / 2 + this.zoom.x, y: height / 2 + scale * (bottom + top) / 2 + this.zoom.y};
   }
-
   /** What paints on a panel's canvas. */
   painter(canvas, context = null) {
     const {clientWidth: width, clientHeight: height} = canvas, pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
     return new SymbolPainter(context, this.view(width, height), this.theme, pt, null);
   }
-
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
@@ -1748,7 +1508,6 @@ class Player {
     this.timeLabel.replaceChildren(make("b", {}, now), rest);
     this.scrub.setAttribute("aria-valuetext", now + rest);
   }
-
   destroy() {
     this.pause();
     this.resize.disconnect();
@@ -1757,16 +1516,6 @@ class Player {
     this.root.remove();
   }
 }
-
-// The player: shows the motion of planar mechanisms. Modules without dependencies, which page.py joins to
-// one for a page and a notebook.
-//
-//   mount(element, data, {fill, theme, autoplay}) -> {time, playing, play(), pause(), seek(t), ...}     (see `mount`)
-//   default export: {render} for anywidget
-//
-// `data` is what udkjax/show/player/player_data.py describes. All texts go through `textContent` or a canvas: none is markup.
-
-
 /** Show `data` in an element.
  *
  *  options: fill (the whole window), theme ("light", "dark"; by default what the system prefers), autoplay.
@@ -1795,7 +1544,6 @@ function mount(element, data, options = {}) {
   element.dataset.lmSuppressShortcuts = "true";  // of JupyterLab, which would take keys away from it
   return handle;
 }
-
 /** anywidget: the model has `data`, and `time` (s) and `playing`, which follow the player and move it. */
 function render({model, el}) {
   const player = mount(el, model.get("data"), {theme: model.get("theme") || null});
@@ -1816,7 +1564,6 @@ function render({model, el}) {
     player.destroy();
   };
 }
-
 
 
 return mount;

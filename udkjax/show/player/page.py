@@ -43,8 +43,7 @@ def as_json(data: object) -> str:
 
 @cache
 def module() -> str:
-    """Return the source of the player: its modules, joined to one."""
+    """Return the source of the player: its modules, joined to one, without the lines that are comments."""
     *parts, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES)
-    return re.sub(
-        r"^import .*\n", "", "\n".join([*(re.sub(r"^export ", "", part, flags=re.M) for part in parts), last]), flags=re.M
-    )
+    joined = "\n".join([*(re.sub(r"^export ", "", part, flags=re.M) for part in parts), last])
+    return re.sub(r"^(import .*| *//.*)?\n", "", joined, flags=re.M)
