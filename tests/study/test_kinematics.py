@@ -424,3 +424,40 @@ def test_what_is_held_and_what_joints_hold_is_refused():
         udk.travel(fixed, "body.a.angle")
     free = udk.library.parallelogram(0.0)  # flat: there the angle depends on the joints, and nowhere else
     assert drive(free, "body.link1.angle").name
+
+
+def coupler_pin(a, b, c, d, angle, sign):
+    """The pin of coupler and rocker of a four-bar, by the two circles that it lies on; on one of two branches."""
+    A, C = a * np.stack([np.cos(angle), np.sin(angle)], -1), np.array([d, 0.0])
+    D = np.linalg.norm(A - C, axis=-1)
+    along, across = (A - C) / D[:, None], np.stack([C[1] - A[:, 1], A[:, 0] - C[0]], -1) / D[:, None]
+    x = (D**2 + c**2 - b**2) / (2 * D)
+    return C + x[:, None] * along + sign * np.sqrt(c**2 - x**2)[:, None] * across
+
+
+@pytest.mark.parametrize("lengths", [(2.5, 2.0), (1.5, 2.2)])
+@pytest.mark.parametrize(("gap", "count"), [(1e-3, 13), (1e-3, 25), (1e-4, 25), (1e-4, 61), (1e-5, 61)])
+def test_a_motion_stays_on_its_branch_where_another_comes_close(lengths, gap, count):
+    """The transmission angle falls to 2.4, 0.8 and 0.24 degrees, between two values."""
+    b, c = lengths
+    d = b + c - 1.0 - gap
+    mech = udk.library.four_bar(angle=1.0, lengths=(1.0, b, c), ground=d)
+    for turn in (2 * np.pi, -2 * np.pi):
+        angle = np.linspace(1.0, 1.0 + turn, count)
+        found = np.asarray(udk.kinematics(mech, "body.crank.angle", angle).path("coupler", (b / 2, 0.0)))
+        exact = [coupler_pin(1.0, b, c, d, angle, sign) for sign in (1, -1)]
+        assert min(np.max(np.abs(found - x)) for x in exact) < 1e-9
+
+
+def test_a_traced_motion_stays_on_its_branch():
+    gaps, angle = np.array([1e-3, 1e-4, 1e-5]), np.linspace(1.0, 1.0 + 2 * np.pi, 25)
+
+    @jax.jit
+    @jax.vmap
+    def path(gap):
+        mech = udk.library.four_bar(angle=1.0, lengths=(1.0, 2.5, 2.0), ground=3.5 - gap)
+        return udk.kinematics(mech, "body.crank.angle", angle).path("coupler", (1.25, 0.0))
+
+    for gap, found in zip(gaps, np.asarray(path(gaps)), strict=True):
+        exact = [coupler_pin(1.0, 2.5, 2.0, 3.5 - gap, angle, sign) for sign in (1, -1)]
+        assert min(np.max(np.abs(found - x)) for x in exact) < 1e-9

@@ -73,6 +73,11 @@ class Analysis(PrintsTable):
         return tuple(self.row_names[i] for i in self.redundant_rows or ())
 
     @property
+    def independent_rows(self) -> tuple[int, ...]:
+        """The rows that are not redundant, as far as that is known."""
+        return tuple(i for i in range(len(self.row_names)) if i not in (self.redundant_rows or ()))
+
+    @property
     def rank(self) -> int | None:
         """The rank of Psi_q outside of singular configurations; None where it is not known."""
         return None if self.redundant_rows is None else len(self.row_names) - len(self.redundant_rows)

@@ -10,6 +10,9 @@ A step counts if the corrector converges near the prediction and the tangent has
 stays the same, or the curve is lost and says so. E^+ is truncated: redundant constraints do no harm, and where branches meet,
 which costs E rank, the old tangent leads across.
 
+The sign of det [E; tau] changes where a branch meets another, and so it does where a step went over to one that only comes close:
+such a step counts if it is short. Branches that come closer to each other than that are taken for branches that meet.
+
 A value so near to a meeting of branches that its own E is of no use is found across it (crossing.py).
 
 Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
@@ -79,6 +82,7 @@ class _Search(NamedTuple):
 class _State(NamedTuple):
     X: Float[Array, "n+1"]
     tau: Float[Array, "n+1"]
+    side: Float[Array, ""]  # of a meeting of branches
     h: Float[Array, ""]
     k: Int[Array, ""]  # the next value
     trials: Int[Array, ""]
@@ -123,7 +127,17 @@ def _follow(
     zero, none = xp.zeros((), X.dtype), xp.asarray(0)
     along = xp.append(xp.zeros_like(X[:-1]), 1.0)
     search = _Search(zero, zero, zero, zero, none)
-    state = _State(X, along, xp.asarray(FIRST_STEP, X.dtype), xp.asarray(first), none, xp.asarray(_START), search, points)
+    state = _State(
+        X,
+        along,
+        xp.ones((), X.dtype),
+        xp.asarray(FIRST_STEP, X.dtype),
+        xp.asarray(first),
+        none,
+        xp.asarray(_START),
+        search,
+        points,
+    )
     most = MAX_TRIALS + 4 * len(values)
 
     def is_underway(state: _State) -> Bool[Array, ""]:
@@ -149,7 +163,8 @@ def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _St
     xp = curve.by.xp
     X, h, target, starts, searches = state.X, state.h, targets[state.k], state.event == _START, state.event <= _TOGGLE
     way = xp.where(target >= X[-1], 1.0, -1.0)
-    tau = state.tau * xp.where(starts | (state.tau[-1] * way >= 0), 1.0, -1.0)
+    turn = xp.where(starts | (state.tau[-1] * way >= 0), 1.0, -1.0)
+    tau = turn * state.tau
     slope = xp.abs(tau[-1])
     wanted = xp.where(target == X[-1], 0.0, xp.abs(target - X[-1]) / xp.where(slope > 0, slope, 1.0))
     lands = ~searches & ~starts & ((wanted <= h) & (slope > 0) | (target == X[-1]))
@@ -157,16 +172,18 @@ def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _St
     ahead = X + eta * tau
     ahead = xp.append(ahead[:-1], xp.where(lands, target, ahead[-1]))
     at, closed = curve.correct(ahead, fixed=lands | starts)
-    turned = curve.tangent(at, tau)
+    turned, side = curve.tangent(at, tau)
 
     def begin() -> _State:  # where branches meet, one of them is taken
-        return state._replace(X=at, tau=turned, event=xp.where(closed, _LANDS, Reached.open))
+        return state._replace(X=at, tau=turned, side=side, event=xp.where(closed, _LANDS, Reached.open))
 
     def narrow() -> _State:
         return _narrow(curve, state, target, way, eta, at, turned)
 
     def advance() -> _State:
-        return _advance(curve, state._replace(tau=tau), target, way, eta, lands, ahead, at, closed, turned, most)
+        return _advance(
+            curve, state._replace(tau=tau, side=turn * state.side), target, way, eta, lands, ahead, at, closed, turned, side, most
+        )
 
     cond = curve.by.cond
     return cond(starts, begin, lambda: cond(searches, narrow, advance))
@@ -187,6 +204,7 @@ def _advance(
     at: Float[Array, "n+1"],
     closed: Bool[Array, ""],
     turned: Float[Array, "n+1"],
+    side: Float[Array, ""],
     most: int,
 ) -> _State:
     """Return the state after a step to `at`, of the length eta, if that step counts."""
@@ -195,6 +213,7 @@ def _advance(
     near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
     good = near & (turned @ tau >= LARGEST_BEND) & closed
     good = good & ~(lands & (eta > CLOSE_DISTANCE) & (curve.clearance(at) < NEAR_LOSS))  # only a close tangent leads across
+    good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # else on a branch that comes close
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
     counts = good & ~folds & ~passed
@@ -206,6 +225,7 @@ def _advance(
     return state._replace(
         X=xp.where(counts, at, X),
         tau=xp.where(counts, turned, tau),
+        side=xp.where(counts, side, state.side),
         h=xp.where(folds, eta, xp.where(counts, longer, shorter)),
         trials=state.trials + 1,
         event=xp.where(folds, _TOGGLE, event),

@@ -1,7 +1,7 @@
 """The positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value: X = (q, s)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import jax
@@ -28,6 +28,7 @@ class AbstractCurve(ABC):
     weights: Any  # of the rows
     units: Any  # of coordinates and value
     rows: Any  # the scales of the rows
+    independent: tuple[int, ...]  # the rows that depend on no others
 
     by: ClassVar[ControlFlow]
 
@@ -82,11 +83,25 @@ class AbstractCurve(ABC):
         sigma = xp.linalg.svd(E, compute_uv=False)
         return sigma[len(X) - 2] / xp.where(sigma[0] > 0, sigma[0], 1.0)
 
-    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> Float[Array, "n+1"]:
+    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> tuple[Array, Array]:
+        """Return the tangent that keeps the direction of one before, and on which side of a meeting of branches it is, +-1.
+
+        The side is the sign of det [E; tau] of independent rows: along a branch it changes where that meets another alone, and
+        not at toggles. It is 1 where it is not known which rows are independent.
+        """
         xp, E = self.by.xp, self.slopes(X)
         tau = before - self.plus(E) @ (E @ before)
         size = xp.linalg.norm(tau)
-        return tau / xp.where(size > 0, size, 1.0)
+        tau = tau / xp.where(size > 0, size, 1.0)
+        return tau, self._sign(xp.concatenate([E[np.array(self.independent, int)], tau[None]]))
+
+    def side(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
+        """Return the same of a point, the sign of det Psi_q: it changes at toggles, too."""
+        return self._sign(self.slopes(X)[np.array(self.independent, int), :-1])
+
+    def _sign(self, A: Float[Array, "k k"]) -> Float[Array, ""]:
+        xp = self.by.xp
+        return xp.linalg.slogdet(A)[0] if A.shape[0] == A.shape[1] else xp.ones(())
 
     def derivatives(self, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
         """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
@@ -106,6 +121,7 @@ class Curve(AbstractCurve):
     weights: Float[Array, "m"]
     units: Float[Array, "n+1"]
     rows: Float[Array, "m"]
+    independent: tuple[int, ...] = field(metadata={"static": True})
 
     by: ClassVar[ControlFlow] = BY_JAX
 
@@ -114,7 +130,8 @@ class Curve(AbstractCurve):
         scales = driven.analysis.scales
         scale = scales.coordinates(driven.analysis.coordinates)
         units = library_for((scale, driven.unit)).append(scale, driven.unit)
-        return cls(mechanism=driven.mechanism, weights=scales.weights, units=number(units), rows=scales.rows)
+        independent = driven.analysis.independent_rows
+        return cls(driven.mechanism, scales.weights, number(units), scales.rows, independent)
 
     def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
         x = X * self.units
@@ -138,6 +155,7 @@ class KnownCurve(AbstractCurve):
     weights: Float[np.ndarray, "m"]
     units: Float[np.ndarray, "n+1"]
     rows: Float[np.ndarray, "m"]
+    independent: tuple[int, ...]
 
     by: ClassVar[ControlFlow] = BY_NUMPY
 
@@ -145,7 +163,8 @@ class KnownCurve(AbstractCurve):
     def of(cls, driven: Driven) -> "KnownCurve":
         scales = jax.tree.map(np.asarray, driven.analysis.scales)
         units = np.append(np.tile([scales.length, scales.length, 1.0], driven.analysis.coordinates // 3), driven.unit)
-        return cls(terms=DenseTerms(driven.mechanism), weights=scales.weights, units=units, rows=scales.rows)
+        independent = driven.analysis.independent_rows
+        return cls(DenseTerms(driven.mechanism), scales.weights, units, scales.rows, independent)
 
     def residual(self, X: Any) -> Any:
         x = X * self.units

@@ -14,7 +14,7 @@ from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.march import can_march, march, march_at_once
+from udkjax.integrate.march import MarchResult, can_march, march, march_at_once
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
@@ -22,9 +22,10 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.branches import SAME_POSITION
 from udkjax.study.continuation import Points, Reached, follow, no_points
 from udkjax.study.control_flow import BY_JAX, ControlFlow, solve
-from udkjax.study.curve import Curve, KnownCurve
+from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Drive, Driven, drive
 from udkjax.study.position_derivatives import with_derivative, with_derivatives
 
@@ -155,7 +156,8 @@ def kinematics(
     With Psi_q q' = -Psi_s and Psi_q q'' = gamma, velocities are q' s_dot and accelerations q'' s_dot^2 + q' s_ddot.
 
     The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
-    followed, the motion ends, with a `status` that says why. Toggles, where the driver can get no farther, are found to rounding.
+    followed, the motion ends, with a `status` that says why. Branches closer than some 0.003 rad of transmission angle are taken
+    for branches that meet. Toggles, where the driver can get no farther, are found to rounding.
     Redundant constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any
     order by every number of the mechanism and by the values. Where branches meet (`Reached.singular`) they have first
     derivatives, but none, not a number, by what parts the branches, as a length does that one of two equal cranks alone has;
@@ -261,7 +263,8 @@ def _solve(
     given = driven.mechanism, driven.analysis, driven.unit, s, q, values
     if fast and can_march(driven.mechanism, driven.analysis):
         found = march(*stop_gradients(given)) if is_traced else march_at_once(*given)
-        first, last = found.trusted, xp.maximum(found.trusted - 1, 0)
+        first = _count_on_branch(curve, s, q, values, found)
+        last = xp.maximum(first - 1, 0)
         some = first > 0
         s, q = xp.where(some, values[last], s), xp.where(some, found.q[last], q)
         points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=xp.zeros_like(points.status))
@@ -272,6 +275,34 @@ def _solve(
     assert isinstance(curve, Curve)  # as it is of traced numbers
     points = follow(*stop_gradients((curve, s, q, values)), points, first)
     return _with_derivatives(curve, q, values, points)
+
+
+def _count_on_branch(
+    curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], found: MarchResult
+) -> Int[Array, ""] | int:
+    """Return how many of the trusted positions are on the branch that they started on.
+
+    Where a branch meets another its side changes, and so it does where machine code went over to one that comes close. Which it
+    was, continuation tells, with shorter steps: of known numbers from the value before, of others from there on.
+    """
+    xp = curve.by.xp
+    start, points = xp.append(q, s) / curve.units, xp.concatenate([found.q, values[:, None]], 1) / curve.units
+    if isinstance(curve, Curve):
+        same = jax.vmap(curve.side)(stop_gradients(points)) == curve.side(stop_gradients(start))
+        return xp.sum(xp.cumprod(same & (np.arange(len(values)) < found.trusted)))
+    side = curve.side(start)
+    for k in range(int(found.trusted)):
+        here = curve.side(points[k])
+        if here == side:
+            continue
+        before = points[k - 1] if k else start
+        x = before * curve.units
+        reached = follow(curve, x[-1], x[:-1], values[k : k + 1], no_points(1, len(q), np), 0)
+        away = np.abs(reached.q[0] / curve.units[:-1] - points[k, :-1])
+        if not (Reached.has_position(reached.status[0]) and np.max(away) <= SAME_POSITION):
+            return k
+        side = here
+    return int(found.trusted)
 
 
 def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "T"], points: Points) -> Points:
