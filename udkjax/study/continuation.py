@@ -125,18 +125,16 @@ def _follow(
     by, xp = curve.by, curve.by.xp
     X, targets = xp.append(q, s) / curve.units, values / curve.units[-1]
     zero, none = xp.zeros((), X.dtype), xp.asarray(0)
-    along = xp.append(xp.zeros_like(X[:-1]), 1.0)
-    search = _Search(zero, zero, zero, zero, none)
     state = _State(
-        X,
-        along,
-        xp.ones((), X.dtype),
-        xp.asarray(FIRST_STEP, X.dtype),
-        xp.asarray(first),
-        none,
-        xp.asarray(_START),
-        search,
-        points,
+        X=X,
+        tau=xp.append(xp.zeros_like(X[:-1]), 1.0),
+        side=xp.ones((), X.dtype),
+        h=xp.asarray(FIRST_STEP, X.dtype),
+        k=xp.asarray(first),
+        trials=none,
+        event=xp.asarray(_START),
+        search=_Search(zero, zero, zero, zero, none),
+        points=points,
     )
     most = MAX_TRIALS + 4 * len(values)
 
