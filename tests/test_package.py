@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -126,6 +127,8 @@ def test_the_public_names_are_there():
     exec("from udkjax import *", everything)
     assert set(udkjax.__all__) <= set(everything)
     assert {*udkjax.__all__, "__version__"} == set(dir(udkjax))
+    for package in (udkjax.library, import_module("udkjax.scene"), import_module("udkjax.scene.drawing")):
+        assert sorted(package.__all__) == dir(package)
     assert callable(udkjax.simulate) and callable(udkjax.assemble) and udkjax.library.__name__ == "udkjax.scene.library"
     with pytest.raises(AttributeError, match="no attribute 'simulat'"):
         udkjax.simulat  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]

@@ -11,12 +11,7 @@ from importlib import import_module
 from udkjax.lazy_names import lazy_names
 
 __version__ = "0.1.0"
-__getattr__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __dir__():
-    return sorted([*__all__, "__version__"])
-
+__getattr__, __dir__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]
 
 os.environ["JAX_ENABLE_X64"] = os.environ.get("JAX_ENABLE_X64") or "1"
 if "jax" in sys.modules:

@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import Any
 
 
-def lazy_names(package: str) -> tuple[Callable[[str], Any], list[str]]:
-    """Return `__getattr__` and `__all__` of a package, from the imports of its stub, which type checkers and editors read."""
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package, from the imports of its stub, which editors read, too."""
     stub = (pkgutil.get_data(package, "__init__.pyi") or b"").decode()
     homes = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)}
 
@@ -21,4 +21,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], list[str]]:
         setattr(sys.modules[package], name, value)
         return value
 
-    return find, [*homes]
+    def list_names() -> list[str]:
+        return sorted([*homes, *({"__version__"} & vars(sys.modules[package]).keys())])
+
+    return find, list_names, [*homes]

@@ -7,7 +7,9 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from udkjax.integrate.march import march, march_at_once
 from udkjax.study.continuation import Reached
+from udkjax.study.curve import KnownCurve
 from udkjax.study.drive import drive
 
 TURN = np.linspace(np.pi / 3, np.pi / 3 + 2 * np.pi, 73)
@@ -461,3 +463,35 @@ def test_a_traced_motion_stays_on_its_branch():
     for gap, found in zip(gaps, np.asarray(path(gaps)), strict=True):
         exact = [coupler_pin(1.0, 2.5, 2.0, 3.5 - gap, angle, sign) for sign in (1, -1)]
         assert min(np.max(np.abs(found - x)) for x in exact) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "driver"),
+    [
+        ("four_bar", {"angle": 1.0}, "body.crank.angle"),
+        ("slider_crank", {}, "motor"),
+        ("parallelogram", {}, "body.link1.angle"),  # with a redundant row
+        ("peaucellier", {}, "body.crank.angle"),
+        ("n_four_bar", {"n": 12, "angle": 1.0}, "body.link0.angle"),  # large, with redundant rows
+    ],
+)
+def test_the_side_is_the_sign_of_the_determinant_of_independent_rows(name, numbers, driver):
+    """However elimination pivots, in one lane and in several."""
+    mech = getattr(udk.library, name)(**numbers)
+    driven = drive(mech, driver)
+    q = udk.assemble(mech).q.ravel()
+    start, curve = driven.value(q), KnownCurve.of(driven)
+    values = float(start) + np.linspace(0.05, 0.5, 4)
+
+    def exact(q, s):
+        E = curve.slopes(np.append(q, s) / curve.units)
+        return np.linalg.slogdet(E[list(curve.independent), :-1])[0]
+
+    one = march_at_once(driven.mechanism, driven.analysis, driven.unit, start, q, values)
+    assert one.trusted == len(values)
+    assert one.first_side == exact(q, start)
+    assert one.side.tolist() == [exact(*at) for at in zip(one.q, values, strict=True)]
+    lanes = jax.vmap(lambda end: march(driven.mechanism, driven.analysis, driven.unit, start, q, end))(
+        values + 0.01 * np.arange(5)[:, None]
+    )
+    assert np.all(np.asarray(lanes.side) == one.side[0]) and np.all(np.asarray(lanes.first_side) == one.first_side)

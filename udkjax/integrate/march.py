@@ -26,11 +26,17 @@ DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on othe
 
 
 class MarchResult(NamedTuple):
-    """Positions and their derivatives by the value; the first `trusted` of them are right."""
+    """Positions and their derivatives by the value; the first `trusted` of them are closed, and on the course they began.
+
+    `side` is the sign of det Psi_q, or 1 where Psi_q is not square or nobody knows which rows are independent, and
+    `first_side` that of the start.
+    """
 
     q: Float[Array, "T n"]
     dq: Float[Array, "T n"]
     ddq: Float[Array, "T n"]
+    side: Float[Array, "T"]
+    first_side: Float[Array, ""]
     trusted: Int[Array, ""]
 
 
@@ -64,8 +70,8 @@ def _by_numpy(x: PyTree) -> PyTree:
 
 
 def _march(found: Sequence, xp: ModuleType) -> MarchResult:
-    q, dq, ddq = (x[0, APPROACH:] for x in found[:3])
-    return MarchResult(q, dq, ddq, xp.maximum(found[3][0, 0].astype(int) - APPROACH, 0))
+    q, dq, ddq, side = (x[0, APPROACH:] for x in found[:4])
+    return MarchResult(q, dq, ddq, side, found[3][0, 0], xp.maximum(found[4][0, 0].astype(int) - APPROACH, 0))
 
 
 def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector, xp: ModuleType) -> list:

@@ -4,6 +4,9 @@ A step predicts by the Taylor polynomial of q(s) to the third order, from q', q'
 Newton's method with elimination. All lanes take the same steps: nothing depends on how one of them fares. What is to be relied
 on is counted: as long as each position is closed to rounding, lies near its prediction, the tangent has turned little since the
 one before, and no row is near dependence. From there on, the caller goes on by singular values.
+
+Where the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows:
+it is another one behind a position where branches meet, and on another branch that comes close.
 """
 
 import numpy as np
@@ -15,11 +18,15 @@ from udkjax.native.layout import Lane, Plan
 from udkjax.native.manifold import largest_violation
 from udkjax.native.members import write_begin, write_run
 from udkjax.native.module import Module
+from udkjax.native.program import Place
+from udkjax.native.pseudoinverses.lu import LUCode
 from udkjax.native.tableau import EULER
+from udkjax.native.weighted_rows import WeightedRows
 
 CORRECTIONS = 2
 STRAIGHT = 0.95  # cosine of the angle by which the tangent may turn in a step
 SLACK = 0.1  # of a step: how far a position may lie from its prediction
+_METHOD = LUCode(relative=True)
 DISTANT = 1e-2  # from dependence: nearer, elimination loses more than half of the digits of q''
 
 
@@ -27,7 +34,7 @@ class Marching(Module):
     """The text of a module whose `run` follows members from their positions q at the value ts[0] over all values ts."""
 
     settings = ("length", "omega")
-    results = ("qs", "dqs", "ddqs", "trusted")
+    results = ("qs", "dqs", "ddqs", "sides", "trusted")
 
     def __init__(self, code: ScenePrograms, width: int, vector: int):
         plan = Plan(
@@ -36,17 +43,30 @@ class Marching(Module):
         super().__init__(plan)
         for name in ("previous dq", "previous ddq", "third derivative", "prediction"):
             self.places.add(name, self.n)
+        self._rows = None
+        if len(code.eliminated_rows) == self.n and not code.marks_rows:
+            for name, count in (("psi_q", code.scratch["psi_q"]), ("root", self.n)):
+                if name not in self.places.places:
+                    self.places.add(name, count)
+            self._rows = WeightedRows(self, _METHOD, chosen=sorted(code.eliminated_rows))
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_programs()
         write_begin(self)
+        if self._rows:
+            self._rows.write()
         self._march()
         write_run(self)
         return self.module_text()
 
     def program_names(self) -> list[str]:
-        return ["newton_q", "value_derivatives"]
+        return ["newton_q", "value_derivatives", "dense_newton_q"]
+
+    @property
+    def arrays(self) -> dict[str, Place]:
+        named = ("psi_q", "root") if self._rows else ()
+        return super().arrays | {name: ("work", self.places[name]) for name in named}
 
     def _get(self, f: Function, name: str, i: Value) -> Value:
         return f.load(f.given["work"], i * f.width + self.places[name] * f.width, f.width)
@@ -75,9 +95,10 @@ class Marching(Module):
             trusted.value = trusted.value + good.value
             with f.if_(begins), f.each(self.n) as i:  # there was no step: nothing is known of the third derivative
                 self._put(f, "third derivative", i, zero)
-            before.value = now
+            before.value, side = now, self._side(f)
             with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
                 row = self.to_int(f, f.lane(s.member, lane)) * times + k
+                f.store(f.lane(side, lane), f.load(call, self.call_fields.index("sides"), base=POINTER), row)
                 for name, x in (("qs", "state q"), ("dqs", "result dq"), ("ddqs", "result dv")):
                     self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, lane)
         with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
@@ -97,6 +118,14 @@ class Marching(Module):
             with f.each(self.n) as i:
                 self._put(f, "state q", i, self._get(f, "corrected q", i))
         self.invoke(f, "value_derivatives")
+
+    def _side(self, f: Function) -> Value:
+        """Return the sign of det Psi_q at `state q`; 1 where Psi_q is not square."""
+        if not self._rows:
+            return f.const(1.0, DOUBLE, f.width)
+        self.invoke(f, "dense_newton_q")
+        self._rows.factor(f)
+        return _METHOD.sign(self._rows.matrices(f))
 
     def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> Value:
         """Tell whether positions are closed, near their prediction, and on a straight course; estimate the third derivative."""

@@ -328,7 +328,7 @@ class MarkRows(Operation):
 
 @dataclass(frozen=True)
 class March(Operation):
-    """Follow the positions of a driven mechanism over values: q, q', q'', and how many are to be relied on."""
+    """Follow the positions of a driven mechanism over values: q, q', q'', their sides, and how many are to be relied on."""
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 
@@ -336,4 +336,4 @@ class March(Operation):
         return Marching(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        return [*[(members, times, self.coordinates)] * 3, (members, 1)]
+        return [*[(members, times, self.coordinates)] * 3, (members, times), (members, 1)]

@@ -3,35 +3,53 @@
 They come from the arrays `psi_q` and `root`, which holds M^(-1/2).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from udkjax.native.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 
-_ENTRIES, _FACTORS = "@entries", "@factors"
+_ENTRIES, _FACTORS, _CHOSEN = "@entries", "@factors", "@chosen"
 
 
 class RowEntries:
-    """The entries of Psi_q, with their tables among the constants of a module."""
+    """The entries of Psi_q, or of the chosen ones of its rows, with their tables among the constants of a module.
 
-    def __init__(self, module: Module):
+    A module has one choice of rows.
+    """
+
+    def __init__(self, module: Module, chosen: Sequence[int] | None = None):
+        self._module = module
         rows, columns, places, factors = module.code.psi_q_entries
+        if chosen is not None:
+            kept = np.isin(rows, chosen)
+            rows, columns, places, factors = (x[kept] for x in (np.searchsorted(chosen, rows), columns, places, factors))
         self._count = len(rows)
+        self._chosen = range(module.m) if chosen is None else chosen
         entries = ", ".join(f"i64 {x}" for entry in zip(rows, columns, places, strict=True) for x in entry)
         numbers = ", ".join(f"double {float(x)}" for x in factors)
         for line in (
             f"{_ENTRIES} = private constant [{3 * self._count} x i64] [{entries}]",
             f"{_FACTORS} = private constant [{self._count} x double] [{numbers}]",
+            f"{_CHOSEN} = private constant [{len(self._chosen)} x i64] [{', '.join(f'i64 {x}' for x in self._chosen)}]",
         ):
             if line not in module.loops.globals:
                 module.loops.globals.append(line)
 
     def entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
-        """Run the block for each entry of Psi_q: its row, its column, its place in `psi_q`, and the factor of what is there."""
+        """Run the block for each entry: its row, its column, its place in `psi_q`, and the factor of what is there.
+
+        Rows are counted among the chosen ones.
+        """
         with f.each(self._count) as e:
             row, column, place = (f.load(Value(f, _ENTRIES, POINTER), e * 3 + j, base=INT) for j in range(3))
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
+
+    def row_of_psi(self, f: Function, row: Value) -> Value:
+        """Return which row of Psi a chosen one is."""
+        return row if len(self._chosen) == self._module.m else f.load(Value(f, _CHOSEN, POINTER), row, base=INT)
 
 
 class WeightedRows(RowEntries):
@@ -40,10 +58,10 @@ class WeightedRows(RowEntries):
     Where it is lane by lane, functions that use it have one lane, and its number as their argument `lane`.
     """
 
-    def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False):
-        super().__init__(module)
-        self._in, self._method = module, method
-        shape, width = (module.m, module.n), 1 if by_lane else module.plan.width
+    def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False, chosen: Sequence[int] | None = None):
+        super().__init__(module, chosen)
+        self._method = method
+        shape, width = (len(self._chosen), module.n), 1 if by_lane else module.plan.width
         self._layout = DenseLayout(module, method.matrices(*shape), shape, width=width)
         self._arguments = [(POINTER, "work"), *([(INT, "lane")] if by_lane else [])]
         module.weigh_rows()
@@ -51,7 +69,7 @@ class WeightedRows(RowEntries):
     def write(self):
         """Write the functions that factorize and solve."""
         for name in ("factor", "solve"):
-            f = self._in.new_function(f"{name}_rows", self._arguments, self._layout.width)
+            f = self._module.new_function(f"{name}_rows", self._arguments, self._layout.width)
             getattr(self._method, name)(self.matrices(f))
 
     def matrices(self, f: Function) -> DenseMatrices:
@@ -60,18 +78,18 @@ class WeightedRows(RowEntries):
 
     def array(self, f: Function, name: str, i: Operand) -> Value:
         """One number of an array, in all lanes of the function."""
-        place = f.like(i, INT, 1) * self._in.plan.width + self._in.start(name, "work")
+        place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         return f.load(f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
     def put(self, f: Function, name: str, i: Operand, x: Value):
         """Store one number of an array, in all lanes of the function."""
-        place = f.like(i, INT, 1) * self._in.plan.width + self._in.start(name, "work")
+        place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         f.store(x, f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
     def weighted_entries(self, f: Function) -> Iterator[tuple[Value, Value, Value]]:
         """Run the block for each entry of W Psi_q: its row, its column and its value."""
         for row, column, place, factor in self.entries(f):
-            yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", row)
+            yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", self.row_of_psi(f, row))
 
     def factor(self, f: Function):
         """Factorize D, of the entries of Psi_q at hand."""
@@ -88,7 +106,8 @@ class WeightedRows(RowEntries):
         b = d.row("b")
         b.clear()  # what fills the last register has been multiplied by what was no number, perhaps
         with f.each(d.m) as i:
-            b.put(i, self.array(f, right, i + start) * self.array(f, "weights", i))
+            row = self.row_of_psi(f, i)
+            b.put(i, self.array(f, right, row + start) * self.array(f, "weights", row))
         return self.solve_right(f)
 
     def solve_right(self, f: Function) -> MatrixRow:

@@ -93,15 +93,8 @@ class AbstractCurve(ABC):
         tau = before - self.plus(E) @ (E @ before)
         size = xp.linalg.norm(tau)
         tau = tau / xp.where(size > 0, size, 1.0)
-        return tau, self._sign(xp.concatenate([E[np.array(self.independent, int)], tau[None]]))
-
-    def side(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
-        """Return the same of a point, the sign of det Psi_q: it changes at toggles, too."""
-        return self._sign(self.slopes(X)[np.array(self.independent, int), :-1])
-
-    def _sign(self, A: Float[Array, "k k"]) -> Float[Array, ""]:
-        xp = self.by.xp
-        return xp.linalg.slogdet(A)[0] if A.shape[0] == A.shape[1] else xp.ones(())
+        A = xp.concatenate([E[np.array(self.independent, int)], tau[None]])
+        return tau, xp.linalg.slogdet(A)[0] if A.shape[0] == A.shape[1] else xp.ones(())
 
     def derivatives(self, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
         """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""

@@ -285,24 +285,18 @@ def _count_on_branch(
     Where a branch meets another its side changes, and so it does where machine code went over to one that comes close. Which it
     was, continuation tells, with shorter steps: of known numbers from the value before, of others from there on.
     """
-    xp = curve.by.xp
-    start, points = xp.append(q, s) / curve.units, xp.concatenate([found.q, values[:, None]], 1) / curve.units
     if isinstance(curve, Curve):
-        same = jax.vmap(curve.side)(stop_gradients(points)) == curve.side(stop_gradients(start))
-        return xp.sum(xp.cumprod(same & (np.arange(len(values)) < found.trusted)))
-    side = curve.side(start)
-    for k in range(int(found.trusted)):
-        here = curve.side(points[k])
-        if here == side:
-            continue
-        before = points[k - 1] if k else start
-        x = before * curve.units
-        reached = follow(curve, x[-1], x[:-1], values[k : k + 1], no_points(1, len(q), np), 0)
-        away = np.abs(reached.q[0] / curve.units[:-1] - points[k, :-1])
+        same = found.side == found.first_side
+        return jnp.sum(jnp.cumprod(same & (np.arange(len(values)) < found.trusted)))
+    trusted = int(found.trusted)
+    before = np.append(found.first_side, found.side[:-1])
+    for k in np.flatnonzero(found.side[:trusted] != before[:trusted]).tolist():
+        s, q = (values[k - 1], found.q[k - 1]) if k else (s, q)
+        reached = follow(curve, s, q, values[k : k + 1], no_points(1, len(q), np), 0)
+        away = np.abs(reached.q[0] - found.q[k]) / curve.units[:-1]
         if not (Reached.has_position(reached.status[0]) and np.max(away) <= SAME_POSITION):
             return k
-        side = here
-    return int(found.trusted)
+    return trusted
 
 
 def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "T"], points: Points) -> Points:

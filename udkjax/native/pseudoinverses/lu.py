@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from udkjax.native.ir import Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import reversed_each
 
@@ -57,3 +58,13 @@ class LUCode(DenseMethod):
         x.clear()
         with reversed_each(d, d.m) as k:  # what lies left of the diagonal meets coordinates that are still zero
             x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))
+
+    def sign(self, d: DenseMatrices) -> Value:
+        """Write how the sign of det D is found of its factors: that of the pivots, and -1 for each pair of rows out of order."""
+        f, order, found = d.f, d.row("order"), d.f.variable(1.0)
+        with f.each(d.m) as k:
+            here = order.entry(k)
+            found.value = f.select(d.row("inverse").entry(k) < 0.0, -found.value, found.value)
+            with f.each(k) as i:
+                found.value = f.select(order.entry(i) > here, -found.value, found.value)
+        return found.value

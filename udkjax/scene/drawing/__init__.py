@@ -2,4 +2,4 @@
 
 from udkjax.lazy_names import lazy_names
 
-__getattr__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]
+__getattr__, __dir__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]
