@@ -10,6 +10,7 @@ import udkjax as udk
 from udkjax.show.style import COLOURS, plain
 
 LOW, HIGH = 0.25, 0.40  # m: the radii of the cam
+STEM = 0.15  # m: from the follower's tip to its centre
 RATE = 2.0  # rad/s
 LIVE = ["driver.motor.motion.coefficients", "gravity[1]", "body.follower.mass", "body.cam.inertia"]  # what its page changes
 
@@ -23,16 +24,16 @@ def radius(angle):
 def make():
     """Return how still the follower rests, the player, and its lift over a turn."""
     angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
-    bodies = {"cam": udk.Body(2.0, 0.05), "follower": udk.Body(0.5, 0.01, (0.0, 0.45))}
+    bodies = {"cam": udk.Body(2.0, 0.05), "follower": udk.Body(0.5, 0.01, (0.0, radius(np.pi / 2) + STEM))}  # its tip on the cam
     joints = {
         "axle": udk.Revolute(("ground", "cam"), [(0.0, 0.0), (0.0, 0.0)]),
         "guide": udk.Prismatic(("ground", "follower"), [(0.0, 0.45), (0.0, 0.2)], axis=np.pi / 2),
-        "cam": udk.Cam(("cam", "follower"), [(0.0, 0.0), (0.0, -0.15)], udk.Profile(angle, radius(angle))),
+        "cam": udk.Cam(("cam", "follower"), [(0.0, 0.0), (0.0, -STEM)], udk.Profile(angle, radius(angle))),
     }
     motor = udk.Driver(("ground", "cam"), "angle", udk.Polynomial([0.0, RATE]))
     mech = udk.Mechanism(bodies, joints, {"motor": motor}, name="dwell cam")
     sol = udk.simulate(mech, np.linspace(0.0, 2 * np.pi / RATE, 121))
-    turned, lift = RATE * np.asarray(sol.ts), np.asarray(sol.q)[:, 1, 1] - 0.15
+    turned, lift = RATE * np.asarray(sol.ts), np.asarray(sol.q)[:, 1, 1] - STEM
     figure = Figure(figsize=(7, 3.0), layout="constrained")
     axes = plain(figure.subplots())
     axes.plot(np.degrees(turned), 1e3 * lift, color=COLOURS[0], lw=1.6, label="simulated")

@@ -22,6 +22,13 @@ def test_a_mistyped_guess_is_said():
         udk.simulate(wrong, [0.0, 0.01])
 
 
+def test_a_slide_that_does_not_turn_is_said_without_an_angle():
+    mech = udk.Mechanism(
+        {"block": udk.Body(1.0, 0.1, (0.3, 0.5), 0.7)}, {"guide": udk.Prismatic(("ground", "block"), [(0, 0), (0, 0)], axis=0.0)}
+    )
+    assert udk.check(mech).moved == ("assembly moved block by 0.5 m",)
+
+
 def test_rounding_is_not():
     near = MECH.with_parameters({"body.rocker.position": np.asarray(MECH.bodies["rocker"].position) + 1e-3})
     assert udk.check(near).moved == () == udk.check(MECH).moved

@@ -34,7 +34,7 @@ from udkjax.integrate.closure import close_by_jax, close_by_machine_code
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import poses_table
-from udkjax.scene.fields import is_traced, is_within_jit, number, number_called
+from udkjax.scene.fields import ROUNDING, is_traced, is_within_jit, number, number_called
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import body_sizes, suspicions
@@ -273,7 +273,9 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
     sizes = body_sizes(mechanism)
     for name, distance, angle in zip(mechanism.body_names, distances, angles, strict=True):
         if distance + angle * sizes[name] > WORTH_SAYING * sizes[name]:
-            yield f"assembly moved {name} by {distance:.2g} m and {np.degrees(angle):.2g} deg"
+            parts = {f"{distance:.2g} m": distance, f"{np.degrees(angle):.2g} deg": angle * sizes[name]}
+            told = " and ".join(text for text, part in parts.items() if part > ROUNDING * sizes[name])
+            yield f"assembly moved {name} by {told}"
 
 
 @cached_by_identity
