@@ -37,8 +37,9 @@ class Body(PrintsLine):
     angular_velocity: Float[Array, ""] = eqx.field(converter=given_number, default=0.0)  # rad/s
 
     def frame(self) -> "Frame":
-        """Return the body's frame at its initial guess."""
-        return Frame.at(self.position, self.angle)
+        """Return the body's frame at its initial guess, with its velocities."""
+        vx, vy = self.velocity
+        return Frame.at(self.position, self.angle)._replace(vx=vx, vy=vy, omega=self.angular_velocity)
 
 
 class Point(NamedTuple):

@@ -12,13 +12,12 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Scalar
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Body, Frame
+from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import Number, Numbers, number
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
-
-PINS = (Revolute, Weld)  # joints that hold two points together
+from udkjax.scene.spanning_tree import spanning_tree
 
 
 @checked
@@ -116,11 +115,13 @@ def attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Ar
 
 def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
     """Move bodies by as much as the pins that hold them have moved: a guess in which nothing has changed stays as it is."""
-    bodies: dict[str, Body] = dict(after.bodies)
-    old = {GROUND: GROUND_FRAME_AT_REST} | {name: _initial_frame(body) for name, body in before.bodies.items()}
-    new = {GROUND: GROUND_FRAME_AT_REST} | {name: _initial_frame(body) for name, body in bodies.items()}
+    old = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in before.bodies.items()}
+    new = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in after.bodies.items()}
     values: dict[str, Numbers] = {}
-    for joint, holder, body in _spanning_tree(before):
+    pins = {name: 0 for name, joint in before.joints.items() if isinstance(joint, Revolute | Weld)}
+    for body, holder, joint in spanning_tree(before, pins):
+        if not joint:
+            continue  # a root stays
         was, now = before.joints[joint], after.joints[joint]
         one, two = (0, 1) if was.bodies[1] == body else (1, 0)
         frame = new[body]
@@ -133,28 +134,6 @@ def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
         values[f"body.{body}.position"] = jnp.stack([frame.x, frame.y])
         values[f"body.{body}.velocity"] = jnp.stack([frame.vx, frame.vy])
     return after.with_parameters(values) if values else after
-
-
-def _spanning_tree(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
-    """Iterate over pins by which bodies are reached: the joint, the body that holds it, and the body that it reaches.
-
-    From the ground on; of bodies that no pin joins to it, from the first of them, which stays.
-    """
-    pins = {name: joint.bodies for name, joint in mechanism.joints.items() if isinstance(joint, PINS)}
-    seen: set[str] = set()
-    for root in (GROUND, *mechanism.body_names):
-        reached = [] if root in seen else [root]
-        for holder in reached:  # grows while it is gone through: the nearest to the root first
-            seen.add(holder)
-            for joint, pair in pins.items():
-                body = pair[0] if pair[1] == holder else pair[1]
-                if holder in pair and body not in seen and body not in reached:
-                    reached.append(body)
-                    yield joint, holder, body
-
-
-def _initial_frame(body: Body) -> Frame:
-    return body.frame()._replace(vx=body.velocity[0], vy=body.velocity[1], omega=body.angular_velocity)
 
 
 def _pin_state(frame: Frame, local: Float[Array, "2"]) -> tuple[Number, Number, Number, Number]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from udkjax.scene.bodies import Body
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body
 from udkjax.scene.checks import SceneError, abbreviate, suggestion
 from udkjax.scene.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
@@ -211,10 +211,7 @@ def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str
     found = []
     for name in loops:
         joint = mechanism.joints[name]
-        frames = [
-            Body(1.0, 1.0).frame() if body not in mechanism.bodies else mechanism.bodies[body].frame()
-            for body in joint.frame_names
-        ]
+        frames = [GROUND_FRAME if body == GROUND else mechanism.bodies[body].frame() for body in joint.frame_names]
         gap = float(np.max(np.abs(np.asarray(joint.residual(0.0, *frames)))))
         found += [(name, gap)] if gap > OPEN_LOOP * max(size, 1.0) else []
     return found

@@ -21,9 +21,10 @@ from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import EVEN
 from udkjax.scene.mjcf.mjcf_reader import INITIAL, OPEN_LOOP
 from udkjax.scene.reshaping import attachments
+from udkjax.scene.spanning_tree import spanning_tree
 from udkjax.scene.suspicions import body_sizes
 
-IN_TREE = ((Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,))  # what no equality can express comes before the others
+IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # what no equality can express comes before the others
 NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, seen from where x is to the right and z is up
 THICKNESS = 0.04  # of bars that are drawn, beside the largest body
 
@@ -64,20 +65,19 @@ class _Writer:
     def __init__(self, mechanism: Mechanism):
         self.mechanism, self.problems = mechanism, list[str]()
         self.size = max(body_sizes(mechanism).values())
-        self.frames = {GROUND: GROUND_FRAME_AT_REST} | {
-            name: body.frame()._replace(vx=body.velocity[0], vy=body.velocity[1], omega=body.angular_velocity)
-            for name, body in mechanism.bodies.items()
-        }
+        self.frames = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in mechanism.bodies.items()}
         self.sites: dict[str, list[Values]] = {name: [] for name in self.frames}
         self.springs: dict[str, Values] = {}  # attributes of hinges, by their names
         self.sections: dict[str, list[str]] = {"tendon": [], "equality": [], "actuator": []}
         self.controls: list[float] = []
         self.taken: set[str] = set()  # names of sites and tendons
-        self.parents, self.holders = spanning_tree(mechanism)
+        preferred = [name for kinds in IN_TREE for name, joint in mechanism.joints.items() if isinstance(joint, kinds)]
+        self.tree = {edge.body: edge for edge in spanning_tree(mechanism, {name: k for k, name in enumerate(preferred)})}
+        held = {edge.joint for edge in self.tree.values()}
         self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of a body
-        self.joints = {name: self._joints(name) for name in self.parents}
+        self.joints = {name: self._joints(name) for name in self.tree}
         for name, joint in mechanism.joints.items():
-            if name not in self.holders.values():
+            if name not in held:
                 self._add_loop(name, joint)
         for name, force in mechanism.forces.items():
             self._add_force(name, force)
@@ -98,7 +98,7 @@ class _Writer:
             *(f"    <site{_attributes(**site)}/>" for site in self.sites[GROUND]),
         ]
         rates: list[Number] = []
-        children = {name: [child for child in self.parents if self.parents[child] == name] for name in self.frames}
+        children = {name: [edge.body for edge in self.tree.values() if edge.holder == name] for name in self.frames}
         pending = [(name, 2) for name in reversed(children[GROUND])]
         while pending:
             name, depth = pending.pop()
@@ -120,7 +120,7 @@ class _Writer:
 
     def _joints(self, name: str) -> list[_TreeJoint]:
         """Return the hinges and slides by which a body hangs on its parent."""
-        parent, held = self.parents[name], self.holders.get(name)
+        _, parent, held = self.tree[name]
         one, two = self.frames[parent], self.frames[name]
         self.turns[name] = dict(self.turns[parent])
         found: list[_TreeJoint] = []
@@ -135,7 +135,7 @@ class _Writer:
             found.append(_TreeJoint(title, {"type": "slide", "axis": _in_space(two.local(direction))}, rate))
 
         turning = two.omega - one.omega
-        if held is None:
+        if not held:
             slide(f"{name}.x", Point(1.0, 0.0), Point(two.x, two.y))
             slide(f"{name}.y", Point(0.0, 1.0), Point(two.x, two.y))
             hinge(f"{name}.angle", Point(two.x, two.y), turning)
@@ -168,7 +168,7 @@ class _Writer:
 
     def _body_lines(self, name: str) -> list[str]:
         """Return the lines of a body, but for those that hang on it and its end."""
-        body, one, two = self.mechanism.bodies[name], self.frames[self.parents[name]], self.frames[name]
+        body, one, two = self.mechanism.bodies[name], self.frames[self.tree[name].holder], self.frames[name]
         place = _in_space(one.local((two.x - one.x, two.y - one.y)))
         inertia = _numbers(body.inertia, body.inertia, body.inertia)
         radius = 0.5 * THICKNESS * self.size
@@ -302,32 +302,3 @@ def _numbers(*values: object) -> str:
 
 def _attributes(**values: str) -> str:
     return "".join(f" {name}={quoteattr(value)}" for name, value in values.items())
-
-
-def spanning_tree(mechanism: Mechanism) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the body on which each hangs, from the ground on, and the joint by which; without one it is free on the ground."""
-    groups, edges = {name: name for name in (GROUND, *mechanism.body_names)}, dict[str, list[tuple[str, str]]]()
-
-    def group(name: str) -> str:
-        while groups[name] != name:
-            name = groups[name]
-        return name
-
-    for kinds in IN_TREE:
-        for name, joint in mechanism.joints.items():
-            if isinstance(joint, kinds) and group(joint.bodies[0]) != group(joint.bodies[1]):
-                one, two = joint.bodies
-                groups[group(one)] = group(two)
-                edges.setdefault(one, []).append((two, name))
-                edges.setdefault(two, []).append((one, name))
-    parents, holders = dict[str, str](), dict[str, str]()
-    for root in (GROUND, *mechanism.body_names):
-        reached = [] if root in parents else [root]
-        if reached and root != GROUND:
-            parents[root] = GROUND
-        for name in reached:  # grows while it is gone through
-            for other, joint in edges.get(name, []):
-                if other != GROUND and other not in parents:
-                    parents[other], holders[other] = name, joint
-                    reached.append(other)
-    return parents, holders
