@@ -36,7 +36,7 @@ def main(words: list[str] | None = None) -> None:
         parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
 
     from benchmarks import native, page, peers, table
-    from benchmarks.common import machine, report
+    from benchmarks.common import machine, write
 
     out, figures = arguments.out, {}
     if out:
@@ -44,14 +44,17 @@ def main(words: list[str] | None = None) -> None:
     for name in NAMES:
         file = out / f"{name}.json" if out else None
         if name in (arguments.names or NAMES):
-            print(f"\n--- {name}")
-            figures[name] = import_module(f"benchmarks.{name}").main(smoke=arguments.smoke, out=file)
+            about = machine()
+            print(f"\n--- {name}\n{'; '.join(f'{k} {v}' for k, v in about.items())}")
+            figures[name] = import_module(f"benchmarks.{name}").main(smoke=arguments.smoke)
+            if file:
+                write(about, figures[name], file)
         elif file and file.exists():
             figures[name] = json.loads(file.read_text())["figures"]
     about, judged = machine(), table.judge(figures)
     table.show(judged)
-    report(about, judged, out / "table.json" if out else None)
     if out:
+        write(about, judged, out / "table.json")
         missing = [name for name in NAMES if name not in figures]
         missing += ["C++ (no compiler)"] if native.program() is None else []
         missing += [f"{package} (not installed)" for package in peers.missing()]

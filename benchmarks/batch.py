@@ -5,7 +5,6 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 
 import udkjax as udk
 from benchmarks import native
-from benchmarks.common import Compiled, at_equal_error, in_turn, machine, ratio, report
+from benchmarks.common import Compiled, at_equal_error, in_turn, ratio
 from benchmarks.peers.peer import STARTS, coordinates
 from benchmarks.scripts import solve
 from udkjax.study.accuracy import pendulum
@@ -58,11 +57,11 @@ def ours(mechanism: Any, ts: np.ndarray) -> Callable:
     return jax.vmap(one, in_axes=(0, None))
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print trajectories per second of CPU time at errors of 1e-6 and 1e-8, and how many times slower than udkjax each is."""
     rounds, tolerances = (1, TOLERANCES[2:4]) if smoke else (ROUNDS, TOLERANCES)
     members, few, end = (4, 2, 0.1) if smoke else (MEMBERS, FEW, END)
-    about, figures = machine(), []
+    figures = []
     print(f"{'10 s':16} {'start':>6} {'':12} {'error':>7} {'a second':>9} {'ours is':>8} times as many")
     for start in STARTS[:1] if smoke else STARTS:
         for kind, outputs in list(OUTPUTS.items())[: 1 if smoke else None]:
@@ -84,7 +83,6 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
     compiled_in = [row["compile_seconds"] for row in figures if row["name"] == "compiled"]
     print(f"compiled in {min(compiled_in):.1f} to {max(compiled_in):.1f} s")
     figures += _cores(smoke)
-    report(about, figures, out)
     return figures
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks import native
 from udkjax.study.members import processor
 
 
@@ -44,16 +45,21 @@ class Compiled:
         return time.perf_counter() - start
 
     def cpu_seconds(self, *arguments: Any, at_least: float = 0.02) -> float:
-        """CPU time of a run, of all threads: the median of as many as take `at_least` seconds, as the C++ program takes it.
+        """CPU time of a run, as `cpu_seconds` takes it."""
+        return cpu_seconds(lambda: self(*arguments), at_least)
 
-        What else runs matters less; nor do the first, in caches that another candidate has left behind.
-        """
-        times: list[float] = []
-        while not times or sum(times) < at_least:
-            start = time.process_time()
-            self(*arguments)
-            times.append(time.process_time() - start)
-        return statistics.median(times)
+
+def cpu_seconds(call: Callable[[], Any], at_least: float = 0.02) -> float:
+    """CPU time (s) of a call, of all threads: the median of as many as take `at_least` seconds, as the C++ program takes it.
+
+    What else runs on the machine matters less, and so do the first calls, in caches that another candidate has left behind.
+    """
+    times: list[float] = []
+    while not times or sum(times) < at_least:
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
+    return statistics.median(times)
 
 
 def alternate(candidates: dict[str, Compiled], arguments: tuple, rounds: int) -> dict[str, list[float]]:
@@ -123,16 +129,15 @@ def machine() -> dict[str, Any]:
         "load": load and [round(x, 2) for x in load],
         "python": platform.python_version(),
         "device": str(jax.devices()[0]),
+        "C++": native.version(),
         **packages,
     }
 
 
-def report(about: dict[str, Any], figures: Any, out: Path | None):
-    """Print the machine; write everything if asked to."""
-    print("; ".join(f"{k} {v}" for k, v in about.items()))
-    if out:
-        out.write_text(json.dumps(_finite({"machine": about, "figures": figures}), indent=1, allow_nan=False) + "\n")
-        print(f"written to {out}")
+def write(about: dict[str, Any], figures: Any, file: Path) -> None:
+    """Write figures and what they belong to."""
+    file.write_text(json.dumps(_finite({"machine": about, "figures": figures}), indent=1, allow_nan=False) + "\n")
+    print(f"written to {file}")
 
 
 def _finite(tree: Any) -> Any:

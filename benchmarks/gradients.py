@@ -3,7 +3,6 @@
 import statistics
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -13,7 +12,7 @@ import numpy as np
 
 import udkjax as udk
 from benchmarks import native
-from benchmarks.common import Compiled, in_turn, machine, ratio, report
+from benchmarks.common import Compiled, in_turn, ratio
 from benchmarks.scripts import MASS, WEIGHT, solve
 
 START, END, TOLERANCE = -45.0, 10.0, 1e-8  # degrees, s
@@ -59,10 +58,10 @@ def script(adjoint: Any = None) -> Callable:
     return angle
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print for each count of parameters the cost of a gradient, in times the run alone, and check the gradients against C++."""
     counts, rounds, at_least = ((1,), 1, 0.0) if smoke else (COUNTS, ROUNDS, 0.02)
-    about, figures, gradients = machine(), [], {}
+    figures, gradients = [], {}
     makers = {"udkjax": ours} if smoke else {"udkjax": ours, "script": script}
     print(f"{'final angle, 10 s':16} {'mode':8} {'parameters':>10} {'ms':>9} {'times the run':>14}")
     for count in counts:
@@ -91,5 +90,4 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
         known = gradients["udkjax", "forward", count]
         if mode != "run":
             np.testing.assert_allclose(found, known, rtol=AGREE, err_msg=f"{name}, {mode}")
-    report(about, figures, out)
     return figures

@@ -7,13 +7,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import machine, report
 from benchmarks.measurements import EXACT, Measurement, driven_excavator, excavator, four_bar, linkage, slider_crank, sprung_chain
 
 CASES: dict[str, Callable[..., Measurement]] = {
@@ -209,16 +207,13 @@ def rows(count: Count) -> Iterable[dict[str, Any]]:
         yield from timing("sprung chain", {"count": size, **shorter}, ["udkjax"], WIDE, count.timed)
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print one table: of each case and protocol how many fits reach the true values, their errors and times."""
-    about = machine()
     print(
         f"{'case':24} {'protocol':22} {'P':>3} {'s':>5} {'fits':>5} {'<= 1e-8':>8} {'median':>9} {'worst':>9} {'within 2':>8} "
         f"{'seconds':>9} {'cpu':>9} {'runs':>8}"
     )
-    figures = list(rows(SMOKE if smoke else FULL))
-    report(about, figures, out)
-    return figures
+    return list(rows(SMOKE if smoke else FULL))
 
 
 if __name__ == "__main__":

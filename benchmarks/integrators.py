@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -13,7 +12,7 @@ import optimistix as optx
 from scipy.integrate import ode, solve_ivp
 
 import udkjax as udk
-from benchmarks.common import Compiled, Work, machine, report
+from benchmarks.common import Compiled, Work
 from benchmarks.problems import PROBLEMS, STIFF, Problem
 from udkjax.integrate.solvers.counting import count_evaluations, evaluations
 
@@ -91,13 +90,13 @@ def _counted(problem: Problem) -> Any:
     return f, calls
 
 
-def main(smoke: bool = False, out: Path | None = None):
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print the errors and the calls of the right-hand side, and their ratio to those of a known code at equal error.
 
     This is VODE's Adams methods, or where the problem is stiff the backward differentiation formulas of LSODA (those of VODE, as
     SciPy translated it for its version 1.17, take up to a hundred times the steps that the Fortran code took).
     """
-    about, figures = machine(), []
+    figures = []
     tolerances = TOLERANCES[2:3] if smoke else TOLERANCES
     print(f"{'problem':12} {'solver':16} {'tol':>7} {'error':>9} {'calls':>7} {'Jacobians':>9} {'steps':>7} {'ratio':>6}")
     for name, problem in PROBLEMS.items():
@@ -123,5 +122,4 @@ def main(smoke: bool = False, out: Path | None = None):
                 figures.append(row | {"jacobians": jacobians, "steps": steps, "ratio": ratio})
                 counts = f"{calls:7d} {jacobians:9d} {steps:7d} {ratio:6.2f}"
                 print(f"{name:12} {solver:16} {tol:7.0e} {error:9.1e} {counts}")
-    report(about, figures, out)
     return figures

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import machine, report
 from udkjax.integrate import native_engine
 
 CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
@@ -92,7 +91,7 @@ def native_ms(run: Any) -> float:
     return 1e3 * statistics.median(times)
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Measure, print a line for each scene, and write the figures."""
     try:
         sync_playwright = import_module("playwright.sync_api").sync_playwright
@@ -124,8 +123,6 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
                     rows.append(row | {"run_ms": run_ms, "native_ms": native_ms(run), "busy_ms": busy_ms} | pictures)
                     show(rows[-1])
                 browser.close()
-    if out:
-        report(machine(), rows, out)
     return rows
 
 

@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from scipy.optimize import fsolve, minimize_scalar
 
 import udkjax as udk
-from benchmarks.common import in_turn, machine, report
+from benchmarks.common import cpu_seconds, in_turn
 from udkjax.integrate.march import march
 from udkjax.study.drive import drive
 
@@ -76,18 +75,9 @@ def by_pylinkage(values: np.ndarray) -> float | None:
 
 
 def timed(run: Callable[[], Any], least: float = 0.05) -> Callable[[], float]:
-    """How long a call takes (CPU s), the mean of as many as take so long; JAX is waited for."""
-
-    jax.block_until_ready(run())  # compiled
-
-    def seconds() -> float:
-        count, start = 0, time.process_time()
-        while not count or time.process_time() - start < least:
-            jax.block_until_ready(run())
-            count += 1
-        return (time.process_time() - start) / count
-
-    return seconds
+    """Return what measures how long a call takes (CPU s) once it is compiled; JAX is waited for."""
+    jax.block_until_ready(run())
+    return lambda: cpu_seconds(lambda: jax.block_until_ready(run()), least)
 
 
 def positions(smoke: bool) -> list[dict[str, Any]]:
@@ -202,9 +192,6 @@ def torque(smoke: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print how fast positions, torques and rest are found; all candidates must agree."""
-    about = machine()
-    figures = [*positions(smoke), *torque(smoke), *rest(smoke)]
-    report(about, figures, out)
-    return figures
+    return [*positions(smoke), *torque(smoke), *rest(smoke)]

@@ -5,21 +5,20 @@ equations. A jitted function of a mechanism, a function of the library and stack
 """
 
 import statistics
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import Compiled, in_turn, machine, ratio, report
+from benchmarks.common import Compiled, in_turn, ratio
 
 METHODS = (udk.Auto(), udk.Elimination(), udk.Greville(), udk.GramSchmidt(), udk.Householder(), udk.Varga(), udk.SVD())
 FORMULATIONS = (udk.NullSpaceQR(), udk.NullSpaceSVD(), udk.Augmented(udk.SVD()))
 MEMBERS, ROUNDS = 64, 9
 
 
-def main(smoke: bool = False, out: Path | None = None):
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print CPU times in ms, in times the run by `Auto`, and the time to compile."""
     ts, members, rounds = (np.linspace(0.0, 0.1, 3), 2, 1) if smoke else (np.linspace(0.0, 5.0, 101), MEMBERS, ROUNDS)
     linkage, masses, angles = udk.library.parallelogram(), np.linspace(1.0, 1.2, members), np.linspace(-0.9, -0.5, members)
@@ -34,7 +33,7 @@ def main(smoke: bool = False, out: Path | None = None):
     def of_mechanism(mechanism):
         return udk.simulate(mechanism, ts).q
 
-    about, figures = machine(), []
+    figures = []
     stacked = jax.vmap(lambda angle: udk.library.parallelogram(angle=angle))(angles)
     chosen: dict[str, dict[str, Any]] = {type(m).__name__: {"method": m} for m in METHODS}
     chosen |= {type(x).__name__: {"formulation": x} for x in FORMULATIONS}
@@ -69,5 +68,4 @@ def main(smoke: bool = False, out: Path | None = None):
             row = {"name": name, "ms": statistics.median(found[name]) * 1e3, "times": ratio(found[name], found[baseline])}
             figures.append(row | {"compile_s": compiled[name][0].compile_seconds})
             print(f"{name:32} {row['ms']:9.3f} {row['times']:11.2f} {compiled[name][0].compile_seconds:10.2f}")
-    report(about, figures, out)
     return figures

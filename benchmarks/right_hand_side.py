@@ -1,14 +1,14 @@
 """One right-hand side of the paper's linkage: a user's dense script against udkjax by each of its methods."""
 
 import statistics
-from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import Compiled, alternate, machine, ratio, report
+from benchmarks.common import Compiled, alternate, ratio
 from benchmarks.scripts import by_cholesky, by_pinv
 from udkjax.equations import prepare
 
@@ -29,7 +29,7 @@ def candidates(mechanism) -> dict:
     }
 
 
-def main(smoke: bool = False, out: Path | None = None):
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print time per evaluation and how many times faster than the script with pinv it is."""
     evaluations, rounds = (3, 2) if smoke else (EVALUATIONS, ROUNDS)
     mechanism = udk.library.parallelogram()
@@ -42,7 +42,6 @@ def main(smoke: bool = False, out: Path | None = None):
     def loop(f):  # each evaluation needs the one before, so that none can be left out
         return lambda y: jax.lax.fori_loop(0, evaluations, lambda _, y: y + 1e-12 * f(y), y)
 
-    about = machine()
     compiled = {name: Compiled(loop(f), y0) for name, f in functions.items()}
     times = alternate(compiled, (y0,), rounds)
     baseline = times["script, jnp.linalg.pinv"]
@@ -54,5 +53,4 @@ def main(smoke: bool = False, out: Path | None = None):
         row = {"name": name, "us": median, "quartiles": [low, high], "faster": ratio(baseline, seconds)}
         figures.append(row | {"compile_s": compiled[name].compile_seconds})
         print(f"{name:26} {median:9.3f} {low:8.3f}-{high:8.3f} {row['faster']:8.1f} {compiled[name].compile_seconds:10.2f}")
-    report(about, figures, out)
     return figures

@@ -5,13 +5,12 @@ Measured in whole runs by machine code, projected, with what a step takes beside
 
 import statistics
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import in_turn, machine, report
+from benchmarks.common import cpu_seconds, in_turn
 
 SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 100, 1000)}
 FROM, UP_TO = 10, 1000  # the exponent is that of N-four-bars of so many: of fewer, what a call takes counts as well
@@ -45,14 +44,7 @@ def measured(name: str, make: Any, n: int) -> tuple[dict[str, Any], Any]:
     evaluations = int(first.stats["right_hand_sides"])
     row = {"name": name, "n": n, "bodies": len(mechanism.body_names), "right_hand_sides": evaluations, **seconds}
 
-    def per_evaluation(at_least: float) -> float:
-        runs, start = 0, time.process_time()
-        while not runs or time.process_time() - start < at_least:
-            udk.simulate(mechanism, TS)
-            runs += 1
-        return (time.process_time() - start) / runs / evaluations
-
-    return row, per_evaluation
+    return row, lambda at_least: cpu_seconds(lambda: udk.simulate(mechanism, TS), at_least) / evaluations
 
 
 def exponent(rows: list[dict[str, Any]]) -> float:
@@ -62,9 +54,8 @@ def exponent(rows: list[dict[str, Any]]) -> float:
     return float(np.polyfit(n, cost, 1)[0]) if len(chosen) > 1 else float("nan")
 
 
-def main(smoke: bool = False, out: Path | None = None):
-    """Print figures for every size, and with what power of N they grow; with `out` also draw them, beside the figures."""
-    about = machine()
+def main(smoke: bool = False) -> list[dict[str, Any]]:
+    """Print figures for every size, and with what power of N they grow."""
     sizes = {"N-four-bar": (1, 2), "chain": (2,)} if smoke else SIZES
     cases = [(name, make, n) for name, make in (("N-four-bar", n_four_bar), ("chain", chain)) for n in sizes[name]]
     figures, timers = [], {}
@@ -81,21 +72,4 @@ def main(smoke: bool = False, out: Path | None = None):
     power = exponent(figures)
     print(f"N-four-bar grows as N^{power:.2f}, from N = {FROM} to {UP_TO}")
     figures.append({"name": "exponents, N-four-bar", "us": power})
-    report(about, figures, out)
-    if out:
-        draw(figures, out.with_suffix(".png"))
     return figures
-
-
-def draw(figures: list[dict[str, Any]], file: Path):
-    """Draw time against the number of bodies."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.0, 3.6), layout="constrained")
-    rows, axes = [row for row in figures if "bodies" in row], figure.subplots()
-    for name in dict.fromkeys(row["name"] for row in rows):
-        x, y = zip(*((row["bodies"], row["us"]) for row in rows if row["name"] == name), strict=True)
-        axes.loglog(x, y, marker="o", ms=3, label=name)
-    axes.set(xlabel="bodies", ylabel="one right-hand side: CPU time (µs)")
-    axes.legend(frameon=False, fontsize="small")
-    figure.savefig(file, dpi=150)

@@ -12,16 +12,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import machine, report
-
 TIMES = 5
 FIRST = """
 import numpy as np
 import udkjax as udk
 udk.simulate(udk.library.parallelogram(), np.linspace(0.0, 20.0, 401))
 """
-# A run of 101 states of a scene, changed by two of its masses, under each of JAX's transformations.
-TRANSFORMED = """
+# A run of 101 states of a scene, changed by two of its masses.
+SCENE = """
 import jax, jax.numpy as jnp, numpy as np
 import udkjax as udk
 mechanism, ts = udk.library.{scene}, np.linspace(0.0, {end}, 101)
@@ -31,7 +29,6 @@ def states(*values):
     return udk.simulate(mechanism.with_parameters(dict(zip(names, values))), ts, throw=False).q
 def angle(*values):
     return states(*values)[-1, 0, 2]
-np.asarray(jax.tree.leaves({run})[0])
 """
 SCENES = {
     "parallelogram()": 5.0,
@@ -82,7 +79,7 @@ def transformed(bytecode: Path) -> list[dict[str, Any]]:
     figures = []
     for scene, end in SCENES.items():
         for name, run in RUNS.items():
-            code, times = TRANSFORMED.format(scene=scene, end=end, run=run), []
+            code, times = f"{SCENE.format(scene=scene, end=end)}np.asarray(jax.tree.leaves({run})[0])", []
             for _ in range(2):
                 with tempfile.TemporaryDirectory() as cold:
                     times.append(waited(code, Path(cold), bytecode)["seconds"])
@@ -92,9 +89,9 @@ def transformed(bytecode: Path) -> list[dict[str, Any]]:
     return figures
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print the time from the start of Python to its end, medians."""
-    about, figures = machine(), []
+    figures = []
     programs = {name: code for name, code in PROGRAMS.items() if not smoke or code != FIRST}
     print(f"{'start of a process':28} {'s':>7} {'CPU s':>7}")
     with tempfile.TemporaryDirectory() as warm, tempfile.TemporaryDirectory() as bytecode:
@@ -110,5 +107,4 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
             print(f"{name:28} {row['seconds']:7.2f} {row['cpu_seconds']:7.2f}")
         if not smoke:
             figures += transformed(Path(bytecode))
-    report(about, figures, out)
     return figures

@@ -15,7 +15,7 @@ import numpy as np
 
 import udkjax as udk
 from benchmarks.batch import MEMBERS, angles, states
-from benchmarks.common import Compiled, machine, report
+from benchmarks.common import Compiled
 from udkjax.study.members import cores
 
 LINKS = ("link1", "link2", "link3")
@@ -63,10 +63,10 @@ def _angle(mechanism: Any, angle: Any) -> Any:
     return udk.with_angle(mechanism, LINKS, angle)
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Sweep once, once more with a kill in the middle, and print what it took beside the same work by `jax.vmap` alone."""
     size, end = (SMOKE, 0.2) if smoke else (FULL, END)
-    about, count = machine(), int(np.prod(size))
+    count = int(np.prod(size))
     before = single_program(size, end, smoke)
     with tempfile.TemporaryDirectory() as folder:
         whole = _process(size, end, f"{folder}/whole")
@@ -99,7 +99,6 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
     print(f"by vmap alone {alone['per_second']:.0f}: {share:.2f} of that, {row['throughput_of_steps']:.2f} by steps")
     print(f"{row['gib']:.2f} GiB at most")
     print(f"killed with {len(kept)} chunks finished; resumed with {resumed['members']} members left; the same, bit by bit")
-    report(about, [row], out)
     return [row]
 
 

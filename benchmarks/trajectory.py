@@ -6,7 +6,6 @@ runs from starts beside each other, whose errors are averaged in logarithms.
 
 import statistics
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ import numpy as np
 
 import udkjax as udk
 from benchmarks import native
-from benchmarks.common import Compiled, at_equal_error, in_turn, machine, ratio, report
+from benchmarks.common import Compiled, at_equal_error, in_turn, ratio
 from benchmarks.peers.peer import STARTS, Problem, problem
 from benchmarks.scripts import solve
 
@@ -68,12 +67,10 @@ def error(tasks: Sequence[Problem], found: Sequence[np.ndarray]) -> float:
     return float(np.exp(np.mean(np.log(errors))))
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print the CPU time that each takes at errors of 1e-6, 1e-8 and 1e-10, and how many times udkjax's that is."""
     rounds, tolerances, at_least = (1, TOLERANCES[2:9:2], 0.0) if smoke else (ROUNDS, TOLERANCES, AT_LEAST)
-    about, figures, seconds_to_compile = machine(), [], {}
-    if native.program() is not None:
-        about["C++"] = native.version()
+    figures, seconds_to_compile = [], {}
     print(f"{'20 s, 401 outputs':20} {'start':>6} {'error':>7} {'ms':>9} {'times ours':>11}")
     for start in STARTS[:1] if smoke else STARTS:
         starts = [start + beside for beside in BESIDE[: 2 if smoke else None]]
@@ -106,5 +103,4 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
                 figures.append(row | {"times_ours": times_ours})
                 print(f"{name:20} {start:6.0f} {target:7.0e} {row['seconds'] * 1e3:9.3f} {times_ours:11.2f}")
     print("compiled in: " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in seconds_to_compile.items()))
-    report(about, figures, out)
     return figures

@@ -4,8 +4,7 @@ The scripts have the Jacobian of this one linkage written by hand; here it is di
 """
 
 import statistics
-import time
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import Compiled, in_turn, machine, report
+from benchmarks.common import Compiled, cpu_seconds, in_turn
 
 STATES, FEW = 1000, 20
 ROUNDS = 9
@@ -60,7 +59,7 @@ def all_at_once(q: np.ndarray) -> np.ndarray:
     return share(*np.linalg.svd(hand_written(q))[:2])
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print how long a state takes, by each; all agree to 1e-10, or the figures would be worthless."""
     mechanism, count = udk.library.parallelogram(), FEW if smoke else STATES
     q = coordinates(angles(count))
@@ -69,18 +68,10 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
     for found in (here.result, all_at_once(q)):
         np.testing.assert_allclose(found, expected, atol=1e-10)
     candidates = {"NumPy, state by state": state_by_state, "NumPy, stacked": all_at_once, "udkjax, vmap": here}
-    timers = {name: lambda run=run: _seconds(run, jnp.asarray(q) if run is here else q) for name, run in candidates.items()}
-    times = in_turn(timers, 1 if smoke else ROUNDS)
+    calls = {name: partial(run, jnp.asarray(q) if run is here else q) for name, run in candidates.items()}
+    times = in_turn({name: partial(cpu_seconds, call, 0.0) for name, call in calls.items()}, 1 if smoke else ROUNDS)
     figures = [{"name": name, "states": count, "us": statistics.median(times[name]) / count * 1e6} for name in candidates]
     print(f"{'uniqueness of 12 multipliers':30} {'us a state':>10}   of {count} states; compiled in {here.compile_seconds:.2f} s")
     for row in figures:
         print(f"{row['name']:30} {row['us']:10.2f}")
-    report(machine(), figures, out)
     return figures
-
-
-def _seconds(run: Any, q: Any) -> float:
-    """CPU time of one call: what else runs matters less."""
-    start = time.process_time()
-    run(q)
-    return time.process_time() - start

@@ -5,27 +5,16 @@ Each in a fresh process, first with nothing cached, then with what that has left
 
 import statistics
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common import machine, report
-from benchmarks.startup import waited
+from benchmarks.common import cpu_seconds
+from benchmarks.startup import SCENE, waited
 
 TIMES = 3
-SCENE = """
-import jax, jax.numpy as jnp, numpy as np
-import udkjax as udk
-mechanism, ts = udk.library.{scene}(), np.linspace(0.0, 5.0, 101)
-names = [name for name in mechanism.parameters() if name.endswith(".mass")][:2]
-masses = [float(mechanism.parameters()[name]) for name in names]
-def states(*values):
-    return udk.simulate(mechanism.with_parameters(dict(zip(names, values))), ts, throw=False).q
-def angle(*values):
-    return states(*values)[-1, 0, 2]
-"""
+LINKAGE, CRANK_ROCKER = (SCENE.format(scene=f"{name}()", end=5.0) for name in ("parallelogram", "four_bar"))
 EVENT = """
 import jax, numpy as np
 import udkjax as udk
@@ -40,10 +29,9 @@ def time(inertia):
 COMMAND = "import sys; sys.argv = ['udkjax', *{words!r}.split()]; from udkjax.cli import main; main()"
 FOUR_BAR = "examples/four_bar.toml"
 CASES = {
-    "eager grad": SCENE.format(scene="parallelogram") + "print(jax.grad(angle, argnums=(0, 1))(*masses))",
-    "eager vmap over 8": SCENE.format(scene="parallelogram")
-    + "print(jax.vmap(states)(*(jnp.linspace(0.9, 1.1, 8) * x for x in masses)).shape)",
-    "hessian of a four-bar": SCENE.format(scene="four_bar") + "print(jax.hessian(angle)(*masses))",
+    "eager grad": LINKAGE + "print(jax.grad(angle, argnums=(0, 1))(*masses))",
+    "eager vmap over 8": LINKAGE + "print(jax.vmap(states)(*(jnp.linspace(0.9, 1.1, 8) * x for x in masses)).shape)",
+    "hessian of a four-bar": CRANK_ROCKER + "print(jax.hessian(angle)(*masses))",
     "first event": EVENT + "print(time(0.1))",
     "gradient of an event's time": EVENT + "print(jax.grad(time)(0.1))",
     "travel": "import udkjax as udk; print(udk.travel(udk.library.four_bar(), 'body.crank.angle'))",
@@ -81,18 +69,13 @@ def call_times(smoke: bool) -> list[dict[str, Any]]:
     }
     for name, call in calls.items():
         call()
-        times = []
-        for _ in range(3 if smoke else 300):
-            start = time.process_time()
-            call()
-            times.append(time.process_time() - start)
-        figures.append({"name": name, "milliseconds": 1e3 * statistics.median(times)})
+        figures.append({"name": name, "milliseconds": 1e3 * cpu_seconds(call, 0.0 if smoke else 0.2)})
     return figures
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print how long each case takes."""
-    about, figures = machine(), call_times(smoke)
+    figures = call_times(smoke)
     for row in figures:
         print(f"{row['name']:28} {row['milliseconds']:8.3f} ms of CPU")
     print(f"{'a process':28} {'s':>7} {'CPU s':>7} {'again, s':>9} {'CPU s':>7}")
@@ -107,5 +90,4 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict[str, Any]]:
                 f"{row['seconds']:7.2f} {row['cpu_seconds']:7.2f} {row['again_seconds']:9.2f} {row['again_cpu_seconds']:7.2f}"
             )
             print(f"{name:28} {numbers}", flush=True)
-    report(about, figures, out)
     return figures

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
-from benchmarks.common import machine, report
 from benchmarks.peers.peer import Peer
 
 MODULES = ("scipy_numpy", "numba_lsoda", "pinocchio_scipy", "mujoco_rk4", "mjx_batch", "exudyn_alpha", "drake_discrete")
@@ -63,9 +63,9 @@ def elsewhere(module: str, smoke: bool) -> list[dict]:
         return [json.loads(line) for line in printed if line.startswith('{"name"')]
 
 
-def main(smoke: bool = False, out: Path | None = None) -> list[dict]:
+def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print the error that each program reached and the time that it took, and name the ones that are missing."""
-    about, figures = machine(), []
+    figures = []
     print(f"{'peer':32} {'version':9} {'start':>6} {'batch':>6} {'knob':>8} {'error':>9} {'CPU time':>9}")
     for module in MODULES:
         if not any(peer.available() for peer in PEERS_OF[module]):
@@ -77,5 +77,4 @@ def main(smoke: bool = False, out: Path | None = None) -> list[dict]:
             print(f"{place} {row['knob']:8.1e} {row['error']:9.1e} {cost}")
     if absent := missing():
         print(f"not installed: {', '.join(absent)}")
-    report(about, figures, out)
     return figures
