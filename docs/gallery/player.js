@@ -65,9 +65,9 @@ class Run {
     this.fine = 4;  // points of a path for each instant
     this.now = new Float64Array(this.size);
   }
-  /** Another motion of the same bodies. */
-  replace(ts, q, v, measures, frame) {
-    Object.assign(this, {ts, q, v, measures, frame, paths: null, fine: 1});
+  /** Another motion of the same bodies, with its events {t, name}. */
+  replace(ts, q, v, measures, frame, events) {
+    Object.assign(this, {ts, q, v, measures, frame, events, paths: null, fine: 1});
   }
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
@@ -460,7 +460,10 @@ button.icon { width: 34px; padding: 0; display: grid; place-items: center; flex:
 button.primary { background: var(--accent); color: var(--on-accent); width: 40px; height: 40px; border-radius: 50%; }
 button.primary:hover { background: color-mix(in srgb, var(--accent) 86%, var(--ink)); }
 input[type="range"] { accent-color: var(--accent); height: 32px; margin: 0; cursor: pointer; }
-.scrub { flex: 1 1 140px; min-width: 100px; }
+.line { flex: 1 1 140px; min-width: 100px; position: relative; display: flex; }
+.scrub { flex: 1; min-width: 0; }
+.ticks { position: absolute; inset: -3px 0 auto; width: 100%; height: 12px; pointer-events: none; }
+.happened { color: var(--force); font-weight: 600; }
 .amplitude { display: flex; align-items: center; gap: 6px; font-size: 13px; color: var(--soft); }
 .amplitude input { width: 96px; }
 .help { position: absolute; inset: 0; display: grid; place-items: center; background: color-mix(in srgb, var(--back) 72%, transparent); z-index: 2; }
@@ -518,6 +521,32 @@ function keepKeys(root, focused) {
     focused.focus({preventScroll: true, focusVisible: false});
   });
 }
+const THUMB = 8, TICK = 7;  // px: half of the slider's thumb, which is at the ends at the first and the last time; a tick's height
+const SAID = 0.04;  // of the timeline: how long one reads which event has happened
+class EventMarks {
+  constructor(player) {
+    this.player = player;
+    this.canvas = make("canvas", {class: "ticks", "aria-hidden": "true"});
+    this.element = make("div", {class: "line"}, player.scrub, this.canvas);
+  }
+  draw() {
+    const {runs, panels, data: {start, end}, theme, t} = this.player, {context, width, height} = contextOf(this.canvas);
+    runs.forEach((run, k) => {
+      context.beginPath();
+      for (const event of run.events) {
+        const x = THUMB + (width - 2 * THUMB) * (event.t - start) / (end - start || 1);
+        context.moveTo(x, height - TICK);
+        context.lineTo(x, height);
+      }
+      context.lineWidth = 2;
+      context.strokeStyle = runs.length > 1 ? theme.bodies[k % theme.bodies.length] : theme.force;
+      context.stroke();
+      const last = run.events.findLast(event => event.t <= t && event.t >= t - SAID * (end - start));
+      const words = last ? `${last.name}, ${+last.t.toPrecision(5)} s` : "";
+      if (panels[k].happened.textContent !== words) panels[k].happened.textContent = words;
+    });
+  }
+}
 /** Drag moves the view, or pulls at the body that is there, where the canvas shows the run of a live page;
  *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
 function followPointers(player, canvas, liveRun) {
@@ -569,8 +598,69 @@ function followPointers(player, canvas, liveRun) {
     player.draw();
   }, {passive: false});
 }
+/** The conditions at a state: each one's side of zero, 0 at zero, and its scale, what a displacement of a length or a turn of a
+ *  radian changes in it, which never becomes smaller than `before`. */
+function look(engine, numbers, rate, state, before) {
+  const {data: {events}, size: n} = engine, scales = [], sides = [];
+  engine.conditions(numbers, state).forEach(([g, ...slopes], k) => {
+    const sizes = [Math.max(1 / rate, Math.abs(state.t)), ...[...state.q].map((x, i) => Math.max(engine.unit(i), Math.abs(x))),
+      ...[...state.v].map((x, i) => Math.max(engine.unit(i) * rate, Math.abs(x)))];
+    scales[k] = slopes.slice(0, 1 + 2 * n).reduce((most, slope, i) => Math.max(most, Math.abs(slope * sizes[i]) || 0), before?.scales[k] ?? 0);
+    sides[k] = Number.isFinite(g) ? (Math.abs(g) > events.zero * scales[k] ? Math.sign(g) : 0) : NaN;
+  });
+  return {scales, sides};
+}
+/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. */
+function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
+  const {data: {events, count, knots, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
+  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: [],
+    steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
+  let at = {...state, t: ts[0]}, watch = state.watch ?? look(engine, numbers, settings.omega, at, null);
+  const put = (row, q, v, violation) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = violation; };
+  const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch}, marks: at.marks, ...more});
+  let violation = 0, first = 0;
+  for (;;) {
+    while (first < T && ts[first] <= at.t) put(first++, at.q, at.v, violation);
+    found.count = first;
+    const undefined_ = watch.sides.findIndex(side => Number.isNaN(side));
+    if (undefined_ >= 0) return finish(`the condition of ${events.names[undefined_]} is not a number`);
+    if (end - at.t <= 2 * settings.smallest) {
+      while (first < T) put(first++, at.q, at.v, violation);
+      return finish("", {done: true, count: T});
+    }
+    const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => events.zero * x);
+    const given = [...numbers.subarray(count + knots), ...watch.sides, ...Array(E).fill(1), ...floors, ...events.directions, events.slowest];
+    const part = engine.piece(numbers, settings, at, times, limit - found.tried, given), {crossing} = part, [event, sure, worst] = crossing;
+    const sides = [...crossing.subarray(events.head, events.head + E)];
+    found.steps += part.steps;
+    found.tried += part.tried;
+    for (let k = 1; k < part.count && times[k] <= sure; k++) {
+      put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
+      found.count = ++first;
+    }
+    at = {t: sure, q: crossing.slice(-2 * n, -n), v: crossing.slice(-n), marks: part.marks};
+    violation = worst;
+    if (!(worst <= driftTol)) return finish("the loops do not stay closed");
+    watch = look(engine, numbers, settings.omega, at, watch);
+    watch.sides = watch.sides.map((side, k) => (k === event ? -sides[k] : side || (Number.isNaN(side) ? NaN : sides[k])));
+    if (event < 0) {
+      if (part.done) continue;
+      return finish(part.words, {limited: part.limited});
+    }
+    found.events.push({t: at.t, index: event, q: at.q, v: at.v});
+    if (events.stops[event] && stops) {
+      if (first < T && ts[first - 1] < at.t) {
+        ts[first] = at.t;
+        put(first++, at.q, at.v, violation);
+      }
+      return finish("", {stop: events.names[event], count: first});
+    }
+    if (found.events.length >= events.most) return finish(`more than ${events.most} events`);
+  }
+}
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
-const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed"};
+const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed",
+  7: "the condition of an event varies too quickly"};
 const EPS = 2 ** -52;
 const numbersOf = text => new Float64Array(bytesOf(text).buffer);
 const largest = (x, unit) => x.reduce((most, value, k) => Math.max(most, Math.abs(value) / unit(k)), 0);
@@ -641,7 +731,7 @@ class Engine {
     module.exports.numbers(given, to);
     return module.view(to, this.base.length).slice();
   }
-  breaks(numbers) { return numbers.slice(this.data.count).sort(); }
+  breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
    *  that hold at a time. */
   dressed(numbers, thresholds, t, marks = null) {
@@ -676,10 +766,11 @@ class Engine {
     return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
   }
   /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
-  mark(parameters, {t, q, v}) {
+  mark(parameters, state) { return this.markRows(this.numbers(parameters), state); }
+  markRows(numbers, {t, q, v}) {
     const {data} = this;
     if (!data.marks) return null;
-    const given = this.dressed(this.numbers(parameters), data.closing.thresholds, t);
+    const given = this.dressed(numbers, data.closing.thresholds, t);
     const settings = [data.scales.length, Math.max(data.scales.rate, largest(v, this.unit))];
     const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
@@ -687,30 +778,44 @@ class Engine {
   /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
    *
    *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
-   *  that of the ground (m), stiffness (N/m) and damping (N s/m).
+   *  that of the ground (m), stiffness (N/m) and damping (N s/m). While it pulls no event stops the motion.
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
-   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; and its `marks`.
+   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
+   *  `events`, a list of {t, index, q, v}. Where one stops it, `stop` is its name, and the last time that of the event.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
-    const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
+    const {data} = this, numbers = this.numbers(parameters), T = times.length;
     if (data.why) throw new Error(data.why);
     if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
-    const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
-    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
-    const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega, max_steps: limit});
-    const marks = state.marks ?? this.mark(parameters, {t: times[0], ...state});
-    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0], marks), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
-      samples: this.samples};
+    const end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1])), smallest = data.smallest * EPS * end;
+    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0])), settings = {...data.settings, smallest, omega};
+    if (data.events) return runWithEvents(this, numbers, settings, state, Float64Array.from(times), !pull, limit);
+    return {...this.piece(numbers, settings, state, Float64Array.from(times), limit), events: []};
+  }
+  /** Integrate from a state over times; with conditions to `watch`, up to the first that crosses zero, which is in `crossing`. */
+  piece(numbers, settings, state, ts, limit, watch = []) {
+    const {data, size} = this, T = ts.length, breaks = this.breaks(numbers), marks = state.marks ?? this.markRows(numbers, {t: ts[0], ...state});
+    const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
+      settings: Object.values({...settings, max_steps: limit}), rows: data.rows, breaks, samples: this.samples, watch};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
+    if (data.events) results.crossing = data.events.head + data.events.names.length + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
     const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
-    if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
+    if (drifted >= 0) { done = false; count = drifted; words = UNFINISHED[5]; }
     const limited = ended.code === 2, last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
-    return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
-      steps: ended.accepted, tried: ended.tried, limited, last, marks};
+    return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t, code: ended.code,
+      steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
+  }
+  /** The conditions of events at a state, each followed by its derivatives by t, q and v. */
+  conditions(numbers, {t, q, v}) {
+    const module = this.instances.evaluate, {count, knots, events} = this.data, each = 2 + 2 * this.size;
+    module.begin();
+    const given = module.put([t, ...q, ...v, ...numbers.subarray(count + knots)]), to = module.reserve(8 * each * events.names.length);
+    module.exports.conditions(given, to);
+    return Array.from(events.names, (_, k) => module.view(to + 8 * k * each, each).slice());
   }
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
    *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
@@ -810,8 +915,8 @@ class Hand {
     const pull = {body: held.body, point: held.point, target, ...spring};
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
     if (!run.done) return live.live.say(`the pull is too much: ${run.words}`, true);
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks};
-    live.append(this.state, run.violation[1]);
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch};
+    live.append(this.state, run.violation[1], run.events);
     return null;
   }
   move(target) { this.target = target; }
@@ -914,6 +1019,7 @@ const LIVE_STYLE = `
 .live .slider input[type="range"] { grid-column: 1 / -1; width: 100%; height: 24px; }
 .live input[type="number"] { font: inherit; font-variant-numeric: tabular-nums; width: 100%; height: 26px; padding: 0 4px; text-align: right;
   color: var(--ink); background: var(--back); border: 1px solid var(--line); border-radius: 5px; appearance: textfield; }
+.live input::-webkit-inner-spin-button { appearance: none; margin: 0; }
 .live :disabled { opacity: 0.5; cursor: default; }
 .narrow .middle { flex-direction: column; }
 .narrow .live { width: auto; border-left: 0; border-top: 1px solid var(--line); max-height: 40%; }
@@ -958,12 +1064,13 @@ const GHOST = 0.28;  // how much one sees of the first motion
 const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
 const STEP_BYTES = 4e7;
 const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
+const endOf = run => (run.stop ? `${run.stop} stops it` : run.words);
 class LiveRun {
   /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
   constructor(live, run, record, data) {
-    const {ts, q, v, measures, frame, reactions, forces} = run;
-    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces}});
-    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed
+    const {ts, q, v, measures, frame, reactions, forces, events} = run;
+    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events}});
+    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed, or stopped
     this.follower = new Follower(run, data.follow);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
   }
@@ -987,9 +1094,9 @@ class LiveRun {
   }
   lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
   reset() {
-    const {ts, q, v, measures, frame, reactions, forces} = this.first;
+    const {ts, q, v, measures, frame, reactions, forces, events} = this.first;
     this.drop();
-    this.run.replace(ts, q, v, measures, frame);
+    this.run.replace(ts, q, v, measures, frame, events);
     this.showReactions(reactions, forces);
     this.follower.follow(this.engine.numbers(null));
     this.changed = false;
@@ -999,7 +1106,7 @@ class LiveRun {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
     if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
-    const run = {ts: times, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
     this.follower.follow(engine.numbers(values));
     return "";
@@ -1009,21 +1116,24 @@ class LiveRun {
     const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
     const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
     const part = engine.run(values, job.state, times, null, Math.min(this.steps, most - job.tried));
-    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = run.ts[run.ts.length - 1] - run.ts[0];
+    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = this.times[this.times.length - 1] - run.ts[0];
+    run.ts.set(part.ts.subarray(skip, skip + count), from);
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
     run.count = job.from = from + count;
+    run.events.push(...part.events);
     job.steps += part.steps;
     job.tried += part.tried;
     job.state = part.last;
     this.show(run);
     if (part.limited && job.tried < most) return {words: `Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
     this.job = null;
-    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
+    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${endOf(part)}.`;
     const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
-    return {words, bad: !part.done};
+    return {words, bad: !part.done && !part.stop};
   }
   drop() {
     this.job = null;
@@ -1035,10 +1145,12 @@ class LiveRun {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
-    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1);
+    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1, this.named(run.events));
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
+  /** Events as they are shown: {t, name}. */
+  named(events) { return events.map(({t, index}) => ({t, name: this.engine.data.events.names[index]})); }
   /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
   reactions(forces) {
     const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
@@ -1100,12 +1212,14 @@ class LiveRun {
     const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
     this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
       violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+    this.happened = this.run.events.filter(({t}) => t <= state.t);
     this.marks = state.marks ??= this.engine.mark(this.values, state);
-    this.append(state, state.violation);
+    this.append(state, state.violation, []);
   }
-  /** Add one state to the record, and show it. */
-  append({t, q, v}, violation) {
+  /** Add one state to the record, and the events before it, and show it. */
+  append({t, q, v}, violation, events) {
     const {past} = this;
+    this.happened.push(...this.named(events));
     past.ts.push(t);
     past.q.push(...q);
     past.v.push(...v);
@@ -1117,7 +1231,8 @@ class LiveRun {
   }
   showPast() {
     const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
-    this.show({...run, count: run.ts.length});
+    this.show({...run, count: run.ts.length, events: []});
+    this.run.events = this.happened;
   }
   /** Solve on from where the hand lets go, for as long as the first motion is. */
   letGo(state) {
@@ -1129,9 +1244,11 @@ class LiveRun {
       past.v.push(...run.v.subarray(k * n, (k + 1) * n));
       past.violation.push(run.violation[k]);
     }
+    this.happened.push(...this.named(run.events));
     this.showPast();
     this.player.setEnd(this.live.end);
-    this.live.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
+    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${endOf(run)}.`;
+    this.live.say(run.done ? "Let go: the motion goes on by itself." : ended, !run.done && !run.stop);
     this.player.play();
   }
   paintGhost(painter, context, t) {
@@ -1301,7 +1418,8 @@ class Player {
     const middle = this.live ? make("div", {class: "middle"}, this.stage, this.live.panel.element) : this.stage;
     this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
       make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
-    const groups = [this.playButton, this.timeLabel, this.scrub, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
+    this.eventMarks = new EventMarks(this);
+    const groups = [this.playButton, this.timeLabel, this.eventMarks.element, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
       ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button))];
     if (this.modes) {
       const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
@@ -1324,10 +1442,9 @@ class Player {
   }
   panel(run, k) {
     const canvas = make("canvas", {role: "img", tabindex: 0, "aria-label": `${this.data.title} ${run.label}: motion`});
-    const caption = make("figcaption");
-    if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
-    if (run.note) caption.append(" ", run.note);
-    const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
+    const note = make("span", {}, run.note ? ` ${run.note}` : ""), happened = make("div", {class: "happened"});
+    const caption = make("figcaption", {}, ...(this.runs.length > 1 || this.modes ? [make("b", {}, run.label)] : []), note, happened);
+    const panel = {run, canvas, note, happened, figure: make("figure", {class: "panel"}, canvas, caption)};
     followPointers(this, canvas, () => this.live?.runs[k]);
     return panel;
   }
@@ -1483,8 +1600,9 @@ class Player {
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
-    this.panels.forEach(({run, canvas}, k) => {
+    this.panels.forEach(({run, canvas, note}, k) => {
       const live = this.live?.runs[k];
+      note.hidden = Boolean(live?.changed);  // it is of the first motion
       const {context, width, height} = contextOf(canvas);
       if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
@@ -1501,6 +1619,7 @@ class Player {
       const {context, width, height} = contextOf(this.stripCanvas);
       drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);
     }
+    this.eventMarks.draw();
     const span = data.end - data.start;
     this.scrub.value = span > 0 ? Math.round(10000 * (t - data.start) / span) : 0;
     const digits = clamp(3 - Math.floor(Math.log10(span || 1)), 0, 9), of = x => x.toFixed(digits);

@@ -115,3 +115,32 @@ def test_a_pull_is_a_spring_to_a_place_and_a_damper():
     expected = 1.0 - np.exp(-decay * ts) * (np.cos(rate * ts) + decay / rate * np.sin(rate * ts))
     assert_allclose(udk.simulate(held, ts, rtol=1e-10, atol=1e-10).q[:, 0, 0], expected, atol=1e-8)
     assert_array_equal(udk.simulate(with_pulls(mechanism), ts).q, udk.simulate(mechanism, ts).q)
+
+
+def test_numbers_of_conditions_follow_those_of_the_mechanism():
+    """The axis of a slide is a number of the scene, and of a condition that looks along it."""
+    from udkjax.integrate.events.condition_program import condition_numbers
+    from udkjax.integrate.events.conditions import WithinLimit, joint_coordinate
+    from udkjax.scene.fields import number
+
+    class Passes:
+        def expand(self, mechanism):
+            slide = joint_coordinate(mechanism, "slide", "a test")
+            return [udk.Event(WithinLimit(slide, number(1.3), number(1.0)), udk.Log(), name="passes")]
+
+    axis = "joint.slide.axis"
+    mechanism = udk.Mechanism(
+        {"block": udk.Body(1.0, 0.1)},
+        {"slide": udk.Prismatic(("ground", "block"), [(0.0, 0.0), (0.0, 0.0)], axis=0.2)},
+    )
+    engine = portable_engine(mechanism, [axis], events=[Passes()])
+    numbers = engine.numbers([0.7])[engine.numbers.count + engine.numbers.knots :]
+    changed = Passes().expand(mechanism.with_parameters({axis: 0.7}))
+    assert_array_equal(numbers, np.concatenate([np.ravel(x) for x in condition_numbers(changed)]))
+    assert 0.7 in numbers and 0.2 not in numbers
+
+
+def test_what_a_page_cannot_look_at_is_named():
+    ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))})
+    with pytest.raises(ValueError, match='a page knows Log and Stop, and event "ball on ground" has Impact'):
+        portable_engine(ball, events=[udk.Contact("ball")])

@@ -27,8 +27,8 @@ def both(operation, inputs, times):
     return host.run(made.module, inputs, shapes), run_without_contraction(made.module, inputs, shapes)
 
 
-def known_call(monkeypatch, module, do):
-    """The operation and the inputs with which `do()` calls machine code, by way of a module of the package."""
+def known_call(monkeypatch, module, do, which=0):
+    """The operation and the inputs with which `do()` first calls machine code, by way of a module of the package."""
     seen = []
 
     def call(operation, inputs, times):
@@ -37,7 +37,7 @@ def known_call(monkeypatch, module, do):
 
     monkeypatch.setattr(module, "call_known", call)
     do()
-    return seen[0]
+    return seen[which]
 
 
 @every_scene
@@ -53,6 +53,27 @@ def test_a_run(monkeypatch, name):
     # And the motion itself is that of the engine on this processor, within what the tolerance leaves open.
     length = float(analyse(mechanism).length)
     assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(TIMES), -1)[1:-1], rtol=0, atol=1e-6 * max(length, 1.0))
+
+
+@every_scene
+def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
+    mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
+    body, path = mechanism.body_names[0], np.asarray(udk.simulate(mechanism, ts).q)[:, 0]
+    k = int(np.argmax(np.ptp(path, axis=0)))
+    middle, coordinate = float(path[:, k].min() + path[:, k].max()) / 2, ("x", "y", "angle")[k]
+    event = udk.Event(lambda t, at: getattr(at[body], coordinate) - middle, udk.Stop())
+    found = []
+    operation, inputs, times = known_call(
+        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, ts, events=[event])), which=-1
+    )
+    assert isinstance(operation, operations.RunWatched)
+    wasm, native = both(operation, inputs, times)
+    for x, y in zip(wasm, native, strict=True):
+        assert_array_equal(x, y)
+    events = found[0].events
+    crossing, t = wasm[-1][0], float(events.time[0])
+    assert crossing[0] == 0.0 and crossing[1] == pytest.approx(t, rel=1e-7)  # rounding, and what the tolerance makes of it
+    assert crossing[4 + k] == pytest.approx(middle, abs=1e-9)  # behind three numbers and one side: q
 
 
 @every_scene

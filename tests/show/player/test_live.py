@@ -1,8 +1,5 @@
 """Live pages as data: sliders, what follows them, and what cannot be live."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -127,9 +124,31 @@ def test_what_cannot_be_live_says_why(slider_crank, run):
     unstable = udk.simulate(slider_crank, np.linspace(0.0, 0.1, 3), stabilization=None, drift_tol=1.0)
     with pytest.raises(ValueError, match="solves by projection, and the run has stabilization=NoneType"):
         udk.animate(slider_crank, unstable, live=True)
-    with_events: Any = SimpleNamespace(ts=run.ts, q=run.q, v=run.v, events=object())
-    with pytest.raises(ValueError, match="events cannot be solved anew"):
-        udk.animate(slider_crank, with_events, live=True)
+
+
+def test_the_events_of_a_live_run_are_those_of_its_simulation(slider_crank):
+    passes = udk.Event(lambda t, at: at["slider"].x - 1.3, udk.Log(), name="passes")
+    with_events = udk.simulate(slider_crank, np.linspace(0.0, 1.0, 21), events=passes)
+    with pytest.raises(ValueError, match="the run has events, whose conditions a page needs: give `animate` the same"):
+        udk.animate(slider_crank, with_events, live=["gravity"])
+    without = udk.simulate(slider_crank, np.linspace(0.0, 1.0, 21))
+    with pytest.raises(ValueError, match="was not simulated with the events passes"):
+        udk.animate(slider_crank, without, live=["gravity"], events=[passes])
+    with pytest.raises(ValueError, match="only a live page"):
+        udk.animate(slider_crank, with_events, events=passes)
+    shown, happened = udk.animate(slider_crank, with_events).data["runs"][0]["events"], with_events.events
+    assert happened is not None and len(happened.time) > 0
+    assert [event["name"] for event in shown] == ["passes"] * len(happened.time)
+    np.testing.assert_array_equal([event["t"] for event in shown], happened.time)
+    assert udk.animate(slider_crank, without).data["runs"][0]["events"] == []
+
+
+def test_ten_seconds_with_events_are_simulated_where_no_run_is_given():
+    pendulum = udk.library.simple_pendulum()
+    body = pendulum.body_names[0]
+    animation = udk.animate(pendulum, live=["gravity[1]"], events=udk.Event(lambda t, at: at[body].x, udk.Log(), name="bottom"))
+    assert {event["name"] for event in animation.data["runs"][0]["events"]} == {"bottom"}
+    assert animation.data["live"]["engines"][0]["events"]["names"] == ["bottom"]
 
 
 def test_pins_that_must_stay_in_line_have_no_sliders_unless_named():

@@ -64,6 +64,11 @@ def shown_q(page):
     return np.array(page.evaluate(f"[...{LIVE}.runs[0].run.q]")).reshape(len(page.evaluate(f"[...{LIVE}.runs[0].run.ts]")), -1)
 
 
+def events_of(run):
+    assert run.events is not None
+    return run.events
+
+
 def measure(page, name):
     return np.array(page.evaluate(f"[...{LIVE}.runs[0].run.measures.find(m => m.name === {name!r}).values]"))
 
@@ -150,6 +155,96 @@ def test_forces_that_redundant_joints_share_are_not_shown_of_a_new_motion(opened
         assert button.is_enabled()
         page.evaluate(f"{LIVE}.change({{'gravity[1]': -5}})")
         assert button.is_disabled() and page.evaluate(f"{LIVE}.runs[0].run.reactions") is None
+
+
+@pytest.fixture(scope="module")
+def with_events(slider_crank):
+    """Two conditions, the second of which stops the motion, and its page."""
+    passes = udk.Event(lambda t, at: at["slider"].x - 1.3, udk.Log(), name="passes")
+    turned = udk.Event(lambda t, at: at["crank"].angle - 6.0, udk.Stop(), 1, name="turned")
+    events = [passes, turned]
+    run = udk.simulate(slider_crank, TS, events=events, rtol=1e-11, atol=1e-11)
+    return events, udk.animate(slider_crank, run, live=["motor.motor.speed", "pin.P[0]", "gravity"], events=events)
+
+
+def test_events_happen_at_new_times_while_a_slider_moves(opened, with_events, slider_crank):
+    events, animation = with_events
+    happened = f"{LIVE}.runs[0].run.events"
+    with opened(animation) as page:
+        first = page.evaluate(happened)
+        show_all(page)
+        for speed, p, count in ((5.0, 0.45, 3), (2.0, 0.4, 1), (-9.0, 0.55, 5)):
+            move(page, "motor speed", speed)
+            move(page, "P x", p)
+            other = slider_crank.with_parameters({"motor.motor.speed": speed, "pin.P[0]": p})
+            run = udk.simulate(other, TS, events=events, rtol=1e-11, atol=1e-11)
+            shown, expected = page.evaluate(happened), events_of(run)
+            assert [event["name"] for event in shown] == [expected.names[k] for k in expected.index]
+            assert len(shown) >= count
+            assert_allclose([event["t"] for event in shown], expected.time, rtol=0, atol=1e-9)
+            alive = np.isfinite(run.q).all((1, 2))
+            q = np.asarray(run.q)[alive].reshape(alive.sum(), -1)
+            if not alive.all():  # the page shows the state at the event, too
+                assert "turned stops it" in note(page) and page.locator(".note.bad").count() == 0
+                q = np.vstack([q, np.ravel(expected.q_before[-1])])
+            else:
+                assert f"{len(shown)} event" in note(page)
+            assert_allclose(shown_q(page), q, rtol=0, atol=1e-8)
+        page.locator(".panel canvas").press("Backspace")
+        assert page.evaluate(happened) == first
+
+
+def test_events_are_marked_on_the_timeline(opened, with_events):
+    """In the player of a recorded run as well; and who comes by one reads its name."""
+    _, animation = with_events
+    with opened(animation) as page:
+        plain(page)
+        ticks = page.locator(".ticks").bounding_box()
+        t, end = page.evaluate(f"[{LIVE}.runs[0].run.events[0].t, {PLAYER}.live.player.data.end]")
+        seen = picture(page)[round(ticks["y"]) : round(ticks["y"] + ticks["height"]), :]
+        colour = page.evaluate(f"{LIVE}.player.theme.force")
+        force = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+        columns = np.flatnonzero((np.abs(seen - force).max(axis=2) < 40).any(axis=0))
+        assert np.abs(columns - (ticks["x"] + 8 + (ticks["width"] - 16) * t / end)).min() < 1.5
+        page.evaluate(f"{PLAYER}.seek({t + 0.01 * end})")
+        assert page.locator(".happened").text_content() == f"passes, {t:.5g} s"
+        page.evaluate(f"{PLAYER}.seek({t - 0.01 * end})")
+        assert page.locator(".happened").text_content() == ""
+
+
+def test_conditions_that_cross_zero_together_are_all_noted(opened):
+    """And one that is zero at the start, and rises: it does not cross."""
+    pendulum = udk.library.simple_pendulum()
+    body, start = pendulum.body_names[0], float(pendulum.q0[0, 2])
+    conditions = {
+        "left": lambda t, at: at[body].x,
+        "again": lambda t, at: -2 * at[body].x,
+        "start": lambda t, at: at[body].angle - start,
+    }
+    events = [udk.Event(condition, udk.Log(), name=name) for name, condition in conditions.items()]
+    run = udk.simulate(pendulum, TS, events=events, rtol=1e-11, atol=1e-11)
+    with opened(udk.animate(pendulum, run, live=["gravity[1]"], events=events)) as page:
+        move(page, "gravity y", -7.0)
+        other = pendulum.with_parameters({"gravity[1]": -7.0})
+        expected = events_of(udk.simulate(other, TS, events=events, rtol=1e-11, atol=1e-11))
+        shown = page.evaluate(f"{LIVE}.runs[0].run.events")
+        assert sorted((e["name"], round(e["t"], 7)) for e in shown) == sorted(
+            (expected.names[k], round(float(t), 7)) for t, k in zip(expected.time, expected.index, strict=True)
+        )
+        assert_allclose([e["t"] for e in shown], expected.time, rtol=0, atol=1e-9)
+
+
+def test_a_hand_comes_by_events_and_is_not_stopped(opened, with_events):
+    _, animation = with_events
+    with opened(animation) as page:
+        page.evaluate(f"{PLAYER}.seek(1.4)")
+        happened, before = f"{LIVE}.runs[0].run.events", page.evaluate(f"{LIVE}.runs[0].run.events.length")
+        q = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.pose(1.4)]")).reshape(-1, 3)
+        place = on_screen(page, 0, q[2, :2])
+        drag(page, place, (place[0] + 4, place[1] - 40), hold=1200)
+        until(page, f"{PLAYER}.time > 1.7")  # beyond the event that stops
+        assert page.evaluate(happened)[-1]["name"] == "turned" and page.evaluate(f"{happened}.length") == before
+        page.mouse.up()
 
 
 def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):

@@ -5,7 +5,11 @@
 format       1
 bodies       names; a state is q and v, x, y (m), angle (rad) of each body in turn, and their rates
 parameters   a list of {name, unit, value}: numbers of the scene that may change, in the order in which they are given
-numbers      base64 of float64: all numbers of the scene, `count` of them, and then the times (s) where its motion is not smooth
+numbers      base64 of float64: all numbers of the scene, `count` of them, then the times (s) where its motion is not smooth,
+             `knots` of them, and the numbers of the conditions of events
+events       {names, directions: in which zeros count, 0 for either, stops: whether each ends the run, slowest: rate of the scene
+             (1/s), zero: of a condition's scale, below which it is zero, most: how many may happen, head: how many numbers a run
+             tells before the sides of conditions}, or null
 thresholds   of pivots, which a run takes behind the numbers; of closing, those in `closing`
 closing      {thresholds, settings, tol and rounding: what counts as closed (equations/position_closure.py)}
 guess        {q, v}: places in `numbers` of the initial guess

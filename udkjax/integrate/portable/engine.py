@@ -15,8 +15,10 @@ from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import compile_known
+from udkjax.integrate.events.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
+from udkjax.integrate.portable.portable_events import PortableEvents
 from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
@@ -58,6 +60,7 @@ def portable_engine(
     atol: float = 1e-8,
     pull: bool = True,
     runs: bool = True,
+    events: Sequence[ExpandsToEvents] = (),
 ) -> PortableEngine:
     """Compile the engine of a mechanism for pages.
 
@@ -68,26 +71,32 @@ def portable_engine(
         atol: tolerance of runs, relative to the mechanism's scales, as in `simulate`.
         pull: whether a hand may pull bodies: each gets a spring, without stiffness until it does.
         runs: whether it integrates motions; without them it closes positions and evaluates energies, and is compiled faster.
+        events: of its runs, as `simulate` takes them.
 
     Returns:
         The `PortableEngine`.
 
     Raises:
         SceneError: a parameter is unknown.
-        UnsupportedError: a scene, or how its numbers follow from a parameter, takes what machine code has no instruction for.
+        ArgumentError: an event changes the motion.
+        UnsupportedError: a scene, the condition of an event, or how numbers follow from a parameter, takes what machine code has
+            no instruction for.
     """
     values = scalar_parameters(mechanism, parameters)
     dress: Callable[[Mechanism], Mechanism] = with_pulls if pull else lambda given: given.without_origin
     dressed, analysis = dress(mechanism), analyse(mechanism)
     if _may_move_by_redundancy(mechanism, analysis):
         analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page finds them
-    numbers = NumberProgram(mechanism, values, dress)
+    watched = PortableEvents(events, mechanism)
+    numbers = NumberProgram(mechanism, values, dress, watched.numbers)
     data: Json = {
         "format": 1,
         "bodies": list(mechanism.body_names),
         "parameters": [{"name": name, "unit": units_of(mechanism, name), "value": x} for name, x in values.items()],
         "numbers": floats(numbers.base),
         "count": numbers.count,
+        "knots": numbers.knots,
+        "events": watched.data(analysis),
         "marks": len(analysis.scales.rows) if analysis.redundant_rows is None else 0,
         "sampled": [],
         "samples": "",
@@ -102,10 +111,10 @@ def portable_engine(
     if data["marks"]:
         modules["mark"] = _operation(MarkRows(scene_programs(dressed).with_all_rows))
     if runs and not data["why"]:
-        modules["run"] = _run(problem, data)
-        if data["sampled"] and any(k >= numbers.count for k in numbers.changing):
+        modules["run"] = _run(problem, data, watched)
+        if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
-    modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
+    modules["evaluate"] = _evaluation(dressed, analysis, numbers, data, watched)
     return PortableEngine(data | {"modules": modules}, numbers, dressed)
 
 
@@ -157,7 +166,7 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
     return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))
 
 
-def _run(problem: Problem, data: Json) -> Json:
+def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
     """Return the module of runs; what it takes goes into the data."""
     operation, inputs = packed(problem)
     given = dict(zip(INPUTS, inputs, strict=False))
@@ -170,7 +179,7 @@ def _run(problem: Problem, data: Json) -> Json:
         "sampled": list(operation.sampled),
         "samples": floats(inputs[len(INPUTS)][0]) if operation.sampled else "",
     }
-    return _operation(operation)
+    return _operation(events.watched_by(operation))
 
 
 def _close(mechanism: Mechanism, data: Json) -> Json:
@@ -181,16 +190,17 @@ def _close(mechanism: Mechanism, data: Json) -> Json:
     return _operation(Close(scene_programs(mechanism).with_all_rows))
 
 
-def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json) -> Json:
+def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json, events: PortableEvents) -> Json:
     """Return the module of evaluations; which efforts it finds goes into the data."""
     code = scene_programs(mechanism, analysis.redundant_rows)
-    evaluation = Evaluation(code, [numbers.function()])
+    further = [numbers.function(), *events.functions()]
+    evaluation = Evaluation(code, further)
     data["efforts"] = [
         {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", **places}
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
     data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
-    linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
+    linked = compile_wasm(evaluation.text(), (*(f.name for f in further), *evaluation.exports))
     return _module(linked, places=evaluation.places, size=evaluation.size)
 
 

@@ -51,23 +51,41 @@ def independent_parameters(mechanism: Mechanism) -> list[str]:
 
 
 class NumberProgram:
-    """The numbers of a mechanism's equations as a function of some parameters, with the times of its breakpoints behind them.
+    """The numbers of a mechanism's equations as a function of some parameters; behind them its breakpoints and further numbers.
 
     Attributes:
-        base: all numbers and the breakpoints as they are.
+        base: all of them as they are.
         changing: which of these depend on the parameters.
         count: how many numbers there are before the breakpoints.
+        knots: how many breakpoints there are.
     """
 
-    def __init__(self, mechanism: Mechanism, values: Mapping[str, float], dress: Callable[[Mechanism], Mechanism]):
-        """Trace it; `dress` makes, of the mechanism with parameters in, the one that is simulated."""
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        values: Mapping[str, float],
+        dress: Callable[[Mechanism], Mechanism],
+        further: Callable[[Mechanism], Sequence[Array | np.ndarray]] = lambda mechanism: (),
+    ):
+        """Trace it.
+
+        Args:
+            mechanism: the scene.
+            values: the parameters, as they are.
+            dress: makes, of the mechanism with parameters in, the one that is simulated.
+            further: numbers besides that follow from the mechanism with parameters in.
+        """
+
+        def parts(given: Mechanism) -> list[Array | np.ndarray]:
+            return [*_numbers(dress(given)), numbers_as_vector(further(given))]
 
         def numbers(p: Array) -> Array:
-            given = dress(mechanism.with_parameters({name: p[k] for k, name in enumerate(values)}))
-            return jnp.concatenate([jnp.asarray(x, float) for x in _numbers(given)])
+            given = mechanism.with_parameters({name: p[k] for k, name in enumerate(values)})
+            return jnp.concatenate([jnp.asarray(x, float) for x in parts(given)])
 
-        self.base = np.concatenate(_numbers(dress(mechanism)))
-        self.count = len(_numbers(dress(mechanism))[0])
+        known = parts(mechanism)
+        self.base = np.concatenate(known)
+        self.count, self.knots = (len(x) for x in known[:2])
         graph = Graph(np.float64)
         inputs = [graph.input(k, "parameter") for k in range(len(values))]
         outputs: list[Scalar] = []
@@ -85,7 +103,7 @@ class NumberProgram:
         return write(self._program, "numbers", 1, ("parameters", "numbers"), inputs, outputs)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
-        """Return all numbers and the breakpoints, by NumPy."""
+        """Return all numbers, by NumPy."""
         found = self.base.copy()
         found[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
         return found

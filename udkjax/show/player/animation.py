@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from udkjax.integrate.events.event import ExpandsToEvents
 from udkjax.integrate.simulate import simulate
 from udkjax.scene import Mechanism
 from udkjax.scene.arguments import checked, require_mechanism
@@ -127,6 +128,7 @@ def animate(
     shapes: Shapes | None = None,
     title: str | None = None,
     live: Live = False,
+    events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),
 ) -> Animation:
     """Show the motion of a mechanism, or several motions side by side and in step.
 
@@ -147,6 +149,8 @@ def animate(
             takes every number of the scene. Of several runs a slider changes all that have its number. By default ten
             seconds. Its measures are violation, energy and effort,
             which the page finds anew, behind those of your own, which it shows of the first motion alone; "rank" is none.
+        events: of live runs, as `simulate` took them: the page finds anew when each happens. Those that note or stop (`Log`,
+            `Stop`), since no other action is a program yet.
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
@@ -155,8 +159,11 @@ def animate(
     Raises:
         ValueError: a batch, a name that is not known, a run without any state, or one that cannot be live.
     """
+    events = tuple(events) if isinstance(events, Sequence) else (events,)
+    if events and not live:
+        raise ValueError("events: only a live page solves them anew, and shows of others what the solution has: leave them out")
     if live:
-        solution, measures = _live_runs(mechanism, solution, measures)
+        solution, measures = _live_runs(mechanism, solution, measures, events)
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
@@ -172,7 +179,7 @@ def animate(
     data = player_data(title or found[0][0].name or "mechanism", found)
     if live:
         shown: Any = [(one, run, record) for (one, *_), run, record in zip(found, runs.values(), data["runs"], strict=True)]
-        data["live"] = live_data(shown, live)
+        data["live"] = live_data(shown, live, events)
     return Animation(data, failures)
 
 
@@ -180,13 +187,14 @@ def _live_runs(
     mechanism: Mechanism | Mapping[str, Mechanism],
     solution: ShownMotion | Mapping[str, ShownMotion] | None,
     measures: Measures,
+    events: Sequence[ExpandsToEvents],
 ) -> tuple[ShownMotion | Mapping[str, ShownMotion], Measures]:
     """Return the runs and the measures of a live page."""
     mechanisms = [require_mechanism(m) for m in (mechanism.values() if isinstance(mechanism, Mapping) else [mechanism])]
     runs: Any = solution
     if runs is None:
         ts = np.linspace(0.0, LIVE_SECONDS, LIVE_INSTANTS)
-        found = [simulate(one, ts, throw=False) for one in mechanisms]
+        found = [simulate(one, ts, throw=False, events=events or None) for one in mechanisms]
         runs = dict(zip(mechanism, found, strict=True)) if isinstance(mechanism, Mapping) else found[0]
     given: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
     efforts = ["effort"] if any(one.driver_names for one in mechanisms) else []

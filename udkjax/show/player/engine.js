@@ -5,16 +5,18 @@
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
 //   engine.mark(parameters, state)             -> a number for each row of Psi, one where it is independent near a state; or null
-//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, last: {t, q, v}}
+//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, events, last}
 //   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
 // of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
 
+import {runWithEvents} from "./events.js";
 import {bytesOf} from "./motion.js";
 
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
-const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed"};
+const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed",
+  7: "the condition of an event varies too quickly"};
 const EPS = 2 ** -52;
 
 const numbersOf = text => new Float64Array(bytesOf(text).buffer);
@@ -97,7 +99,7 @@ class Engine {
     return module.view(to, this.base.length).slice();
   }
 
-  breaks(numbers) { return numbers.slice(this.data.count).sort(); }
+  breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
 
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
    *  that hold at a time. */
@@ -137,10 +139,12 @@ class Engine {
   }
 
   /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
-  mark(parameters, {t, q, v}) {
+  mark(parameters, state) { return this.markRows(this.numbers(parameters), state); }
+
+  markRows(numbers, {t, q, v}) {
     const {data} = this;
     if (!data.marks) return null;
-    const given = this.dressed(this.numbers(parameters), data.closing.thresholds, t);
+    const given = this.dressed(numbers, data.closing.thresholds, t);
     const settings = [data.scales.length, Math.max(data.scales.rate, largest(v, this.unit))];
     const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
@@ -149,30 +153,46 @@ class Engine {
   /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
    *
    *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
-   *  that of the ground (m), stiffness (N/m) and damping (N s/m).
+   *  that of the ground (m), stiffness (N/m) and damping (N s/m). While it pulls no event stops the motion.
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
-   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; and its `marks`.
+   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
+   *  `events`, a list of {t, index, q, v}. Where one stops it, `stop` is its name, and the last time that of the event.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
-    const {data, size} = this, T = times.length, numbers = this.numbers(parameters);
+    const {data} = this, numbers = this.numbers(parameters), T = times.length;
     if (data.why) throw new Error(data.why);
     if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
-    const breaks = this.breaks(numbers), end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1]));
-    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
-    const settings = Object.values({...data.settings, smallest: data.smallest * EPS * end, omega, max_steps: limit});
-    const marks = state.marks ?? this.mark(parameters, {t: times[0], ...state});
-    const inputs = {numbers: this.dressed(numbers, data.thresholds, times[0], marks), ts: times, q: state.q, v: state.v, settings, rows: data.rows, breaks,
-      samples: this.samples};
+    const end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1])), smallest = data.smallest * EPS * end;
+    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0])), settings = {...data.settings, smallest, omega};
+    if (data.events) return runWithEvents(this, numbers, settings, state, Float64Array.from(times), !pull, limit);
+    return {...this.piece(numbers, settings, state, Float64Array.from(times), limit), events: []};
+  }
+
+  /** Integrate from a state over times; with conditions to `watch`, up to the first that crosses zero, which is in `crossing`. */
+  piece(numbers, settings, state, ts, limit, watch = []) {
+    const {data, size} = this, T = ts.length, breaks = this.breaks(numbers), marks = state.marks ?? this.markRows(numbers, {t: ts[0], ...state});
+    const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
+      settings: Object.values({...settings, max_steps: limit}), rows: data.rows, breaks, samples: this.samples, watch};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
+    if (data.events) results.crossing = data.events.head + data.events.names.length + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
     const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
-    if (drifted >= 0) { done = false; count = drifted; words = "the loops do not stay closed"; }
+    if (drifted >= 0) { done = false; count = drifted; words = UNFINISHED[5]; }
     const limited = ended.code === 2, last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
-    return {ts: Float64Array.from(times), q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
-      steps: ended.accepted, tried: ended.tried, limited, last, marks};
+    return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t, code: ended.code,
+      steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
+  }
+
+  /** The conditions of events at a state, each followed by its derivatives by t, q and v. */
+  conditions(numbers, {t, q, v}) {
+    const module = this.instances.evaluate, {count, knots, events} = this.data, each = 2 + 2 * this.size;
+    module.begin();
+    const given = module.put([t, ...q, ...v, ...numbers.subarray(count + knots)]), to = module.reserve(8 * each * events.names.length);
+    module.exports.conditions(given, to);
+    return Array.from(events.names, (_, k) => module.view(to + 8 * k * each, each).slice());
   }
 
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the

@@ -29,8 +29,8 @@ export class Hand {
     const pull = {body: held.body, point: held.point, target, ...spring};
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
     if (!run.done) return live.live.say(`the pull is too much: ${run.words}`, true);
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks};
-    live.append(this.state, run.violation[1]);
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch};
+    live.append(this.state, run.violation[1], run.events);
     return null;
   }
 

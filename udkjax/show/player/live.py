@@ -4,7 +4,7 @@ sliders  live_parameters.py
 engines  udkjax/integrate/portable; runs of one mechanism share one
 runs     of each run: engine, its number; sliders: [number of a slider, the value that this mechanism has] for each parameter of
          the engine; follow (followers.py); start: the state that closing begins with, or null where that is the scene's own
-         guess; times: all of a motion that failed, or null
+         guess; times: all of a motion that failed or was stopped, or null
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ import numpy as np
 
 from udkjax.equations import analyse
 from udkjax.integrate.assembly import close
+from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.program import UnsupportedError
 from udkjax.scene import Mechanism
@@ -28,8 +29,15 @@ TOLERANCE = 1e-8  # rtol and atol of a run that does not know its own: those of 
 SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteristic time: the scene's own initial state
 
 
-def live_data(runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live) -> Json:
+def live_data(
+    runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live, events: Sequence[ExpandsToEvents] = ()
+) -> Json:
     """Return what a live page of some runs has besides, as plain data; each run with what the player shows of it.
+
+    Args:
+        runs: mechanisms, their motions, and these as the player has them.
+        live: which numbers have sliders.
+        events: of all runs.
 
     Raises:
         SceneError: no mechanism has a parameter of that name.
@@ -40,14 +48,14 @@ def live_data(runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], 
     data: Json = {"engines": [], "runs": []}
     unknown = [] if isinstance(live, bool) else [n for n in live if not any(names_in(m, [n]) for m, _, _ in runs)]
     for mechanism, solution, record in runs:
-        _require_solvable(solution)
+        _require_solvable(mechanism, solution, events)
         own = sliders_of(mechanism, unknown or names_in(mechanism, live))
         sliders = {slider.name: slider for slider in own} | sliders
         rtol, atol = (float(getattr(solution, name, TOLERANCE)) for name in ("rtol", "atol"))
         key = id(mechanism), rtol, atol
         if key not in engines:
             engines[key] = len(engines)
-            data["engines"].append(_engine(mechanism, own, rtol, atol))
+            data["engines"].append(_engine(mechanism, own, rtol, atol, events))
         follow = followers(mechanism, record, record["symbols"])
         start, times = _start(mechanism, solution), _times(solution)
         data["runs"].append({"engine": engines[key], "sliders": own, "follow": follow, "start": start, "times": times})
@@ -57,17 +65,21 @@ def live_data(runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], 
     return data | {"sliders": [slider.data for slider in in_sections(sliders.values())]}
 
 
-def _require_solvable(solution: ShownMotion):
-    if getattr(solution, "events", None) is not None:
-        raise ArgumentError("live: a run with events cannot be solved anew in a page; leave out live, or the events")
+def _require_solvable(mechanism: Mechanism, solution: ShownMotion, events: Sequence[ExpandsToEvents]):
+    happened = getattr(solution, "events", None)
+    if happened is not None and not events:
+        raise ArgumentError("live: the run has events, whose conditions a page needs: give `animate` the same `events`, too")
+    names = [event.name for event in expand_events(events, mechanism)] if events else []
+    if names and (happened is None or list(happened.names[: len(names)]) != names or len(happened.names) != 3 * len(names)):
+        raise ArgumentError(f"live: the run was not simulated with the events {', '.join(names)}: give `simulate` the same")
     stabilization = getattr(solution, "settings", {}).get("stabilization", "Projection")
     if stabilization != "Projection":
         raise ArgumentError(f"live: a page solves by projection, and the run has stabilization={stabilization}: leave out live")
 
 
-def _engine(mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: float) -> Json:
+def _engine(mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: float, events: Sequence[ExpandsToEvents]) -> Json:
     try:
-        engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol)
+        engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol, events=events)
     except UnsupportedError as error:
         raise ArgumentError(f"live: a page has no instruction for {error}: name the numbers to change, without those") from None
     if engine.data["why"]:
@@ -76,7 +88,7 @@ def _engine(mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: 
 
 
 def _times(solution: ShownMotion) -> list[float] | None:
-    """Return the times of a run that failed, to whose end other numbers may come; None where all of it is shown."""
+    """Return all times of a run that failed or was stopped, to whose end other numbers may come; None where it is shown whole."""
     ts = np.asarray(solution.ts, float)
     if len(ts) < 2:
         raise ArgumentError("live: the run has one instant, and no motion to solve anew")

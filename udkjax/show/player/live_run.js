@@ -12,12 +12,14 @@ const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be graspe
 const STEP_BYTES = 4e7;
 const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
 
+const endOf = run => (run.stop ? `${run.stop} stops it` : run.words);
+
 export class LiveRun {
   /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
   constructor(live, run, record, data) {
-    const {ts, q, v, measures, frame, reactions, forces} = run;
-    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces}});
-    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed
+    const {ts, q, v, measures, frame, reactions, forces, events} = run;
+    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events}});
+    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed, or stopped
     this.follower = new Follower(run, data.follow);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
   }
@@ -48,9 +50,9 @@ export class LiveRun {
   lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
 
   reset() {
-    const {ts, q, v, measures, frame, reactions, forces} = this.first;
+    const {ts, q, v, measures, frame, reactions, forces, events} = this.first;
     this.drop();
-    this.run.replace(ts, q, v, measures, frame);
+    this.run.replace(ts, q, v, measures, frame, events);
     this.showReactions(reactions, forces);
     this.follower.follow(this.engine.numbers(null));
     this.changed = false;
@@ -63,7 +65,7 @@ export class LiveRun {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
     if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
-    const run = {ts: times, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0};
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
     this.follower.follow(engine.numbers(values));
     return "";
@@ -74,21 +76,24 @@ export class LiveRun {
     const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
     const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
     const part = engine.run(values, job.state, times, null, Math.min(this.steps, most - job.tried));
-    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = run.ts[run.ts.length - 1] - run.ts[0];
+    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = this.times[this.times.length - 1] - run.ts[0];
+    run.ts.set(part.ts.subarray(skip, skip + count), from);
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
     run.count = job.from = from + count;
+    run.events.push(...part.events);
     job.steps += part.steps;
     job.tried += part.tried;
     job.state = part.last;
     this.show(run);
     if (part.limited && job.tried < most) return {words: `Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
     this.job = null;
-    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
+    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${endOf(part)}.`;
     const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
-    return {words, bad: !part.done};
+    return {words, bad: !part.done && !part.stop};
   }
 
   drop() {
@@ -104,10 +109,13 @@ export class LiveRun {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
-    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1);
+    this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1, this.named(run.events));
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
+
+  /** Events as they are shown: {t, name}. */
+  named(events) { return events.map(({t, index}) => ({t, name: this.engine.data.events.names[index]})); }
 
   /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
   reactions(forces) {
@@ -181,13 +189,15 @@ export class LiveRun {
     const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
     this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
       violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+    this.happened = this.run.events.filter(({t}) => t <= state.t);
     this.marks = state.marks ??= this.engine.mark(this.values, state);
-    this.append(state, state.violation);
+    this.append(state, state.violation, []);
   }
 
-  /** Add one state to the record, and show it. */
-  append({t, q, v}, violation) {
+  /** Add one state to the record, and the events before it, and show it. */
+  append({t, q, v}, violation, events) {
     const {past} = this;
+    this.happened.push(...this.named(events));
     past.ts.push(t);
     past.q.push(...q);
     past.v.push(...v);
@@ -200,7 +210,8 @@ export class LiveRun {
 
   showPast() {
     const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
-    this.show({...run, count: run.ts.length});
+    this.show({...run, count: run.ts.length, events: []});
+    this.run.events = this.happened;
   }
 
   /** Solve on from where the hand lets go, for as long as the first motion is. */
@@ -213,9 +224,11 @@ export class LiveRun {
       past.v.push(...run.v.subarray(k * n, (k + 1) * n));
       past.violation.push(run.violation[k]);
     }
+    this.happened.push(...this.named(run.events));
     this.showPast();
     this.player.setEnd(this.live.end);
-    this.live.say(run.done ? "Let go: the motion goes on by itself." : `Let go: the motion ends at ${run.t.toPrecision(4)} s, ${run.words}.`, !run.done);
+    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${endOf(run)}.`;
+    this.live.say(run.done ? "Let go: the motion goes on by itself." : ended, !run.done && !run.stop);
     this.player.play();
   }
 

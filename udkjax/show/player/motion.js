@@ -72,9 +72,9 @@ export class Run {
     this.now = new Float64Array(this.size);
   }
 
-  /** Another motion of the same bodies. */
-  replace(ts, q, v, measures, frame) {
-    Object.assign(this, {ts, q, v, measures, frame, paths: null, fine: 1});
+  /** Another motion of the same bodies, with its events {t, name}. */
+  replace(ts, q, v, measures, frame, events) {
+    Object.assign(this, {ts, q, v, measures, frame, events, paths: null, fine: 1});
   }
 
   /** The coordinates and their rates at any time between the first and the last instant. */

@@ -10,8 +10,8 @@ from string import Template
 from udkjax.show.player.packing import Json
 
 MODULES = (  # after those they import
-    *("motion", "painter", "symbols", "strip", "style", "elements", "pointers"),
-    *("engine", "follow", "hand", "sliders", "address", "live_run", "live"),
+    *("motion", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers"),
+    *("events", "engine", "follow", "hand", "sliders", "address", "live_run", "live"),
     *("player", "mount"),
 )
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.

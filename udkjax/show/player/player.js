@@ -1,6 +1,7 @@
 // The player's elements, what they do, and how they look.
 
 import {HELP, LIVE_HELP, SPEEDS, button, icon, keepKeys, make} from "./elements.js";
+import {EventMarks} from "./event_marks.js";
 import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES, contextOf} from "./painter.js";
@@ -61,7 +62,8 @@ export class Player {
     const middle = this.live ? make("div", {class: "middle"}, this.stage, this.live.panel.element) : this.stage;
     this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
       make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
-    const groups = [this.playButton, this.timeLabel, this.scrub, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
+    this.eventMarks = new EventMarks(this);
+    const groups = [this.playButton, this.timeLabel, this.eventMarks.element, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
       ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button))];
     if (this.modes) {
       const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
@@ -85,10 +87,9 @@ export class Player {
 
   panel(run, k) {
     const canvas = make("canvas", {role: "img", tabindex: 0, "aria-label": `${this.data.title} ${run.label}: motion`});
-    const caption = make("figcaption");
-    if (this.runs.length > 1 || this.modes) caption.append(make("b", {}, run.label));
-    if (run.note) caption.append(" ", run.note);
-    const panel = {run, canvas, figure: make("figure", {class: "panel"}, canvas, caption)};
+    const note = make("span", {}, run.note ? ` ${run.note}` : ""), happened = make("div", {class: "happened"});
+    const caption = make("figcaption", {}, ...(this.runs.length > 1 || this.modes ? [make("b", {}, run.label)] : []), note, happened);
+    const panel = {run, canvas, note, happened, figure: make("figure", {class: "panel"}, canvas, caption)};
     followPointers(this, canvas, () => this.live?.runs[k]);
     return panel;
   }
@@ -270,8 +271,9 @@ export class Player {
   draw() {
     if (!this.theme) return;
     const {data, t, theme, show} = this;
-    this.panels.forEach(({run, canvas}, k) => {
+    this.panels.forEach(({run, canvas, note}, k) => {
       const live = this.live?.runs[k];
+      note.hidden = Boolean(live?.changed);  // it is of the first motion
       const {context, width, height} = contextOf(canvas);
       if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
@@ -288,6 +290,7 @@ export class Player {
       const {context, width, height} = contextOf(this.stripCanvas);
       drawStrip(context, width, height, this.runs, this.measure, data.start, data.end, t, theme, this.measureSelect.offsetWidth + 24);
     }
+    this.eventMarks.draw();
     const span = data.end - data.start;
     this.scrub.value = span > 0 ? Math.round(10000 * (t - data.start) / span) : 0;
     const digits = clamp(3 - Math.floor(Math.log10(span || 1)), 0, 9), of = x => x.toFixed(digits);

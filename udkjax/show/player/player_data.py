@@ -17,6 +17,7 @@ runs       a list of
     frame          s, the typical time between two instants
     mode           instead of these: {q: numbers, shape: numbers, frequency: Hz or null}
     measures       a list of {name, unit, log, values: single precision}
+    events         a list of {t, name}: what happened, and when
     reactions      {anchors, usual (N), unique: booleans, force: packed table of T rows, x and y of each anchor}, or null
 """
 
@@ -89,6 +90,7 @@ def run_record(
             {"name": m.name, "unit": m.unit, "log": m.log, "values": floats(m.values[shown])}
             for m in measures_of(mechanism, solution, measures, label)
         ],
+        "events": _events_of(solution),
         "reactions": None,
     }
     if with_reactions:
@@ -122,9 +124,19 @@ def mode_record(
         "frame": 1.0,
         "mode": {"q": q.ravel().tolist(), "shape": shape.ravel().tolist(), "frequency": frequency},
         "measures": [],
+        "events": [],
         "reactions": None,
     }
     return record, poses
+
+
+def _events_of(solution: ShownMotion) -> list[Json]:
+    """Return the events of a run in their order."""
+    events = getattr(solution, "events", None)
+    if events is None:
+        return []
+    times, index = np.asarray(events.time), np.asarray(events.index)
+    return [{"t": float(t), "name": events.names[k]} for t, k in zip(times, index, strict=True) if k >= 0]
 
 
 def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]]:

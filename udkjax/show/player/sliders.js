@@ -92,6 +92,7 @@ export const LIVE_STYLE = `
 .live .slider input[type="range"] { grid-column: 1 / -1; width: 100%; height: 24px; }
 .live input[type="number"] { font: inherit; font-variant-numeric: tabular-nums; width: 100%; height: 26px; padding: 0 4px; text-align: right;
   color: var(--ink); background: var(--back); border: 1px solid var(--line); border-radius: 5px; appearance: textfield; }
+.live input::-webkit-inner-spin-button { appearance: none; margin: 0; }
 .live :disabled { opacity: 0.5; cursor: default; }
 .narrow .middle { flex-direction: column; }
 .narrow .live { width: auto; border-left: 0; border-top: 1px solid var(--line); max-height: 40%; }

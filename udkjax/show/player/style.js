@@ -40,7 +40,10 @@ button.icon { width: 34px; padding: 0; display: grid; place-items: center; flex:
 button.primary { background: var(--accent); color: var(--on-accent); width: 40px; height: 40px; border-radius: 50%; }
 button.primary:hover { background: color-mix(in srgb, var(--accent) 86%, var(--ink)); }
 input[type="range"] { accent-color: var(--accent); height: 32px; margin: 0; cursor: pointer; }
-.scrub { flex: 1 1 140px; min-width: 100px; }
+.line { flex: 1 1 140px; min-width: 100px; position: relative; display: flex; }
+.scrub { flex: 1; min-width: 0; }
+.ticks { position: absolute; inset: -3px 0 auto; width: 100%; height: 12px; pointer-events: none; }
+.happened { color: var(--force); font-weight: 600; }
 .amplitude { display: flex; align-items: center; gap: 6px; font-size: 13px; color: var(--soft); }
 .amplitude input { width: 96px; }
 .help { position: absolute; inset: 0; display: grid; place-items: center; background: color-mix(in srgb, var(--back) 72%, transparent); z-index: 2; }

@@ -1,0 +1,33 @@
+// Events on the timeline: a tick at the time of each, and the name of the one that has just happened.
+
+import {make} from "./elements.js";
+import {contextOf} from "./painter.js";
+
+const THUMB = 8, TICK = 7;  // px: half of the slider's thumb, which is at the ends at the first and the last time; a tick's height
+const SAID = 0.04;  // of the timeline: how long one reads which event has happened
+
+export class EventMarks {
+  constructor(player) {
+    this.player = player;
+    this.canvas = make("canvas", {class: "ticks", "aria-hidden": "true"});
+    this.element = make("div", {class: "line"}, player.scrub, this.canvas);
+  }
+
+  draw() {
+    const {runs, panels, data: {start, end}, theme, t} = this.player, {context, width, height} = contextOf(this.canvas);
+    runs.forEach((run, k) => {
+      context.beginPath();
+      for (const event of run.events) {
+        const x = THUMB + (width - 2 * THUMB) * (event.t - start) / (end - start || 1);
+        context.moveTo(x, height - TICK);
+        context.lineTo(x, height);
+      }
+      context.lineWidth = 2;
+      context.strokeStyle = runs.length > 1 ? theme.bodies[k % theme.bodies.length] : theme.force;
+      context.stroke();
+      const last = run.events.findLast(event => event.t <= t && event.t >= t - SAID * (end - start));
+      const words = last ? `${last.name}, ${+last.t.toPrecision(5)} s` : "";
+      if (panels[k].happened.textContent !== words) panels[k].happened.textContent = words;
+    });
+  }
+}
