@@ -29,7 +29,7 @@ def test_a_run_becomes_a_page(run, tmp_path, capsys):
     out = tmp_path / "run.html"
     assert udkjax("animate", run, "--out", out, "--measures", "torque", "--json") == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["bytes"] == out.stat().st_size < 100_000 and (printed["start"], printed["end"]) == (0, 1)
+    assert printed["bytes"] == out.stat().st_size < 60_000 and (printed["start"], printed["end"]) == (0, 1)
     text = out.read_text()
     assert '"name":"torque","unit":"N m"' in text and "<title>four-bar</title>" in text
 

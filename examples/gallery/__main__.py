@@ -91,16 +91,18 @@ def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
 
 
 def share_player(player: Path) -> None:
-    """Put the program of a page, which all of them have in common, into `player.js` beside it.
+    """Take the program out of a page, and put that of live ones, which serves them all, into `player.js` beside it.
 
     It is a script, since browsers read no modules from a disk, and the page loses its policy, which allows no scripts beside it.
     """
+    from udkjax.show.player.page import module
+
     text = player.read_text(encoding="utf-8")
     start, _, rest = text.partition('<script type="module">\n')
-    module, mount, end = rest.rpartition("\nmount(")
+    _, mount, end = rest.rpartition("\nmount(")
     start = re.sub(r'<meta http-equiv="Content-Security-Policy"[^\n]*\n', "", start)
     player.write_text(f'{start}<script src="{PLAYER}"></script>\n<script>{mount}{end}', encoding="utf-8")
-    program = re.sub(r"^export (default .*|)", "", module, flags=re.MULTILINE)
+    program = re.sub(r"^export (default .*|)", "", module(), flags=re.MULTILINE)
     shared = f'const mount = (() => {{\n"use strict";\n{program}\nreturn mount;\n}})();\n'
     (player.parent / PLAYER).write_text(shared, encoding="utf-8")
 

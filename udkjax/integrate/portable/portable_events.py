@@ -36,9 +36,7 @@ class PortableEvents:
         for event in self._events:
             if not isinstance(event.action, Log | Stop):
                 kind = type(event.action).__name__
-                raise ArgumentError(
-                    f"live: a page knows Log and Stop, and event {quote(event.name)} has {kind}: leave out live"
-                )
+                raise ArgumentError(f"live: a page knows Log and Stop, and event {quote(event.name)} has {kind}: leave out live")
         programs = condition_programs(self._events, mechanism.body_names) if events else None
         if programs is None and events:
             raise UnsupportedError("the condition of an event")

@@ -9,11 +9,10 @@ from string import Template
 
 from udkjax.show.player.packing import Json
 
-MODULES = (  # after those they import
-    *("motion", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers"),
-    *("events", "engine", "follow", "hand", "sliders", "address", "live_run", "live"),
-    *("player", "mount"),
-)
+# Each after those it imports.
+SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
+SOLVING = ("events", "engine", "follow", "hand", "sliders", "address", "live_run", "live")  # of a live page alone
+LAST = ("player", "mount")
 # Within <script> no character of a text may end it, begin markup or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
@@ -24,7 +23,7 @@ def page(data: Json, options: Json | None = None) -> str:
     return template.substitute(
         title=html.escape(data["title"]),
         data=as_json(data),
-        module=module(),
+        module=module(is_live="live" in data),
         options=as_json({"fill": True, **(options or {})}),
     )
 
@@ -42,8 +41,12 @@ def as_json(data: object) -> str:
 
 
 @cache
-def module() -> str:
-    """Return the source of the player: its modules, joined to one, without the lines that are comments."""
-    *parts, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES)
+def module(is_live: bool = True) -> str:
+    """Return the source of the player: its modules, joined to one, without the lines that are comments.
+
+    Without those that solve, whose names no page takes but a live one, it is half as long.
+    """
+    names = (*SHOWING, *(SOLVING if is_live else ()), *LAST)
+    *parts, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)
     joined = "\n".join([*(re.sub(r"^export ", "", part, flags=re.M) for part in parts), last])
     return re.sub(r"^(import .*| *//.*)?\n", "", joined, flags=re.M)

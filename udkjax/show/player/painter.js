@@ -1,5 +1,6 @@
 // Painting on a canvas: themes, lines and circles, arrows, texts, the grid, traces and reactions.
 
+import {Labels, around, aroundPin} from "./labels.js";
 import {clamp, nice, place, short} from "./motion.js";
 
 // Okabe and Ito's colours, which everyone tells apart, and one more; on dark grounds, lighter.
@@ -195,11 +196,9 @@ export class Painter {
   }
 
   names(run) {
-    run.bodies.forEach((name, body) => this.text(name, this.anchor([body, 0, 0]), this.textColour(body), {align: "center", weight: 600}));
-    for (const mark of run.marks) {
-      if (mark.kind !== "pin") continue;
-      const [x, y] = this.at(mark);
-      this.text(mark.name, [x + 8 * this.pt, y - 10 * this.pt], this.theme.ink, {size: 11});
-    }
+    const labels = run.labels ??= new Labels(), pins = run.marks.filter(mark => mark.kind === "pin"), unit = Math.max(1, this.pt);
+    labels.begin(this, pins.map(mark => this.at(mark)));
+    for (const mark of pins) labels.put(`pin ${mark.name}`, mark.name, aroundPin(this.at(mark), unit), this.theme.ink, 400);
+    run.bodies.forEach((name, body) => labels.put(name, name, around(this.anchor([body, 0, 0]), unit), this.textColour(body), 600));
   }
 }

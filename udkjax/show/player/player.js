@@ -80,7 +80,7 @@ export class Player {
     this.keys.addEventListener("keydown", this.onKey);
     keepKeys(this.root, this.panels[0].canvas);
     this.root.classList.toggle("fill", Boolean(this.options.fill));
-    shadow.replaceChildren(make("style", {}, STYLE + LIVE_STYLE), this.root);
+    shadow.replaceChildren(make("style", {}, STYLE + (data.live ? LIVE_STYLE : "")), this.root);
     for (const name of Object.keys(this.buttons)) this.press(name);
     this.setPlaying(false);
   }

@@ -2,9 +2,9 @@
 
 import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {middle, symbolsOf} from "./drawn_symbols.js";
-import {Labels, aroundPin, besideBar, within} from "./labels.js";
 import {carry} from "./mover.js";
 import {linkShape} from "./shapes.js";
+import {Labels, aroundPin, besideBar, within} from "./player/labels.js";
 import {THEMES, contextOf} from "./player/painter.js";
 import {SymbolPainter} from "./player/symbols.js";
 import {angleUnit, lengthUnit, shown} from "./units.js";
@@ -12,7 +12,7 @@ import {toPixels} from "./view.js";
 
 const HALO = 7;  // px around what is selected
 const LABEL = 12;  // px
-const signPlace = ([x, y]) => [x + 13, y + 11];  // px, of what a mark says
+const SIGN_PLACES = [[13, 11, "left"], [13, -11, "left"], [-13, 11, "right"], [-13, -11, "right"]];  // px, of what a mark says
 
 export class DrawingCanvas {
   constructor(element) {
@@ -61,6 +61,7 @@ export class DrawingCanvas {
     this.halos(studio, painter, theme);
     painter.draw(this.symbols);
     this.places = this.placesOf(document);
+    this.names.begin(painter, this.places.values());
     this.marks(studio, painter, theme);
     this.labels(studio, painter, theme);
     this.preview(studio, painter, theme);
@@ -116,7 +117,7 @@ export class DrawingCanvas {
       const place = this.places.get(name);
       if (!place) continue;
       painter.circle(place, 10, {stroke: theme.force, width: strong ? 2.6 : 1.3});
-      painter.text(sign, signPlace(place), theme.force, {size: 12, weight: 700});
+      this.names.put(`sign ${name}`, sign, SIGN_PLACES.map(([x, y, align]) => [place[0] + x, place[1] + y, align]), theme.force, 700);
     }
     if (preview?.onto) {
       const place = this.places.get(preview.onto);
@@ -124,10 +125,9 @@ export class DrawingCanvas {
     }
   }
 
-  labels({document, show, selection, motions, marked}, painter, theme) {
+  labels({document, show, selection, motions}, painter, theme) {
     const isChosen = (kind, name, index) => selection.some(item => item.kind === kind && item.name === name && item.index === index);
-    const {names} = this, signs = [...marked.keys()].flatMap(name => (this.places.has(name) ? [signPlace(this.places.get(name))] : []));
-    names.begin(painter, this.places.values(), signs);
+    const {names} = this;
     for (const [name, place] of this.places) {
       const chosen = isChosen("pin", name, undefined);
       if (show.names || chosen) names.put(`pin ${name}`, name, aroundPin(place), theme.ink, chosen ? 700 : 400);
