@@ -1,9 +1,9 @@
 """Interpolating cubic splines, natural and periodic, written for values that may be traced.
 
-With knots x_k, values y_k and curvatures m_k = S''(x_k), a cubic spline is, on the interval [x_i, x_i+1] of length h, with
-A = (x_i+1 - x) / h and B = (x - x_i) / h,
+With knots x_k, values y_k and curvatures m_k = S''(x_k), a cubic spline is, on the interval [x_i, x_i+1] of length h_i, with
+s = x - x_i,
 
-    S(x) = A y_i + B y_i+1 + ((A^3 - A) m_i + (B^3 - B) m_i+1) h^2 / 6,
+    S(x) = y_i + ((y_i+1 - y_i) / h_i - h_i (2 m_i + m_i+1) / 6) s + m_i / 2 s^2 + (m_i+1 - m_i) / (6 h_i) s^3,
 
 and S' is continuous where h_i-1 m_i-1 + 2 (h_i-1 + h_i) m_i + h_i m_i+1 = 6 (y_i+1 - y_i) / h_i - 6 (y_i - y_i-1) / h_i-1.
 Source: de Boor, A Practical Guide to Splines, chapter 4.
@@ -26,12 +26,7 @@ AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # of the one library or of th
 
 def natural_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"]) -> Array:
     """Evaluate the natural cubic spline (no curvature at the ends) at a scalar x; beyond the ends it is a straight line."""
-    steps, slopes = jnp.diff(knots), jnp.diff(values) / jnp.diff(knots)
-    inner = _tridiagonal(2 * (steps[:-1] + steps[1:]), steps[1:-1], 6 * jnp.diff(slopes)[:, None])[:, 0]
-    within = jnp.clip(x, knots[0], knots[-1])
-    end = jnp.zeros(1, knots.dtype)
-    value, slope = _cubic(within, knots, values, jnp.concatenate([end, inner, end]))
-    return value + slope * (x - within)
+    return _evaluate(x, spline_pieces(knots, values, jnp))
 
 
 def spline_pieces(knots: AnyArray, values: AnyArray, xp: ModuleType) -> AnyArray:
@@ -50,32 +45,27 @@ def spline_pieces(knots: AnyArray, values: AnyArray, xp: ModuleType) -> AnyArray
         return xp.stack([knots[0], values[0], slopes[0], 0 * slopes[0], 0 * slopes[0]])[None]
     system = 2 * (steps[:-1] + steps[1:]), steps[1:-1], 6 * xp.diff(slopes)[:, None]
     inner = (_tridiagonal_by_numpy if xp is np else _tridiagonal)(*system)[:, 0]
-    m, end = xp.concatenate([xp.zeros(1), inner, xp.zeros(1)]), xp.zeros(1)
-    first = slopes - steps * (2 * m[:-1] + m[1:]) / 6
-    last = slopes[-1:] + steps[-1:] * m[-2:-1] / 6
-    inside = xp.stack([knots[:-1], values[:-1], first, m[:-1] / 2, xp.diff(m) / (6 * steps)], 1)
-    lines = (xp.stack([knots[k], values[k], slope[0], end[0], end[0]])[None] for k, slope in ((0, first), (-1, last)))
-    before, behind = lines
-    return xp.concatenate([before, inside, behind])
+    end = xp.zeros(1)
+    inside = _cubics(knots, values, xp.concatenate([end, inner, end]), xp)
+    before = xp.stack([knots[0], values[0], inside[0, 2], end[0], end[0]])
+    _, _, slope, half_curvature, _ = inside[-1]
+    behind = xp.stack([knots[-1], values[-1], slope + steps[-1] * half_curvature, end[0], end[0]])
+    return xp.concatenate([before[None], inside, behind[None]])
 
 
 def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], period: Number) -> Array:
-    """Evaluate the periodic cubic spline at a scalar x; the knot after the last is the first, one period on."""
+    """Evaluate the periodic cubic spline of three knots or more at a scalar x; after the last one the first comes again."""
     n = knots.size
     closed, around = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
     steps, slopes = jnp.diff(closed), jnp.diff(around) / jnp.diff(closed)
     right = 6 * (slopes - jnp.roll(slopes, 1))
-    if n < 3:
-        curvatures = (2 * right - jnp.roll(right, 1)) / (3 * (steps + jnp.roll(steps, 1)))
-    else:
-        # The last row and column apart: what is left is tridiagonal (Schur complement).
-        diagonal = 2 * (jnp.roll(steps, 1) + steps)
-        corner = jnp.concatenate([steps[-1:], jnp.zeros(n - 3, knots.dtype), steps[-2:-1]])
-        one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
-        last = (right[-1] - jnp.sum(corner * one)) / (diagonal[-1] - jnp.sum(corner * other))
-        curvatures = jnp.append(one - last * other, last)
-    within = wrap(x, knots[0], period)
-    return _cubic(within, closed, around, jnp.append(curvatures, curvatures[0]))[0]
+    # The last row and column apart: what is left is tridiagonal (Schur complement).
+    diagonal = 2 * (jnp.roll(steps, 1) + steps)
+    corner = jnp.concatenate([steps[-1:], jnp.zeros(n - 3, knots.dtype), steps[-2:-1]])
+    one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
+    last = (right[-1] - jnp.sum(corner * one)) / (diagonal[-1] - jnp.sum(corner * other))
+    curvatures = jnp.append(one - last * other, last)
+    return _evaluate(wrap(x, knots[0], period), _cubics(closed, around, jnp.append(curvatures, curvatures[0]), jnp))
 
 
 def wrap(x: Number, start: Number, period: Number) -> Array:
@@ -88,19 +78,20 @@ def count_knots(x: Number, knots: Float[Array, " n"]) -> Array:
     return jnp.sum(jnp.where(x >= knots, 1.0, 0.0))
 
 
-def _cubic(
-    x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], curvatures: Float[Array, " n"]
-) -> tuple[Array, Array]:
-    """Return the spline's value and slope at x within the knots."""
-    reached = jnp.append(True, x >= knots[1:-1])
-    inside = reached & jnp.append(x < knots[1:-1], True)
-    ends = [knots[:-1], knots[1:], values[:-1], values[1:], curvatures[:-1], curvatures[1:]]
-    x0, x1, y0, y1, m0, m1 = jnp.sum(jnp.where(inside, jnp.stack(ends), 0.0), 1)
-    h = x1 - x0
-    a, b = (x1 - x) / h, (x - x0) / h
-    value = a * y0 + b * y1 + ((a**3 - a) * m0 + (b**3 - b) * m1) * h**2 / 6
-    slope = (y1 - y0) / h + ((3 * b**2 - 1) * m1 - (3 * a**2 - 1) * m0) * h / 6
-    return value, slope
+def _cubics(knots: AnyArray, values: AnyArray, curvatures: AnyArray, xp: ModuleType) -> AnyArray:
+    """Return the cubics between neighbouring knots as rows (n - 1, 5), as `spline_pieces` does."""
+    steps, m = xp.diff(knots), curvatures
+    slopes = xp.diff(values) / steps - steps * (2 * m[:-1] + m[1:]) / 6
+    return xp.stack([knots[:-1], values[:-1], slopes, m[:-1] / 2, xp.diff(m) / (6 * steps)], 1)
+
+
+def _evaluate(x: Number, pieces: Float[Array, "pieces 5"]) -> Array:
+    """Return the value at x of the piece that it is in."""
+    starts = pieces[1:, 0]
+    inside = jnp.append(True, x >= starts) & jnp.append(x < starts, True)
+    start, *c = jnp.sum(jnp.where(inside[:, None], pieces, 0.0), 0)
+    s = x - start
+    return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
 
 
 def _tridiagonal_by_numpy(diagonal: np.ndarray, beside: np.ndarray, right: np.ndarray) -> np.ndarray:
