@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -45,9 +45,9 @@ def check_known(tree: eqx.Module, name: str) -> None:
 
 def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
     """Return the mechanism of the tables of a file; raise `SceneError`, with the name of the file."""
-    entries, problems = [], list(_check_head(scene))
+    entries, problems = [], list(head_mistakes(scene, ("format", "name", "gravity", *SECTIONS)))
     for section in SECTIONS:
-        entries.extend(read_section(section, scene.get(section, []), problems))
+        entries.extend(read_section(section, scene.get(section, []), problems, CLASSES_WITHOUT_TYPE.get(section)))
     entries = [e._replace(table={k: vector_as_angle(x) if k == "axis" else x for k, x in e.table.items()}) for e in entries]
     gravity = scene.get("gravity", [0.0, -9.81])
     problems.extend(problems_of(entries, gravity))
@@ -59,16 +59,23 @@ def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
     return Mechanism(made["body"], made["joint"], made["driver"], made["force"], gravity, scene.get("name", ""))
 
 
-def _check_head(scene: Table) -> Iterator[str]:
-    """Iterate over the mistakes at the top of a file."""
+def head_mistakes(scene: Table, expected: Collection[str]) -> Iterator[str]:
+    """Iterate over the mistakes at the top of a file, whose keys are `expected`."""
     if not isinstance(scene.get("name", ""), str):
         yield f"name: must be a string, is {abbreviate(scene['name'])}"
-    expected = ("format", "name", "gravity", *SECTIONS)
-    yield from (f"{key}: unknown key{suggestion(key, expected)}" for key in scene if key not in expected)
+    for key in scene:
+        if key not in expected:
+            near = f"; write [[{key[:-1]}]]" if key[:-1] in expected and key.endswith("s") else suggestion(key, expected)
+            yield f"{key}: unknown key{near}"
 
 
-def read_section(section: str, tables: object, problems: list[str]) -> Iterator[SceneEntry]:
-    """Iterate over the entries of one section, their names and types read; adds to `problems` if it is not a section at all."""
+def read_section(
+    section: str, tables: object, problems: list[str], cls: type | None = None, counted: bool = False
+) -> Iterator[SceneEntry]:
+    """Iterate over the entries of one section; adds to the problems if it is no list of tables.
+
+    Their class is `cls`, or that which their types name. Those without a name are counted, as SECTION1, if they are `counted`.
+    """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
         return
@@ -76,17 +83,12 @@ def read_section(section: str, tables: object, problems: list[str]) -> Iterator[
     if section == "force":
         names = name_elements([str(table.get("type")) for table in tables], names)
     for index, (name, table) in enumerate(zip(names, tables, strict=True)):
-        entry = SceneEntry(
-            section,
-            index,
-            name,
-            CLASSES_WITHOUT_TYPE.get(section),
-            {key: value for key, value in table.items() if key != "name"},
-        )
+        name = f"{section}{index + 1}" if name is None and counted else name
+        entry = SceneEntry(section, index, name, cls, {key: value for key, value in table.items() if key != "name"})
         if section in CLASSES_BY_TYPE:
-            cls, problem = find_class(entry.where, CLASSES_BY_TYPE[section], table)
+            found, problem = find_class(entry.where, CLASSES_BY_TYPE[section], table)
             table = {key: value for key, value in entry.table.items() if key != "type"}
-            entry = entry._replace(cls=cls, problem=problem, table=table)
+            entry = entry._replace(cls=found, problem=problem, table=table)
         yield entry
 
 

@@ -10,7 +10,15 @@ from udkjax.printing import PrintedTable
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.description import drawing_table
-from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, SECTIONS, known_elements, placement_of, read_drawing
+from udkjax.scene.drawing.drawing_reader import (
+    BY_HAND,
+    DRAWN,
+    SECTIONS,
+    DrawingElements,
+    known_elements,
+    placement_of,
+    read_drawing,
+)
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units
@@ -102,8 +110,14 @@ class Drawing(AbstractDrawing):
             raise SceneError([*unknown, *found.problems], name)
         self.name, self.gravity, self.ground = name, number(found.gravity), tuple(ground)
         self.units = tuple((units or {}).items())
-        self._names = tuple(tuple(found.groups[section]) for section in (*DRAWN, *BY_HAND))
-        self._elements = tuple(tuple(found.groups[section].values()) for section in (*DRAWN, *BY_HAND))
+        self._names, self._elements = _in_order(found.groups)
+
+    @classmethod
+    def of_elements(cls, found: DrawingElements, ground: Sequence[str], name: str, units: Mapping[str, str]) -> "Drawing":
+        """Return the drawing of elements that were read, and have no mistakes."""
+        names, elements = _in_order(found.groups)
+        gravity, choices = number(found.gravity), tuple(units.items())
+        return make_module(cls, name=name, gravity=gravity, ground=tuple(ground), units=choices, _names=names, _elements=elements)
 
     @property
     def groups(self) -> dict[str, dict[str, Any]]:
@@ -162,21 +176,19 @@ class Drawing(AbstractDrawing):
         except SceneError as error:
             raise SceneError([_with_link(problem, placement.drawn) for problem in error.problems], self.name) from None
 
-    def _in(self, units: Mapping[str, str]) -> "Drawing":
-        """Return the same drawing, to be written in other units."""
-        return make_module(Drawing, **vars(self) | {"units": tuple(units.items())})
-
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""
         entries = [entry for section, group in groups.items() for entry in _entries(section, group)]
         found = read_drawing(entries, self.ground, gravity, Units())
         if found.problems:
             raise SceneError(found.problems, self.name)
-        return eqx.tree_at(
-            lambda d: (d.gravity, d._elements),
-            self,
-            (gravity, tuple(tuple(found.groups[s].values()) for s in (*DRAWN, *BY_HAND))),
-        )
+        return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(found.groups)[1]})
+
+
+def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...], ...]]:
+    """Return the names and the elements of each section, as a drawing stores them: JAX would sort the keys of a dict."""
+    sections = [groups[section] for section in (*DRAWN, *BY_HAND)]
+    return tuple(map(tuple, sections)), tuple(tuple(group.values()) for group in sections)
 
 
 def _pins(pins: Mapping[str, Any], velocities: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,49 +10,26 @@ from udkjax.scene.drawing.drawing import Drawing
 from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, read_drawing, units_of_element
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Pin
-from udkjax.scene.fields import Table
-from udkjax.scene.mechanism_tables import check_classes, check_known, key_lines, read_section, type_key
+from udkjax.scene.mechanism_tables import check_classes, check_known, head_mistakes, key_lines, read_section, type_key
 from udkjax.scene.schema import table_of
 
 LISTS = tuple(section for section in DRAWN if section != "pin")  # sections of tables in double brackets
-PLURALS = {
-    **{section: f"{section}s" for section in LISTS},
-    "body": "bodies",
-    "joint": "joints",
-    "driver": "drivers",
-    "force": "forces",
-}
 
 
 def drawing_of_tables(scene: Mapping[str, Any], source: str) -> Drawing:
     """Return the drawing of the tables of a file; raise `SceneError`, with the name of the file."""
-    problems = list(_check_head(scene))
+    head = ("format", "name", "units", "gravity", "ground", "pins", "velocities")
+    problems = list(head_mistakes(scene, (*head, *LISTS, *BY_HAND)))
     entries = list(_read_pins(scene, problems))
-    for section in LISTS:
-        entries.extend(_read_list(section, scene.get(section, []), problems))
-    for section in BY_HAND:
-        entries.extend(read_section(section, scene.get(section, []), problems))
+    for section in (*LISTS, *BY_HAND):
+        is_counted = section in LISTS and section != "link"
+        entries.extend(read_section(section, scene.get(section, []), problems, (DRAWN | BY_HAND)[section], is_counted))
     ground, gravity, units = scene.get("ground", []), scene.get("gravity"), scene.get("units", {})
     found = read_drawing(entries, ground, gravity, Units(units))
     problems.extend(found.problems)
     if problems:
         raise SceneError(problems, source)
-    named: dict[str, Any] = {plural: found.groups[section] for section, plural in PLURALS.items()}
-    try:
-        return Drawing(found.groups["pin"], ground=ground, gravity=found.gravity, name=scene.get("name", ""), **named)._in(units)
-    except SceneError as error:
-        raise SceneError(error.problems, source) from None
-
-
-def _check_head(scene: Table) -> Iterator[str]:
-    """Iterate over the mistakes at the top of a file."""
-    if not isinstance(scene.get("name", ""), str):
-        yield f"name: must be a string, is {abbreviate(scene['name'])}"
-    expected = ("format", "name", "units", "gravity", "ground", "pins", "velocities", *LISTS, *BY_HAND)
-    for key in scene:
-        if key not in expected:
-            near = f"; write [[{key[:-1]}]]" if key[:-1] in expected and key.endswith("s") else suggestion(key, expected)
-            yield f"{key}: unknown key{near}"
+    return Drawing.of_elements(found, ground, scene.get("name", ""), units)
 
 
 def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneEntry]:
@@ -66,15 +43,6 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
     for k, (name, place) in enumerate(pins.items()):
         speed = {"velocity": velocities[name]} if name in velocities else {}
         yield SceneEntry("pin", k, name, Pin, {"position": place, **speed})
-
-
-def _read_list(section: str, tables: object, problems: list[str]) -> Iterator[SceneEntry]:
-    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-        problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
-        return
-    for k, table in enumerate(tables):
-        name = table.get("name", None if section == "link" else f"{section}{k + 1}")
-        yield SceneEntry(section, k, name, DRAWN[section], {key: value for key, value in table.items() if key != "name"})
 
 
 def drawing_text(drawing: Drawing) -> str:
