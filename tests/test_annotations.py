@@ -1,7 +1,6 @@
 """Annotated shapes of the textbook's functions and of the pseudoinverses, which beartype holds against the arrays."""
 
-import subprocess
-import sys
+from tests.fresh_process import python
 
 CODE = """
 from jaxtyping import TypeCheckError, install_import_hook
@@ -43,5 +42,4 @@ for wrong in (lambda: constraints.psi_q(mech, 0.0, q.reshape(-1, 3)[:, :2]), lam
 
 
 def test_arrays_have_the_annotated_shapes():
-    found = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
-    assert found.stdout.split() == ["refused", "refused"], found.stderr[-2000:]
+    assert python(CODE).split() == ["refused", "refused"]

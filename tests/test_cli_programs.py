@@ -1,10 +1,8 @@
 """Where commands let JAX store what it compiles."""
 
-import os
-import subprocess
-import sys
-
 import pytest
+
+from tests.fresh_process import python
 
 SHOW = """
 import os
@@ -15,22 +13,14 @@ print(os.environ.get("JAX_COMPILATION_CACHE_DIR"))
 
 
 @pytest.mark.parametrize(
-    "given, expected",
+    "code, given, expected",
     [
-        ({"UDKJAX_CACHE": "/somewhere"}, "/somewhere/jax"),
-        ({"UDKJAX_CACHE": "0"}, "None"),
-        ({"UDKJAX_CACHE": "/somewhere", "JAX_COMPILATION_CACHE_DIR": "/elsewhere"}, "/elsewhere"),
+        (SHOW, {"UDKJAX_CACHE": "/somewhere"}, "/somewhere/jax"),
+        (SHOW, {"UDKJAX_CACHE": "0"}, "None"),
+        (SHOW, {"UDKJAX_CACHE": "/somewhere", "JAX_COMPILATION_CACHE_DIR": "/elsewhere"}, "/elsewhere"),
+        (f"import jax\n{SHOW}", {"UDKJAX_CACHE": "/somewhere"}, "None"),
     ],
-    ids=["beside machine code", "nowhere", "where it was told to"],
+    ids=["beside machine code", "nowhere", "where it was told to", "left alone where JAX is imported already"],
 )
-def test_programs_are_stored_beside_machine_code(given, expected):
-    environment = {name: text for name, text in os.environ.items() if not name.startswith("JAX_")} | given
-    shown = subprocess.run([sys.executable, "-c", SHOW], env=environment, capture_output=True, text=True, check=True)
-    assert shown.stdout.strip() == expected
-
-
-def test_who_has_imported_jax_is_left_alone():
-    code = f"import jax\n{SHOW}"
-    environment = {name: text for name, text in os.environ.items() if not name.startswith("JAX_")}
-    shown = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert shown.stdout.strip() == "None"
+def test_programs_are_stored_beside_machine_code(code, given, expected):
+    assert python(code, **given) == expected

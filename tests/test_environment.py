@@ -1,21 +1,14 @@
 """What importing the package sets up: float64, and nothing else."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.fresh_process import python
+
 CONFTEST = str(Path(__file__).with_name("conftest.py"))
 SHOW = "import os; print(jax.numpy.result_type(float), jax.config.jax_compilation_cache_dir, os.environ.get('XLA_FLAGS'))"
 JAX_FIRST, UDKJAX_FIRST = "import jax, udkjax", "import udkjax, jax"
-
-
-def python(code: str, **environment: object) -> str:
-    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", **{k: str(v) for k, v in environment.items()}}
-    done = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=True)
-    assert "Traceback" not in done.stderr
-    return done.stdout.strip()
 
 
 @pytest.mark.parametrize(

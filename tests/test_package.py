@@ -1,18 +1,16 @@
 """The house: floors import only from below, the public face is what it says, and importing it costs nothing."""
 
-import ast
 import os
 import re
-import subprocess
-import sys
 import tomllib
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import udkjax
+from tests.fresh_process import python
+from tests.imports import imports
 from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
@@ -40,17 +38,6 @@ ONLY_IN = {
     "uvicorn": {"studio"},
     "distributed": {"study"},
 }
-
-
-def imports(file: Path, package: str) -> Iterator[str]:
-    """Every module that a file imports, by its full name, wherever in the file it does so. `package` is the one it is in."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (name.name for name in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            base = ".".join([*above, *([node.module] if node.module else [])])
-            yield from (f"{base}.{name.name}" for name in node.names)
 
 
 def violations(root: Path) -> list[str]:
@@ -134,11 +121,6 @@ def test_the_public_names_are_there():
         udkjax.simulat  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def python(code: str, **environment: str) -> str:
-    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", **environment}
-    return subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=True).stdout.strip()
-
-
 def test_importing_the_package_imports_nothing_else():
     assert python("import sys, udkjax; print({'jax', 'numpy', 'equinox', 'diffrax'} & set(sys.modules))") == "set()"
 
@@ -214,6 +196,4 @@ def test_every_optional_package_has_its_extra():
 
 def test_no_warning_is_given_by_importing_and_running():
     code = "import udkjax as udk; udk.simulate(udk.library.double_pendulum(), [0.0, 0.1]); print('quiet')"
-    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", "UDKJAX_CACHE": os.environ["UDKJAX_CACHE"]}
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], env=clean, capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("quiet\n", "")
+    assert python(code, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"], PYTHONWARNINGS="error") == "quiet"

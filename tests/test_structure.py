@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import udkjax
+from tests.imports import imports
 
 ROOT = Path(udkjax.__file__).parent
 
@@ -28,15 +29,7 @@ def modules(root: Path) -> dict[str, Path]:
 def imported(file: Path, name: str, known: dict[str, Path]) -> set[str]:
     """The modules that one imports, anywhere in its text: at its top, inside functions, for types."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-    found = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            parts = package.split(".")
-            base = ".".join([*parts[: len(parts) - node.level + 1], *([node.module] if node.module else [])])
-            base = base if node.level else node.module or ""
-            found |= {f"{base}.{alias.name}" if f"{base}.{alias.name}" in known else base for alias in node.names}
+    found = {full if full in known else full.rpartition(".")[0] for full in imports(file, package)}
     return {module for module in found if module in known and module != name}
 
 
