@@ -62,5 +62,5 @@ def main(words: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    os.environ["UDKJAX_CACHE"] = "0"  # what was compiled before would be found; `startup` looks at that by itself
+    os.environ["UDKJAX_CACHE"] = "0"  # otherwise programs compiled before would be found; `startup` measures that by itself
     main()

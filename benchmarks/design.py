@@ -16,7 +16,7 @@ from udkjax.study.design.design import DesignSearch
 
 CASES = Path(__file__).parents[1] / "tests" / "data" / "path_synthesis.json"
 STARTS, SEEDS = 300, 100
-DIGITS = 1e-6  # that errors were published to
+DIGITS = 1e-6  # precision of published errors
 LINKAGE = udk.Drawing(
     pins={"O": (0, 0), "A": (3, 4), "B": (12, 9), "P": (6, 12), "C": (10, 0)},
     links={name: {"pins": list(pins), "mass": 1.0} for name, pins in (("crank", "OA"), ("coupler", "ABP"), ("rocker", "CB"))},

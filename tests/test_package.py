@@ -183,15 +183,10 @@ def test_every_optional_package_has_its_extra():
     core = {re.split(r"[\[>=<]", line)[0] for line in project["dependencies"]}
     assert core.isdisjoint(EXTRAS)
     extras = {name: " ".join(lines) for name, lines in project["optional-dependencies"].items()}
-    transitive = {
-        "PIL": "pillow",
-        "imageio_ffmpeg": "imageio-ffmpeg",
-        "distributed": "dask",
-        "h5py": "h5netcdf",
-        "pandas": "xarray",
-    }  # comes with it
+    comes_with = {"PIL": "pillow", "imageio_ffmpeg": "imageio-ffmpeg", "distributed": "dask"}
+    comes_with |= {"h5py": "h5netcdf", "pandas": "xarray"}
     for package, extra in EXTRAS.items():
-        assert transitive.get(package, package) in extras[extra]
+        assert comes_with.get(package, package) in extras[extra]
 
 
 def test_no_warning_is_given_by_importing_and_running():

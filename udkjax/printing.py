@@ -237,7 +237,7 @@ def prints_table(cls: Class) -> Class:
 def _table_of(record: Any) -> PrintedTable:
     make = getattr(record, "_table" if has_numbers(record) else "_shapes", None)
     try:
-        with jax.ensure_compile_time_eval():  # what is known is computed, also while something else is traced
+        with jax.ensure_compile_time_eval():  # known numbers are computed, also while something else is traced
             return fields_table(record, getattr(record, "_units", {})) if make is None else make()
     except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError):  # JAX puts marks in the place of numbers
         return fields_table(record, getattr(record, "_units", {}))

@@ -87,7 +87,7 @@ class Peer(NamedTuple):
 
     name: str
     package: str  # as it is called where it is installed from
-    knob: str  # what is turned for accuracy
+    knob: str  # the setting that decides on accuracy
     knobs: tuple[float, ...]  # from coarse to fine
     setup: Callable[..., Run]  # from the Problem, or from the Batch; imports the package
     batch: int = 1  # trajectories that run at once, from starts within `SPREAD`

@@ -30,7 +30,7 @@ NAMES = (
     "six_bar_dwell",
 )
 DRAWINGS = {"toggle_press": 1.0, "quick_return": 2.0, "cam_follower": 0.5, "door_closer": 6.0, "scissor_lift_spring": 2.0}  # s
-PLAYER = "player.js"  # what moves their pages
+PLAYER = "player.js"  # the script of all pages
 FRAMES = 121  # of their players
 WIDTH = 720  # px, of pictures
 DPI = 96  # of plots

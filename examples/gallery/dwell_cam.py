@@ -12,7 +12,7 @@ from udkjax.show.style import COLOURS, plain
 LOW, HIGH = 0.25, 0.40  # m: the radii of the cam
 STEM = 0.15  # m: from the follower's tip to its centre
 RATE = 2.0  # rad/s
-LIVE = ["driver.motor.motion.coefficients", "gravity[1]", "body.follower.mass", "body.cam.inertia"]  # what its page changes
+LIVE = ["driver.motor.motion.coefficients", "gravity[1]", "body.follower.mass", "body.cam.inertia"]  # changed by its page
 
 
 def radius(angle):

@@ -7,7 +7,7 @@ import numpy as np
 
 import udkjax as udk
 
-LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # what its page changes
+LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # changed by its page
 FILM = {"width": 400, "fps": 12.5, "speed": 0.35}  # of one turn
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 import udkjax as udk
 
-LIVE = [  # what its page changes
+LIVE = [  # changed by its page
     "gravity",
     "joint.A3.points[0]",
     "joint.A3.points[1]",

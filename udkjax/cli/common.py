@@ -45,7 +45,7 @@ __all__ += ["fail", "load", "output_times", "refuse", "say", "show"]
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml")]
 JsonValue = dict[str, "JsonValue"] | list["JsonValue"] | str | float | bool | None
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="write the results as JSON.")]
-MOST_TIMES = 10**7  # that a command writes: some gigabytes for a few bodies
+MOST_TIMES = 10**7  # output times of a command: some gigabytes for a few bodies
 Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not show how far it is.")]
 
 

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 DATASET_SUFFIXES = (".nc", ".h5", ".csv", ".npz")  # of datasets; .h5 is NetCDF too, which is HDF5 within
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf", ".jpg")
-FILE_SUFFIXES = (*DATASET_SUFFIXES, *PICTURE_SUFFIXES, ".html", ".json", ".toml")  # what no folder is called
+FILE_SUFFIXES = (*DATASET_SUFFIXES, *PICTURE_SUFFIXES, ".html", ".json", ".toml")  # suffixes that no folder has
 
-# What the columns of a .csv are called, as measurements are: `body.crank.vx [m/s]`.
+# Names of columns of a .csv, like those of measurements: `body.crank.vx [m/s]`.
 COLUMN_NAMES = {"q": ("x", "y", "angle"), "v": ("vx", "vy", "omega"), "a": ("ax", "ay", "alpha")}
 
 

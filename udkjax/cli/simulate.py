@@ -103,7 +103,7 @@ def simulate(
     if max_steps is not None:
         choices["max_steps"] = max_steps
     with _stopwatch() as seconds, warnings.catch_warnings():
-        warnings.simplefilter("ignore", AssemblyWarning)  # which the summary says
+        warnings.simplefilter("ignore", AssemblyWarning)  # the summary reports it
         sol = udk.simulate(mech, ts, **choices)
         np.asarray(sol.q)  # JAX runs ahead: wait for it
 
@@ -145,7 +145,7 @@ def _stopwatch() -> Iterator[dict[str, float]]:
     def listen(event: str, duration_secs: float, **_: object) -> None:
         if event.startswith("/jax/core/compile/"):
             end = time.perf_counter()
-            while spans and spans[-1][0] > end - duration_secs:  # what is traced inside this is a part of it
+            while spans and spans[-1][0] > end - duration_secs:  # inner traces are parts of this one
                 spans.pop()
             spans.append((end - duration_secs, end))
 

@@ -65,7 +65,7 @@ class PartitionedSystem(WrappedSystem):
 
     equations: MechanismSystem
     formulation: CoordinatePartitioning
-    dependent: Bool[Array, "n"] | None = None  # which coordinates are dependent, where the partition is fixed
+    dependent: Bool[Array, "n"] | None = None  # the dependent coordinates, if the partition is fixed
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """a = a_p + N z at the state as it is."""

@@ -75,7 +75,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism whose numbers are known, by NumPy."""
     mechanism = jax.tree.map(np.asarray, mechanism.at(0.0))
     q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
-    with np.errstate(all="ignore"):  # what is not finite is no scale
+    with np.errstate(all="ignore"):  # numbers that are not finite are no scales
         found = _scales(mechanism, _guess_terms(mechanism, q, v, np), np)
     return jax.tree.map(number, found)
 

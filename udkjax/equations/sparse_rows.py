@@ -161,7 +161,7 @@ class SparseRows(RowTerms):
         if not np.all(np.isfinite(D.data)):
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
-        for _ in range(VELOCITIES + 1):  # what the first leaves because of its damping
+        for _ in range(VELOCITIES + 1):  # the damped first correction leaves a rest
             v = v + self._solve(D, self.geometry(t, q, v)[1] / length)
         return q, v, psi, self.geometry(t, q, v)[1], rank
 

@@ -153,7 +153,7 @@ def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[
     """Evaluate a loop of known length, round by round."""
     body, order = equation.params["jaxpr"], range(equation.params["length"])
     inner = getattr(body, "jaxpr", body)
-    # What is given round by round has one dimension more outside; before it come what is fixed, and what is handed on.
+    # Inputs of each round have one dimension more outside; fixed ones and those handed on come before them.
     rows = sum(a.aval.shape != b.aval.shape for a, b in zip(equation.invars, inner.invars, strict=True))
     carries = sum(a.aval.shape == b.aval.shape for a, b in zip(equation.outvars, inner.outvars, strict=True))
     ends = np.cumsum([len(inputs) - carries - rows, carries])
@@ -228,7 +228,7 @@ def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates:
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
     """Select the elements of an indexing with known indices: JAX selects them from an array of their places."""
     array, *indices = inputs
-    places, outside = np.arange(array.size).reshape(array.shape), array.size  # what stands for an index beyond the end
+    places, outside = np.arange(array.size).reshape(array.shape), array.size  # a place for indices beyond the end
     parameters = {**equation.params, "fill_value": outside} if "fill_value" in equation.params else equation.params
     taken = _fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
     if not np.any(taken == outside):

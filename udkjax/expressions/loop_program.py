@@ -14,7 +14,7 @@ import numpy as np
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
-# What an output does with the number in its place: replace it, be added to it, stay if it is larger, or if it is not true.
+# Ways to write an output over the number in its place: replace it, add to it, keep the larger one, or whichever is false.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
 ADD_ONE_BY_ONE = "add one by one"  # in loops by NumPy
 MOST_TURNS = 8  # updates of one place by a loop, in a program of JAX: each is an operation of it, or all are a loop

@@ -120,17 +120,17 @@ def close(
         close = _close if is_within_jit() else _close_compiled  # in which known numbers are traced, too
         return close(mechanism.without_origin.at(t), analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
-        analysis = None  # that of the known mechanism, which lasts
+        analysis = None  # the analysis of the known mechanism lasts
     return _closure_of_known(mechanism, np.asarray(t).item(), state, analysis)
 
 
-@cached_by_identity  # who simulates a mechanism again need not close it again
+@cached_by_identity  # a second run of a mechanism need not close it again
 def _closure_of_known(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
     with jax.ensure_compile_time_eval():
         scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
-        with np.errstate(all="ignore"):  # what is not finite does not close
+        with np.errstate(all="ignore"):  # a state that is not finite does not close
             q, v, psi, psi_dot, rank = _close_known(mechanism, scales, t, q, v)
             closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
@@ -190,7 +190,7 @@ class Check(NamedTuple):
     time: float  # s
     mass: float  # kg
     moved: tuple[str, ...] = ()  # by assembly, far beside their sizes
-    suspicious: tuple[str, ...] = ()  # what is likely a mistake
+    suspicious: tuple[str, ...] = ()  # likely mistakes
 
     def _table(self) -> PrintedTable:
         return PrintedTable("mechanism, checked", list(check_lines(self).items()))

@@ -43,7 +43,7 @@ class RunPlan:
     operation: RunStates | None  # of machine code that integrates it
     evaluation: Accelerate | None  # of machine code that evaluates its equations for diffrax; None: the textbook's own
     why_not_native: str  # why there is none, or it is not taken; empty where it is
-    independent_rows: int = 0  # that the method takes
+    independent_rows: int = 0  # the number of rows that the method takes
 
     @property
     def is_native(self) -> bool:
@@ -159,7 +159,7 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
 def _textbook(equations: AbstractSystem) -> TextbookEquations:
     """Return the equations of a mechanism, whatever formulation is around them."""
     inner = equations.equations if isinstance(equations, WrappedSystem) else equations
-    assert isinstance(inner, TextbookEquations)  # those of a system of the user's own are nothing else
+    assert isinstance(inner, TextbookEquations)  # a user's own system has textbook equations
     return inner
 
 

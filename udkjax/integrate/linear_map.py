@@ -161,7 +161,7 @@ class Linear(eqx.Module):
 
     function: DifferentiableFunction
     xs: list[Array]
-    run: Any  # what evaluating it has left for its first derivatives; None: nothing
+    run: Any  # stored by the evaluation for its first derivatives; None: nothing
     active: Mask = eqx.field(static=True)
     transposed: bool = eqx.field(static=True, default=False)
 

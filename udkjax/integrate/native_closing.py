@@ -17,7 +17,7 @@ from udkjax.native.operations import Close, CloseCotangents, CloseSecondTangents
 from udkjax.native.primitive import call_known, native_p, unsupported
 from udkjax.scene.mechanism import Mechanism
 
-# What closing finds: q, v, what is left of Psi and of Psi_dot, and the rank of D.
+# Results of closing: q, v, the residuals Psi and Psi_dot, and the rank of D.
 Closed = tuple[Array, Array, Array, Array, Array]
 
 

@@ -35,7 +35,7 @@ from udkjax.scene.identity_cache import cached_by_identity
 def packed(problem: Problem) -> tuple[RunStates, list[np.ndarray]]:
     """Return the operation of a problem whose numbers are all known, and its inputs."""
     operation = problem.compiled.plan.operation
-    assert operation is not None  # who comes here has asked whether there is one
+    assert operation is not None  # checked by the caller
     return operation, _inputs(problem, operation, np)
 
 
@@ -120,7 +120,7 @@ def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, t
 def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
     """Return the second derivatives of positions, velocities and the end along two changes, each of what is active in it."""
     run = problem.compiled.plan.operation
-    assert run is not None  # who comes here has asked whether there is one
+    assert run is not None  # checked by the caller
     operation = run.with_second_tangents(active_numbers(_numbers_of(problem), _active_of(problem, active)))
     return _integrate_along(problem, changes, operation)[1]
 
@@ -164,7 +164,7 @@ def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: A
 def _operation(problem: Problem, active: Problem | None = None, reverse: bool = False) -> RunStates:
     """Return the operation of a problem: a run, or one with tangents or cotangents of what is active."""
     run = problem.compiled.plan.operation
-    assert run is not None  # who comes here has asked whether there is one
+    assert run is not None  # checked by the caller
     if active is None:
         return run
     which = active_numbers(_numbers_of(problem), _active_of(problem, active))

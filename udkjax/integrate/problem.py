@@ -32,9 +32,8 @@ class Problem:
     rate: Float[Array, ""]  # of the system and the run (1/s)
     max_steps: Int[ArrayLike, ""]
     marks: Float[Array, "m"] | None = None  # of rows of Psi: one for those that are independent; None: machine code knows them
-    points: int | None = field(
-        default=None, metadata={"static": True}
-    )  # that a record for reverse mode has room for; None: by breakpoints
+    # Capacity of a record for reverse mode; None: by breakpoints.
+    points: int | None = field(default=None, metadata={"static": True})
 
     @property
     def equations(self) -> AbstractSystem:

@@ -170,7 +170,7 @@ def simulate(
     if not isinstance(mechanism, Mechanism) or not is_known or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:
-        analysis = analyse(mechanism)  # what was given was of other numbers, in which a row depended
+        analysis = analyse(mechanism)  # the given analysis was of other numbers, of which a row was redundant
         solution, _, end = _run(mechanism, analysis, ts, state, closure, choices)
     if _has_failed(solution):
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)

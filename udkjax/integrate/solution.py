@@ -50,7 +50,7 @@ class Result(PrintsWords):
         return self.label if self is Result.successful else f"{self.label}: {CAUSES[self]}"
 
 
-# What is true of every run that ended so. `Solution.cause` says more of a single run, where more is found.
+# Causes that every run with the result shares. `Solution.cause` says more of a single run, where more is found.
 CAUSES = {
     Result.successful: "the end time was reached",
     Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for what is stiff",

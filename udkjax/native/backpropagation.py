@@ -163,7 +163,7 @@ class Reverse(Recorded):
                 f.call("differences_back", f.given["work"])
             f.call("step_back", f.given["work"])
             self._move_back(f, s)
-        # What is left is that of the first state as it was given, which is the first output, too.
+        # The remaining cotangent is that of the first state as it was given, which is the first output, too.
         for k in self._each_lane(f, s.ready > 0.5):
             self._add_output(f, k, f.const(0, INT), "bar point3")
             for x in "qv":

@@ -21,7 +21,7 @@ from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.tableau import EULER
 from udkjax.native.weighted_rows import WeightedRows
 
-CORRECTED = "qv"  # what a correction is of, by its number in a record
+CORRECTED = "qv"  # corrected quantities, by their number in a record
 
 
 class Closing(Module):
@@ -151,7 +151,7 @@ class Closing(Module):
         with f.each(self.n) as i:
             f.store(self.change(f, x, i), f.given["work"], i + self.places[f"state d{x}"])
 
-    # What closing with derivatives does besides (closing_derivatives.py).
+    # --- hooks for derivatives (closing_derivatives.py)
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
         """Hook: called at the state before each correction with its `scale`, and one if that was `limited`."""

@@ -26,7 +26,7 @@ MOST_JUMPS = 3  # of conditions, before intervals are as long again as they were
 # that no oscillation is zero at all nodes.
 MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
 MOST_STUCK = 4  # times in a row that intervals become finer: before a jump, some of the finer ones are clear
-FIRST, SECOND, THIRD = range(3)  # which node of two intervals is next
+FIRST, SECOND, THIRD = range(3)  # the node of two intervals that is next
 LAST_CHANGE = 1e-7  # of the event time, in T: Taylor's step makes an error of its square
 MOST_LANDINGS = 5  # steps that end at a crossing: one, as a rule
 LEAST_STEP = 10  # times the smallest, to a crossing: the next may be a fifth as long

@@ -80,7 +80,7 @@ class LoopWriter:
                 new = f.like(value, DOUBLE, width)
                 if slot.update == ADD:
                     new = f.load(*address(slot), width) + new
-                elif slot.update in (MAXIMUM, ALL):  # what is not a number stays
+                elif slot.update in (MAXIMUM, ALL):  # NaN stays
                     name = "maximum" if slot.update == MAXIMUM else "minimum"
                     new = f.intrinsic(name, f.load(*address(slot), width), new)
                 f.store(new, *address(slot), width)

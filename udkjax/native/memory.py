@@ -25,12 +25,12 @@ class Memory:
     rowcount: int  # registers that they take
     stage_accelerations: list[str]
 
-    settings: tuple[str, ...] = SETTINGS  # that it takes
+    settings: tuple[str, ...] = SETTINGS  # settings that it takes
     inputs: tuple[str, ...] = ()  # besides those of every run
     results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()  # inputs and outputs of which it must know how many numbers they have of each member
-    directions_in = 0  # which dimension of the last input says how many directions there are
+    directions_in = 0  # the dimension of the last input that counts the directions
     written_text = ""  # the whole module, once it is written
 
     @property

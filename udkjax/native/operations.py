@@ -52,7 +52,7 @@ class Operation(ABC):
 
     code: ScenePrograms
 
-    settings: ClassVar[tuple[str, ...]] = SETTINGS  # that its kind takes
+    settings: ClassVar[tuple[str, ...]] = SETTINGS  # settings of this kind of operation
     in_lanes: ClassVar[bool] = True  # whether members run side by side
     results: ClassVar[int] = len(OUTPUTS)  # the first outputs, which have no directions
     is_reverse: ClassVar[bool] = False  # whether it runs and walks back in two passes, each without what the other finds
@@ -201,7 +201,7 @@ class RunCotangents(RunStates):
     """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
 
     active: tuple[bool, ...] = ()
-    points: int = STORED  # that the record of a run has room for
+    points: int = STORED  # capacity of the record of a run
     is_reverse: ClassVar[bool] = True
 
     def module(self, width: int, beside: int, vector: int) -> Module:

@@ -174,7 +174,7 @@ class _Text:
             size = f.variable(0.0)
             with f.each(n) as i:
                 step = f.abs(self._load(f, "new", i) - self._load(f, "q", i)) / self._load(f, "unit", i)
-                size.value = f.select(step <= size.value, size.value, step)  # what is not a number stays
+                size.value = f.select(step <= size.value, size.value, step)  # NaN stays
             goes = (todo.value > 0.5) & (size.value < f.repeat(most, self.width))
             with f.each(n) as i:
                 self._put(f, "q", f.select(goes, self._load(f, "new", i), self._load(f, "q", i)), i)

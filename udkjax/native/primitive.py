@@ -168,7 +168,7 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     found = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
     if not operation.is_reverse:
         return found
-    # What a pass leaves out, as in `LoadedCode`, is memory as it was.
+    # Outputs that a pass does not write, as in `LoadedCode`, are uninitialized memory.
     results, (*bars, record) = found[: len(OUTPUTS)], found[len(OUTPUTS) :]
     if inputs[-1].shape[0]:
         return [*map(jnp.zeros_like, results), *bars, record]

@@ -28,7 +28,7 @@ class UnsupportedError(ValueError):
     """Something in a scene that machine code has no instruction for."""
 
 
-Place = tuple[str, int]  # which pointer, and the how manieth number from there
+Place = tuple[str, int]  # the name of a pointer, and an index from there
 
 
 def consecutive(pointer: str, count: int) -> list[Place]:

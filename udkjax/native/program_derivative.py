@@ -20,7 +20,7 @@ from udkjax.native.module import Module
 from udkjax.native.program import Place
 
 WAYS = ("d", "e", "de")  # the changes along two directions and along both, of which tangents hold one each
-GIVEN = ("d", "e")  # those of numbers and of the first state: along both they do not change
+GIVEN = ("d", "e")  # directions of numbers and of the first state do not change along either
 
 
 class ProgramDerivative:

@@ -57,7 +57,7 @@ LOST_TOL = 1e-2
 
 LOOK_AHEAD = 1e-6  # of the span: how far beyond the end of a run that stopped one looks for what is not finite
 
-# How much of an error counts that projection takes back. What lasts of it is what it does to the rest while the step is taken.
+# Weight of the error component normal to the manifold, which projection removes: it lasts only by its effect within the step.
 # Close to singular configurations it is the stages' distance from the manifold over a small singular value: for its sake alone,
 # steps were up to six times as many at tolerances of 1e-11. A hundredth keeps some of these; with none of it, runs that cross are
 # less exact than their tolerance says.
@@ -80,8 +80,8 @@ NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds no
 # Of the characteristic length, and rad: a Newton step that moves q by less leaves rounding errors, since it converges
 # quadratically.
 NEWTON_TOL = 1e-8
-# What an output may be open after its projection, each row over its scale: what Newton's last step leaves is far below, what
-# interpolation leaves of a row that is not projected far above it. Beyond, it is closed on all rows.
+# Tolerance of an output after its projection, each row over its scale: Newton's last step leaves far less, and
+# interpolation of a row that is not projected far more. Beyond it, the output is closed on all rows.
 OPEN_OUTPUT = 1e-9
 # An output that lies nearer to the manifold takes one Newton step in q and v alike: what that leaves is the square.
 SINGLE_STEP_TOL = 1e-7

@@ -104,7 +104,7 @@ class WeightedRows(RowEntries):
         """Return D^+ W b, with b in an array."""
         d = self.matrices(f)
         b = d.row("b")
-        b.clear()  # what fills the last register has been multiplied by what was no number, perhaps
+        b.clear()  # padding of the last register may have been multiplied by NaN
         with f.each(d.m) as i:
             row = self.row_of_psi(f, i)
             b.put(i, self.array(f, right, row + start) * self.array(f, "weights", row))

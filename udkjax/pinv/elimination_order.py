@@ -75,7 +75,7 @@ def order_blocks(sizes: Sequence[int], holds: Sequence[Set[int]]) -> list[Fronts
     while ready:
         key = max(ready, key=lambda key: len(ready[key]))
         blocks = ready[key]
-        for k in blocks:  # those that need wait no more join while it goes on
+        for k in blocks:  # blocks that need not wait any longer join the list in this loop
             j = parent[k]
             if j >= 0:
                 waits[j] -= 1

@@ -22,7 +22,7 @@ from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, Check, G
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# How instances of the classes that arguments may have are made, for messages.
+# Examples of how to make an argument of each class, for messages.
 EXAMPLES = {
     "Mechanism": 'udk.load("scene.toml")',
     "State": "udk.State(q, v)",

@@ -67,7 +67,7 @@ def number(value: Numbers) -> Float[Array, "..."]:
         found = jax.device_put(value)  # jnp.asarray would compile a program for each shape
         if not isinstance(found, Tracer):
             return found
-        with jax.ensure_compile_time_eval():  # what is known stays known while something else is traced
+        with jax.ensure_compile_time_eval():  # known numbers stay known while something else is traced
             return jax.device_put(value)
     return jnp.asarray(value, dtype=dtype)
 

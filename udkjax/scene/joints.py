@@ -179,7 +179,7 @@ class Distance(Joint):
     def complete(self, *frames):
         length = between(self.points, *frames).norm()
         reach = sum(abs(x) for frame, point in zip(frames, self.points, strict=True) for x in (frame.x, frame.y, *point))
-        # What rounding leaves of points that coincide has no direction: a length of zero, which the mechanism refuses.
+        # The rounding between points that coincide has no direction: a length of zero, which the mechanism refuses.
         return fill(self, "length", array_namespace(length).where(length > ROUNDING * reach, length, 0.0))
 
 

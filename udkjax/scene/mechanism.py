@@ -113,7 +113,7 @@ class Mechanism(PrintsTable):
     _joints: tuple[Joint, ...]
     _drivers: tuple[Driver, ...]
     _forces: tuple[ForceElement, ...]
-    drawing: AbstractDrawing | None = None  # that it was made from
+    drawing: AbstractDrawing | None = None  # the drawing that it was made from
     changed: tuple[str, ...] = eqx.field(static=True, default=())  # numbers that do not follow from the drawing any more
 
     def __init__(

@@ -65,7 +65,7 @@ def _check_analysis(name: str, value: Any, given: Given) -> None:
 
 def _of_diffrax(kind: str, example: str) -> Check:
     def check(name: str, value: Any, given: Given):
-        diffrax = sys.modules.get("diffrax")  # who has an instance of its classes has imported it
+        diffrax = sys.modules.get("diffrax")  # imported already by whoever has an instance of its classes
         if not (diffrax and isinstance(value, getattr(diffrax, kind))):
             meant = f"an instance of diffrax's, such as {name}={example}, or None"
             raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")

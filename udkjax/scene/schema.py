@@ -41,12 +41,8 @@ CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
     "force": _by_type(forces, forces.ForceElement),
     "motion": _by_type(drivers, drivers.Motion),
 }
-CLASSES_WITHOUT_TYPE: dict[str, type] = {
-    "body": Body,
-    "driver": drivers.Driver,
-    "profile": joints.Profile,
-    "held": Held,
-}  # tables without a `type`
+# Tables without a `type`.
+CLASSES_WITHOUT_TYPE: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": joints.Profile, "held": Held}
 
 
 def is_in_format(cls: type) -> bool:

@@ -117,7 +117,7 @@ _SIZES = {
     _TORQUE: {"Nm": 1.0, "mNm": 1e-3, "kNm": 1e3, "Nmm": 1e-3, "Ncm": 1e-2},
 }
 _UNITS = {name: _Unit(size, dimension) for dimension, sizes in _SIZES.items() for name, size in sizes.items()}
-_GRAVITY = _Unit(9.80665, _ACCELERATION)  # what "g" is to an accelerometer; else it is a gram
+_GRAVITY = _Unit(9.80665, _ACCELERATION)  # "g" of an accelerometer; elsewhere "g" is a gram
 _SPELLINGS = {
     "°": "deg",
     "²": "2",

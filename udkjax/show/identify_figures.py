@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MOST_WRITTEN = 14  # parameters up to which correlations are written as numbers too
 LARGEST_ERROR = 1e3  # percent: standard errors that are larger are drawn as this
 HIGHEST_COST = 3.0  # times the limit of a profile likelihood: what is higher is not drawn
-ZERO_DRAWN = 1e-18  # what is zero is drawn as this where an axis is logarithmic
+ZERO_DRAWN = 1e-18  # zero is drawn as this on a logarithmic axis
 
 
 def pictures(data: "xarray.Dataset") -> dict[str, Figure]:

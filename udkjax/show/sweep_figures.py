@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Colours = tuple[Colormap | str, Normalize]
 
 RESULT_VARIABLE, MEMBER_DIMENSION = "result", "member"  # the variable of the codes, and the dimension of a design
-OTHER_RESULT = "not computed"  # what has a code of no `Result`
+OTHER_RESULT = "not computed"  # label of codes that no `Result` has
 RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their order, successes in grey, and of the others
 MISSING_COLOUR = "0.75"  # where there is no value
 LOGARITHMIC_RATIO = 1e2  # from this ratio of the largest to the smallest value on, colours and axes are logarithmic

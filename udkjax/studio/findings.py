@@ -18,7 +18,7 @@ from udkjax.study.kinematics import travel
 from udkjax.study.report import plural
 
 Json = dict[str, Any]
-MOST_FIXES = 8  # that are listed of one redundancy
+MOST_FIXES = 8  # fixes listed for one redundancy
 IN_LINE = 1e-4  # rad: of a toggle that is found to rounding, whose angle errs by the root of that
 
 

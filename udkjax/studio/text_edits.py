@@ -15,7 +15,7 @@ from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]
-NEW_TABLES = ("pins", "velocities")  # that get a header of their own
+NEW_TABLES = ("pins", "velocities")  # tables that get a header of their own
 HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries get one each
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from udkjax.studio.limits import RefusedError
 
 TASKS = "udkjax.studio.tasks"
-END_SECONDS = 5.0  # that a process has to end by itself
+END_SECONDS = 5.0  # time for a process to end by itself
 
 
 class Worker:

@@ -133,7 +133,7 @@ def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, "
     Below the top it swings, sin(phi / 2) = k sn(omega t + u, k); above it turns over, phi / 2 = am(k omega t + u, 1 / k). The
     first amplitude comes from atan2: asin would lose half of the digits at a release from rest.
     """
-    from scipy.special import ellipj, ellipkinc  # which takes longer to import than a run
+    from scipy.special import ellipj, ellipkinc  # importing SciPy takes longer than a run
 
     if omega == 0:
         return rate * ts

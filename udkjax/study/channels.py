@@ -58,7 +58,7 @@ class Channel:
     needs: Needs
     section: str  # body, joint, pin, driver or distance
     owner: str  # the joint or driver; else empty
-    bodies: tuple[str, ...]  # whose it is; of an angle at a joint, and of a distance, both
+    bodies: tuple[str, ...]  # the bodies that it belongs to: two for an angle at a joint, or a distance
     points: tuple[Point, ...] = ()  # of each body
     quantity: str = ""
 

@@ -109,7 +109,7 @@ def follow(
     Of a batch one member follows another: side by side all would take as many steps as the slowest. Without derivatives.
     """
     if curve.by.xp is np:
-        with np.errstate(all="ignore"):  # what is not finite closes nothing
+        with np.errstate(all="ignore"):  # positions that are not finite are not closed
             return _follow(curve, s, q, values, points, first) if first < len(values) else points
     return sequential(_follow, curve, s, q, values, points, first)
 

@@ -105,7 +105,7 @@ def solve(function: Callable[..., Result], *given: Any) -> Result:
 
 
 def _by_jax(function: Callable[..., Result], *given: Any) -> Result:
-    return function(*given, BY_JAX)  # which is told by its identity: given to a compiled function it would be another one
+    return function(*given, BY_JAX)  # compared by identity: given to a compiled function it would be another one
 
 
 def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:

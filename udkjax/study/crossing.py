@@ -24,7 +24,7 @@ SPACINGS = (0.04, 0.015, 0.005)
 # Steps h from the point to the nearest and to the farthest of the others, twelve in all: they multiply errors by 13. With fewer
 # the polynomials err more, with more or nearer ones rounding does.
 NEAREST_NODE, FARTHEST_NODE = 2, 7
-# How far the polynomials through twelve and through ten values may differ in q, q' and q'', scaled: a hundred times their error.
+# Bounds on how the polynomials through twelve and ten values differ in q, q' and q'', scaled: a hundred times their error.
 ACCEPTED_DIFFERENCES = (1e-9, 1e-7, 1e-5)
 
 
@@ -116,7 +116,7 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
     ]
     at = xp.append(q, X[-1])
     E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
-    at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # what E sees well is closed to rounding
+    at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # the part that E resolves well is closed to rounding
     known = xp.all(closed) & curve.is_closed(at) & (tau[-1] != 0)
     doubt = xp.where(known, xp.max(xp.stack(doubts)), xp.inf)
     doubt = xp.where(xp.isfinite(doubt), doubt, xp.inf)

@@ -69,7 +69,7 @@ class Driven(NamedTuple):
     analysis: Analysis
     name: str  # of the driver; empty where s is time itself
     row: int  # of the driver in Psi; -1 where s is time itself
-    unit: Float[Array, ""]  # what s is measured by: one radian, the scale of a length, the mechanism's own time
+    unit: Float[Array, ""]  # the unit of s: one radian, the scale of a length, the mechanism's own time
 
     @property
     def is_angle(self) -> bool:

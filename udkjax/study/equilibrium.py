@@ -50,7 +50,7 @@ class Equilibrium(PrintsTable):
     q: Float[Array, "bodies 3"]
     multipliers: Float[Array, "m"]  # lambda of F = Psi_q^T lambda (N, N m), of least norm; rows as in `analyse`
     omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
-    residual: Float[Array, ""]  # what is left of the loads along free directions, relative to the scale of forces
+    residual: Float[Array, ""]  # remaining loads along free directions, relative to the scale of forces
     balanced: Bool[Array, ""]
     neutral: Float[Array, ""]  # (rad/s)^2: an omega2 of no more is rounding
     bodies: tuple[str, ...] = eqx.field(static=True, default=())

@@ -77,7 +77,7 @@ class Explanation(NamedTuple):
     null_rows: Float[np.ndarray, "m k"]  # N: combinations of rows of Psi_q that vanish
     constraint_force: Float[np.ndarray, "n"]  # -Psi_q^T lambda
     gauss: Gauss
-    checks: dict[str, float]  # what must vanish, relative to what it is the difference of
+    checks: dict[str, float]  # differences that must vanish, relative to their terms
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and texts, for JSON."""

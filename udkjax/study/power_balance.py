@@ -40,7 +40,7 @@ class PowerBalance(NamedTuple):
     """
 
     drivers: dict[str, Float[Array, "T"]]
-    forces: dict[str, Float[Array, "T"]]  # what is not stored: of dampers, loads, and potentials that change with time
+    forces: dict[str, Float[Array, "T"]]  # power that is not stored: of dampers, loads, and potentials that change with time
     joints: dict[str, Float[Array, "T"]]  # of both bodies together: zero, to rounding and what the velocities violate
     kinetic: Float[Array, "T"]  # dT/dt
     potential: Float[Array, "T"]  # dV/dt

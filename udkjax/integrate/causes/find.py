@@ -269,7 +269,7 @@ def explained(
         atol=float(solution.atol),
         drift_tol=float(drift_tol),
         is_projected=chosen["stabilization"] == "Projection",
-        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # whose corrector is not solved, but applied once
+        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # the corrector of Adams is not solved, but applied once
         drops_rows=chosen["method"] in ("Auto", "Elimination"),
         formulation=chosen["formulation"],
     )

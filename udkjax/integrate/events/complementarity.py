@@ -69,7 +69,7 @@ def _passive_set(
     def step(at: _ActiveSet) -> _ActiveSet:
         z = _solve_passive(W, b, at.passive)
         leaves = at.passive & (z <= 0)
-        # As far towards z as all x stay positive; what is zero there leaves the passive set.
+        # Go towards z as far as all x stay positive; entries that are zero there leave the passive set.
         way = at.x - z
         part = jnp.where(leaves, jnp.where(way > 0, at.x / jnp.where(way > 0, way, 1.0), 0.0), jnp.inf)
         least = jnp.min(part)

@@ -10,7 +10,7 @@ from udkjax.integrate.events.hybrid import ConditionValues, Hybrid
 # Of a condition's scale, that is what a displacement of L or a turn of one radian changes in it: below it the condition is zero,
 # and so are its first and second rate, per T and T^2. Rounding errors of a state are some 1e-15 of it.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
-PARTS, DIVISIONS = 32, 6  # that a bracket of a root of a cubic is divided into, and how often: to 1e-9 of it
+PARTS, DIVISIONS = 32, 6  # parts of a bracket of a root of a cubic, and number of divisions: down to 1e-9 of it
 NO_EVENT = -1  # no index of an event
 
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1

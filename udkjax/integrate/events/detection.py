@@ -32,11 +32,11 @@ _shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
 NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
 BENDS = 3.0  # times as much as beside it a smooth condition bends in an interval that is fine enough, at most
-INTERVALS_OF_JUMP = 6  # that are too coarse for a jump or a kink, at every scale
+INTERVALS_OF_JUMP = 6  # intervals too coarse to resolve a jump or a kink, at every scale
 
 BESIDE = 4  # intervals before one that is too coarse that are done again
 
-ROOT, FIRST_OF_TWO, SECOND_OF_TWO = 0, 1, 2  # what is sought: a root, or the extremum, and then the root before it or behind it
+ROOT, FIRST_OF_TWO, SECOND_OF_TWO = 0, 1, 2  # the target: a root, or the extremum, and then the root before it or behind it
 
 
 class Nodes(NamedTuple):
@@ -61,7 +61,7 @@ class Detection(NamedTuple):
     is_coarse: Bool[Array, ""]  # whether an interval before, or that one, is too coarse
     last_sure: Int[Array, ""]  # the node up to which all is certain, where an interval is too coarse
     coarse: Bool[Array, "C"]  # of which conditions
-    undefined: Bool[Array, "C"]  # which conditions are not a number at its end
+    undefined: Bool[Array, "C"]  # conditions that are not a number at its end
 
 
 def detect(
@@ -112,7 +112,7 @@ def detect(
     usable = good[1:, None] & watched
     certain = jnp.where(hits, single, away | valley)
     coarse = (usable & ~unresolved & ~certain) | (good[1:, None] & ~finite[1:])
-    # What is too coarse in a short window, and only there, is a jump or a kink: finer windows would not tell more.
+    # Intervals too coarse in a short window, and only there, hold a jump or a kink: finer windows would not tell more.
     jumps = is_short & (jnp.sum(coarse, 0) <= INTERVALS_OF_JUMP) & jnp.all(finite, 0)
     coarse = coarse & ~jumps
 
@@ -121,7 +121,7 @@ def detect(
     found = ((hits & crosses(direction, before, after)) | enters | leaves) & usable
     place = jnp.argmax(jnp.any(found, axis=1))
     coarse_place = jnp.argmax(jnp.any(coarse, axis=1))
-    last_sure = jnp.maximum(coarse_place - BESIDE, 0)  # those before may only look as if they were fine enough
+    last_sure = jnp.maximum(coarse_place - BESIDE, 0)  # intervals before may only look fine enough
     cubic, side, here, enters, leaves, lowest = jax.tree.map(lambda x: x[place], (cubic, before, found, enters, leaves, lowest))
     root = jnp.where(enters | leaves, lowest, cubic_root(cubic, side))
     event = jnp.argmin(jnp.where(here, root, jnp.inf))

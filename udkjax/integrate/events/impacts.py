@@ -83,7 +83,7 @@ class ContactChanges(NamedTuple):
     closed: Int[Array, "E"]  # OPEN, TOUCHES or SLOW
     hits: Bool[Array, "E"]
     held: Bool[Array, "E"]  # after it
-    ends: Bool[Array, "E"]  # which come to rest, and end the run by that
+    ends: Bool[Array, "E"]  # events that come to rest, and end the run by that
     carried: Bool[Array, "E"]  # held at zero by others that are held
     blocked: Bool[Array, ""]  # the constraints leave a contact that approaches no motion
 

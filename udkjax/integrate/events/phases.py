@@ -30,8 +30,8 @@ class Tables(NamedTuple):
     """The phases that events lead to, as [phase][event]: hashable, so that what is compiled for them is found again."""
 
     after: tuple[tuple[int, ...], ...]  # the phase that follows an event
-    resting: tuple[tuple[int, ...], ...]  # that of a contact that comes to rest
-    freed: tuple[tuple[int, ...], ...]  # that of a contact at rest that lets go
+    resting: tuple[tuple[int, ...], ...]  # the phase after a contact has come to rest
+    freed: tuple[tuple[int, ...], ...]  # the phase after a contact at rest has let go
     held: tuple[tuple[int, ...], ...]  # the row of Psi that holds a contact; -1: none
 
 
@@ -40,7 +40,7 @@ class Phases(eqx.Module):
 
     mechanisms: tuple[Mechanism, ...]
     analyses: tuple[Analysis, ...]
-    added: tuple[Joint, ...]  # what `Attach` and `Lock` add, with the numbers that the state at the event decides left out
+    added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that the state at the event decides
     added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # of each: the event, and the name of the joint
     tables: Tables = eqx.field(static=True)
 
@@ -74,7 +74,7 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
             raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(event.action.name)}{near}")
     first: frozenset[str] = frozenset(mechanism.constraints)
     found, steps = [first], []
-    for active in found:  # which grows while it is followed
+    for active in found:  # the list grows in this loop
         rows = [_next_phases(event, active, names, added_by, k) for k, event in enumerate(events)]
         for target in (x for row in rows for x in row):
             if target not in found:

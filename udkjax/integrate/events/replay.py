@@ -233,7 +233,7 @@ def _apply_at_fixed_time(
         rate = jnp.where(k >= E, hybrid.rate_of_pressure(k % E, state, values.a), rate)
     h, rate = values.h[k] - stop_gradients(values.h[k]), stop_gradients(rate)
     is_transversal = jnp.abs(rate) > ZERO_RATE * values.scale[k] * hybrid.rate
-    # What happens again at the same instant, where the condition stands still, happens when the first event does.
+    # An event that happens again at the same instant, where its condition stands still, moves with the first one.
     d = jnp.where(is_transversal, -h / jnp.where(is_transversal, rate, 1.0), jnp.where(again, shift, 0.0))
     before = state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * values.a)
     after = apply_event(hybrid, k, before, hybrid.values(before), found.closed[j]).state._replace(phase=found.event_phase[j])

@@ -34,7 +34,7 @@ def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) 
     for name in independent_parameters(mechanism) if names is None else names:
         owner, place = split_index(name, known)
         if owner not in known or (place and place not in np.ndindex(*np.shape(known[owner])[: len(place)])):
-            mechanism.with_parameters({name: 0.0})  # which says what is wrong with the name
+            mechanism.with_parameters({name: 0.0})  # raises an error that names the parameter
         value = np.asarray(known[owner])
         for rest in np.ndindex(*value.shape[len(place) :]):
             found[owner + "".join(f"[{k}]" for k in (*place, *rest))] = float(value[(*place, *rest)])

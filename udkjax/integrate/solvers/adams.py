@@ -132,7 +132,7 @@ class History(eqx.Module):
     phi: Float[Array, "N y"]
     y: Float[Array, "y"]  # to which phi belongs
     exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value that the corrector has used
-    points: Int[Array, ""]  # that are known: so many rows of phi count
+    points: Int[Array, ""]  # number of known points, and of rows of phi that count
     control: OrderControl
     rate: Scalar  # at which the iteration converged
     evaluations: Int[Array, ""]
@@ -197,7 +197,7 @@ class Adams(Multistep):
         d, found, calls, rate = self._correct(lambda y: f(t1, y), predicted, slope, rule, size, state)
         y1 = predicted + h * rule.g[k] * d
         finite = jnp.all(jnp.isfinite(y1))
-        y1 = jnp.where(finite, y1, jnp.nan)  # what the controller is prepared for
+        y1 = jnp.where(finite, y1, jnp.nan)  # a value that the controller rejects
 
         size, estimates = _sizes(self.root_finder, unravel, y0, unravel(y1)), stop_gradients(rule)
         below = jnp.stack([d, d + star[k - 1], d + star[k - 1] + star[jnp.maximum(k - 2, 0)]])

@@ -32,7 +32,7 @@ Vector = Float[Array, "n"]
 Terms = PyTree[diffrax.AbstractTerm]
 
 HIGHEST = 5  # the formula of order six is of little use, the seventh unstable (Hairer, Wanner II, section V.1)
-# As in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names are behind them.
+# Constants of VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names behind them.
 WORTHWHILE = 1.5  # THRESH: the step grows by no smaller factor; while it is steady, M serves and the error estimates are good
 LARGEST, SMALLEST = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step; those of diffrax.PIDController, by default
 NO_DIVISION_BY_ZERO = 1e-6  # ADDON

@@ -22,8 +22,8 @@ Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
 
 SAFETY = 0.9  # of diffrax.PIDController, by default
 STRICTER = 8.0  # than the tolerance: the errors of many short steps add up
-LOST_STEP = 0.05  # what replaces so small a part of the step planned begins again with order one: there was a jump
-ERROR_ORDER = 2  # that the controller is told: the order of the error of the first step, which is of order one
+LOST_STEP = 0.05  # a step that is cut to a smaller part than this starts again at order one: there was a jump
+ERROR_ORDER = 2  # given to the controller: the order of the error of the first step, which is of order one
 
 
 class Tolerances(eqx.Module):

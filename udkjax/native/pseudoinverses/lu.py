@@ -56,7 +56,7 @@ class LUCode(DenseMethod):
             y.put(k, found)
             d.axpy(-found, d.row("lower", k), b)
         x.clear()
-        with reversed_each(d, d.m) as k:  # what lies left of the diagonal meets coordinates that are still zero
+        with reversed_each(d, d.m) as k:  # entries left of the diagonal meet coordinates that are still zero
             x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))
 
     def sign(self, d: DenseMatrices) -> Value:

@@ -14,7 +14,7 @@ from udkjax.native.operations import Operation
 from udkjax.native.wasm.object_code import LinkedModule, link
 
 TRIPLE = "wasm32-unknown-unknown"
-# What every browser of the last years has: Chrome 91, Firefox 89, Safari 16.4.
+# Every browser of the last years has these: Chrome 91, Firefox 89, Safari 16.4.
 FEATURES = "+simd128,+bulk-memory,+nontrapping-fptoint,+sign-ext,+mutable-globals"
 LANES = 2  # float64 numbers in a register
 

@@ -72,7 +72,7 @@ class Drawing(AbstractDrawing):
     name: str = eqx.field(static=True)
     gravity: Float[Array, "2"]  # m/s^2
     ground: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # that it was written in
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # the units that it was written in
     _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # of the elements of each section
     _elements: tuple[tuple[Any, ...], ...]
 

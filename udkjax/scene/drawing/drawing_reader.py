@@ -63,7 +63,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     ]
     groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
     for section in groups:
-        if section == "body":  # what names joints comes last: they are known now, where the pins and links are right
+        if section == "body":  # elements that name joints come last: if pins and links are right, joints are known now
             layout = PinLayout(groups["link"], fixed, groups["slide"])
             known["revolute"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
             known["revolute"] |= named["joint"]

@@ -23,9 +23,7 @@ class Motor(DrawnElement):
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     slide: str | None = eqx.field(static=True, default=None, metadata=SLIDE)
-    of: tuple[str, ...] = eqx.field(
-        static=True, converter=given_names, default=(), metadata=LINK
-    )  # needed where more than two meet
+    of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
     speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; of a slide: m/s
     motion: Motion | None = None  # rad or m, from the drawn position
     torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m
@@ -72,9 +70,7 @@ class PinSpring(DrawnElement):
     stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N/m; of torsion: N m/rad
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    of: tuple[str, ...] = eqx.field(
-        static=True, converter=given_names, default=(), metadata=LINK
-    )  # needed where more than two meet
+    of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
     damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
     length: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)  # m
     angle: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad
@@ -109,9 +105,7 @@ class PinDamper(DrawnElement):
     damping: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N s/m; of turning: N m s/rad
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    of: tuple[str, ...] = eqx.field(
-        static=True, converter=given_names, default=(), metadata=LINK
-    )  # needed where more than two meet
+    of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
 
     @property
     def measured_as(self):
@@ -137,7 +131,7 @@ class Load(DrawnElement):
     link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # beside a pin: which of its links
     force: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # N
     torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m, from the ground
-    frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")  # whose axes the force has
+    frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")  # the axes of the force
 
     def mistakes(self, layout):
         if (self.force is None) == (self.torque is None):

@@ -52,7 +52,7 @@ class PinInSlot(DrawnElement):
     along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
     direction: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # rad or a vector; instead of `along`
     on: str = eqx.field(static=True, default=GROUND, metadata=LINK)
-    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # that is guided; needed where `on` shares the pin
+    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # the guided one; needed where `on` shares the pin
 
     def mistakes(self, layout):
         yield from line_mistakes(self.along, self.direction)

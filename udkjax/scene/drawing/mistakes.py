@@ -148,9 +148,9 @@ def _far_pins(places: Mapping[str, Points]) -> Iterator[str]:
 
 def _shape_mistakes(places: Mapping[str, Points], link: Link) -> Iterator[str]:
     if not link.pins or len(set(link.pins)) < len(link.pins):
-        return  # which is said already
+        return  # reported already
     if link.inertia is not None and link.centre is not None and link.mass is not None and link.outline is None:
-        return  # which asks for no shape
+        return  # such a link needs no shape
     points = [places[pin] for pin in link.pins]
     if link.kind == "bar" and len(points) > 2:
         start, way = points[0], points[-1] - points[0]

@@ -13,7 +13,7 @@ from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # what a caller may have passed over
+LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # parts of a model that a caller may leave out
 FAR_AWAY = 16.0  # times the size of a model: a point of a slide that it does not reach, but no number that looks mistyped
 
 

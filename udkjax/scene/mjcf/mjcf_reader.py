@@ -194,7 +194,7 @@ def _add_armature(
         spin = carrier.angular_velocity + ratio * (body.angular_velocity - carrier.angular_velocity)
         rotor, axle = unique_name(f"{joint.name} rotor", bodies), unique_name(f"{joint.name} axle", joints)
         mass = ROTOR_MASS * carrier.mass
-        inertia = body.inertia / (2 * ratio)  # which is A / (N (N - 1))
+        inertia = body.inertia / (2 * ratio)  # A / (N (N - 1))
         bodies[rotor] = Body(mass, inertia, carrier.position, carrier.angle, carrier.velocity, spin)
         bodies[one] = _with_mass(carrier, carrier.mass - mass, carrier.inertia + armature / ratio)
         bodies[two] = _with_mass(body, body.mass, body.inertia / 2)

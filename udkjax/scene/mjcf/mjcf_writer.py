@@ -24,7 +24,7 @@ from udkjax.scene.reshaping import attachments
 from udkjax.scene.spanning_tree import spanning_tree
 from udkjax.scene.suspicions import body_sizes
 
-IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # what no equality can express comes before the others
+IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # joints that no equality can express come first
 NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, seen from where x is to the right and z is up
 THICKNESS = 0.04  # of bars that are drawn, beside the largest body
 

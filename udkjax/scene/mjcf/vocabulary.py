@@ -10,7 +10,7 @@ from udkjax.scene.checks import quote
 from udkjax.scene.mjcf.xml_tree import XmlElement
 
 WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on the motion
-TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # whose children are called as other elements are
+TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # parents of children that have the tags of other elements
 ACTUATORS = ("motor", "position", "velocity", "general")
 SHAPELESS = ("material", "mesh", "texture", "pair")  # in defaults alone
 

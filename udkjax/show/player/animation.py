@@ -86,7 +86,7 @@ class Animation:
         elif kind == ".dxf":
             pictures.save_dxf(self, path, t)
         elif kind in (".gif", ".mp4", ".png"):
-            from udkjax.show.player import films  # which needs an extra
+            from udkjax.show.player import films  # needs an extra
 
             if kind == ".gif":
                 films.save_gif(self, path, **options)
@@ -198,7 +198,7 @@ def _live_runs(
         runs = dict(zip(mechanism, found, strict=True)) if isinstance(mechanism, Mapping) else found[0]
     given: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
     efforts = ["effort"] if any(one.driver_names for one in mechanisms) else []
-    wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # what the page finds anew, too
+    wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # curves that the page computes anew, too
     return runs, {name: given.get(name) for name in wanted if name != "rank"}
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from udkjax.scene import GROUND, Gear, Mechanism, Rack
 from udkjax.show.player.packing import Json
 
-SAME_DIGITS = 7  # that points of symbols are written with
+SAME_DIGITS = 7  # significant digits of the points of symbols
 
 Point = tuple[int, float, float]  # the number of a body, and a place in its frame, with so many digits
 

@@ -293,7 +293,7 @@ def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.nd
 
 def corners_of(points: Float[np.ndarray, "points 2"]) -> tuple[Float[np.ndarray, "corners 2"], bool]:
     """Return the ends of a bar through points that are in line, or else, and True, the corners of the plate that holds them."""
-    from scipy.spatial import ConvexHull  # which takes longer to import than to call
+    from scipy.spatial import ConvexHull  # importing SciPy takes longer than the call
 
     spread = points - points.mean(axis=0)
     if np.linalg.matrix_rank(spread, tol=SAME_PLACE * np.abs(spread).max()) < 2:

@@ -30,7 +30,7 @@ TOP = (
     "transmission",
     "rotation",
 )
-SEARCHED = ("free", "motion")  # what only a search can hold to
+SEARCHED = ("free", "motion")  # settings that only a search respects
 LENGTH = ("pins", "least", "most")
 # The keys of each kind of goal, and the SI units of those that have some; "value" is that of what drives.
 GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {

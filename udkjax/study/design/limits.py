@@ -13,7 +13,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.free_numbers import FreeNumbers
 
 Range = tuple[float, float]
-# How far a position stays from where branches meet over a turn that has to be complete, whatever transmission is asked for:
+# Distance of a position from where branches meet, over a turn that has to be complete, whatever transmission is required:
 # sine of the transmission angle of a four-bar. Closer, machine parts with clearances do not know their branch.
 LEAST_TRANSMISSION = 3e-3
 DEFAULT_REACH = 2.0  # times the extent of targets and drawing: how far pins are searched, where there are no bounds

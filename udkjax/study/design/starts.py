@@ -38,7 +38,7 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
         return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
     trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
     s, moved = trials
-    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # what scaling has made too long
+    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # lengths that scaling has made too long
     q, there = problem.march(moved, s, threads)
     best = np.argsort(np.where(there & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
     best = best[there[best]]

@@ -37,7 +37,7 @@ class Clearance(NamedTuple):
 
     smallest: float  # the smallest singular value that counts, relative to the largest
     estimate: float  # the distance by its slope, as in `RankChange`; infinite where it does not change
-    nearest: RankChange | None  # what was found on the path, which only a single degree of freedom has
+    nearest: RankChange | None  # the change found on the path; only a single degree of freedom has a path
     searched: float  # how far along the path
 
 

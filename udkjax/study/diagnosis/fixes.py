@@ -27,7 +27,7 @@ class JointChange(NamedTuple):
     text: str
     element: Constraint | None  # None: nothing
     slides: tuple[int, float] | None = None  # of a slot made of a revolute: the body that it is in, and its axis there (rad)
-    rows: tuple[int, ...] = ()  # which rows stay, where it is no slot
+    rows: tuple[int, ...] = ()  # rows that stay, if it is no slot
 
     def remaining_rows(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
         """Return the rows of the constraint's Jacobian that stay."""

@@ -136,7 +136,7 @@ def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[
     fit = _polish(problem, found.fit.z, tol, minimizer)
     history = [*found.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
-    robust = minimizer.loss is not squares  # what is an outlier depends on the noise
+    robust = minimizer.loss is not squares  # outliers depend on the noise
     for _ in range(MOST_REWEIGHTINGS if len(unknown) + problem.noise_given.any() > 1 or (robust and len(unknown)) else 0):
         if not reweigh(problem, fit.z, tol, minimizer.loss, NOISE_FLOOR):
             break

@@ -41,7 +41,7 @@ class SearchResult(NamedTuple):
     guesses: int
     ways: tuple[str, ...]
     history: History
-    problem: FitProblem  # that the unknowns of the fit are of
+    problem: FitProblem  # the problem of these unknowns
 
 
 def search(

@@ -105,7 +105,7 @@ class MultipleShooting(FitProblem):
         self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
         assert self.runs.q is not None and self.runs.v is not None
         self.runs.q[p], self.runs.v[p] = q, v
-        for _ in range(2):  # what the values of parameters will move the guess by is taken off before
+        for _ in range(2):  # compensate beforehand for how far the parameters will move the guess
             found = self.predictor.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
             self.runs.q[p] += q - found.q
             self.runs.v[p] += v - found.v

@@ -26,7 +26,7 @@ from udkjax.study.quantities import Setter, parameter_value
 Transform = Literal["positive", "bounded", "free"]
 BOUND_DISTANCE = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
 FARTHEST_UNKNOWN = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
-# How far other guesses are from the first: positive parameters by a factor, others by a part of their scale.
+# Distance of other guesses from the first: positive parameters by a factor, others by a part of their scale.
 GUESS_FACTOR, GUESS_RADIUS = 2.5, 0.5
 BOUND_MARGIN = 0.02  # of the distance between the bounds: no guess is nearer, since bounds themselves are infinitely far
 SMALLEST_READABLE_PART = 1e-3  # of the largest: the least that coordinates taken as unknowns of a free motion must show of it

@@ -23,7 +23,7 @@ CHUNK_COPIES = 4  # of what is stored of a chunk, in memory while it is computed
 CHUNK_SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
 CHUNKS_FOR_EACH = 4  # chunks for each that computes at a time, so that all have something to do to the end
 SHORTEST_CHUNK = 0.05  # s of work in a chunk for that: to call a program and to store what it gave takes a few hundredths of it
-MOST_TRIED_GROUPS = 3  # whose programs are tried to estimate a cost; others are taken to be as fast, on average
+MOST_TRIED_GROUPS = 3  # groups timed to estimate a cost; others are taken to be as fast, on average
 # Steps that a run takes grow by this power of the reciprocal of its tolerances, about: by methods of 8th order, rtol and atol.
 TOLERANCE_POWER = 1 / 16
 

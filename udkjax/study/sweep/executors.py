@@ -34,7 +34,7 @@ def run(plan: SweepPlan, chunk: Chunk) -> Done:
     Where a member's numbers made rows independent that the mechanism leaves out as redundant, it is run again without them.
     """
     group = group_run(plan, chunk.group)
-    group.compile()  # what that takes is not counted
+    group.compile()  # compiling is not counted
     begun = time.perf_counter()
     found = group.compute(chunk.members)
     if group.redundant and group.varied:

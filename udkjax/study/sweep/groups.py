@@ -32,7 +32,7 @@ LANE_WIDTH = 8  # members: a piece has a multiple, of what the widest vector uni
 DEVICE_PIECE = 4096  # members of a piece where a device takes them all at once
 LARGEST_PIECE = 8  # times `PIECE_MEMBERS` in a piece, at most: to call a program takes what ten of its members take
 LEAST_PIECES = 16  # pieces that a group has at least, before they get larger: so that all devices have something to do
-STRAIGHT_METHODS = (type(None), Auto, Elimination)  # that vector instructions suit also where there is no machine code
+STRAIGHT_METHODS = (type(None), Auto, Elimination)  # methods that suit vector instructions also without machine code
 
 
 class Shared(NamedTuple):

@@ -53,7 +53,7 @@ class Chunk:
     index: int  # its place among all chunks
     group: int  # `Group.index`
     members: Int[np.ndarray, "n"]  # places in the flattened grid, in the order in which they are computed
-    work: float  # that is expected of it, beside that of other chunks of its group
+    work: float  # expected work, relative to other chunks of its group
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ def make_plan(
         problems += error.problems
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
-        settings.setdefault("stabilization", Baumgarte())  # who varies gains has some
+        settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs some
     problems += check_settings(mechanism, dimensions, settings)
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()

@@ -21,7 +21,7 @@ from udkjax.study.sweep.fingerprint import Json, differences, digest
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 2  # of what a folder holds: another one is another sweep
-UNFINISHED_SUFFIX = ".unfinished"  # what a file's name ends with while it is written
+UNFINISHED_SUFFIX = ".unfinished"  # suffix of a file while it is written
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
 MEMBERS, STORED_PREFIX = "members", "stored/"  # in a file: whom its numbers belong to, and what goes before the names of these
 ADVICE = "choose another folder, or remove this one to begin anew"

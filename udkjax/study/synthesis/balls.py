@@ -13,7 +13,7 @@ import numpy as np
 LONG = np.longdouble
 ROUNDING = float(np.finfo(LONG).eps)  # relative, of one operation on middles: twice what it can be
 INFLATE = 1.0 + 1e-10  # of a radius, by each operation: some 1e6 roundings of float64
-SMALLEST = float(np.finfo(float).tiny)  # what may be lost to underflow
+SMALLEST = float(np.finfo(float).tiny)  # bound on what underflow loses
 
 
 class Ball(NamedTuple):

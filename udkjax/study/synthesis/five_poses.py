@@ -24,7 +24,7 @@ ISOTROPIC = 1e-6  # from the isotropic points, of two homogeneous coordinates of
 SMALLEST_CUBIC = 1e-11  # of the cubic terms of the minors: below it, zeros are no isolated ones
 MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 CUBIC = ((3, 0), (2, 1), (1, 2), (0, 3))
-SINE_TOL = 8.0 * ROUNDING  # what a sine of the longest floating-point type may be off by
+SINE_TOL = 8.0 * ROUNDING  # error of a sine of the longest floating-point type
 
 
 class RealDyads(NamedTuple):

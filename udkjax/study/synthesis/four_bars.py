@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 KINDS = ("double crank", "crank-rocker", "double rocker", "rocker-crank", "triple rocker")  # by the shortest link; without one
-IN_ORDER, CIRCUIT, BRANCH, ORDER = 0, 1, 2, 3  # what a motion through all positions is free of, or suffers from
+IN_ORDER, CIRCUIT, BRANCH, ORDER = 0, 1, 2, 3  # defects of a motion through all positions: none, or of circuit, branch or order
 DEFECTS = ("none", "circuit", "branch", "order")
 
 
