@@ -2,7 +2,9 @@
 
 import ast
 import inspect
+import io
 import re
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from udkjax import equations, expressions, pinv, scene
 
 FLOORS = scene, pinv, expressions, equations
 NO_SUBJECT = re.compile("(What|Whatever|Whether|Which|Who|Whose|How|Where|When|As|Those|That)\\b")
+CLAUSE = re.compile("(what|whatever|which|who|whose|how|that|those)\\b", re.IGNORECASE)  # that begins no description, nor comment
 FUNCTIONS = {
     f"{floor.__name__}.{name}": found
     for floor in FLOORS
@@ -59,11 +62,29 @@ def without_subject(text: str) -> list[str]:
     return [doc.splitlines()[0] for doc in docs if NO_SUBJECT.match(doc)]
 
 
+def clauses(text: str) -> list[str]:
+    """The descriptions of arguments and attributes, and the comments, that begin with a clause in place of a noun or a verb."""
+    kinds = ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
+    docs = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
+    sections = [found for doc in docs for found in re.findall(r"^(?:Args|Attributes):\n((?: +.*\n?|\n)+)", doc, re.M)]
+    described = [line for section in sections for line in re.findall(r"^ {4}(\w+: .*)$", section, re.M)]
+    tokens = [token for token in tokenize.generate_tokens(io.StringIO(text).readline) if token.type == tokenize.COMMENT]
+    own = {token.start[0] for token in tokens if token.line.strip() == token.string}
+    first = [token.string for token in tokens if not (token.start[0] in own and token.start[0] - 1 in own)]
+    return [x for x in described if CLAUSE.match(x.partition(": ")[2])] + [x for x in first if CLAUSE.match(x[2:])]
+
+
 def test_docstrings_are_sentences_with_a_subject():
-    files = sorted(Path(udkjax.__file__).parent.rglob("*.py"))
-    assert {f"{file}: {line}" for file in files for line in without_subject(file.read_text(encoding="utf-8"))} == set()
+    texts = {file: file.read_text(encoding="utf-8") for file in sorted(Path(udkjax.__file__).parent.rglob("*.py"))}
+    assert {f"{file}: {x}" for file, text in texts.items() for x in (*without_subject(text), *clauses(text))} == set()
 
 
 def test_a_docstring_without_a_subject_is_noticed():
     text = 'class One:\n    """Thosely."""\n    def f(self):\n        """As `g`."""\ndef g():\n    """Whether it is."""'
     assert without_subject(text) == ["Whether it is.", "As `g`."]
+
+
+def test_a_clause_in_place_of_a_noun_is_noticed():
+    text = "A = 1  # that is told\nB = 2  # m\n# One\n# which two\n"
+    text += 'def f(x, y):\n    """Do.\n\n    Args:\n        x: which of them.\n        y: the one.\n    """\n'
+    assert clauses(text) == ["x: which of them.", "# that is told"]

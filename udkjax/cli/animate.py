@@ -47,11 +47,11 @@ def animate(
 
     Args:
         files: runs that `udkjax simulate` wrote (NetCDF), or scenes (TOML, or MJCF), which are simulated.
-        out: what to write: .html, a page that needs no network; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
+        out: file to write: .html, a page that needs no network; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
         t1: end of the run of a scene (s).
         dt: time between two of its instants (s).
         labels: of the runs, where there are several; by default the files' names.
-        measures: what a strip shows over time: violation, energy, rank, or a variable over time of the file.
+        measures: curves of a strip over time: violation, energy, rank, or a variable over time of the file.
         reactions: draw the forces of the joints as arrows.
         traces: joints or bodies whose paths are drawn; by default the pins that move.
         live: a page with sliders that solves the motion anew, and whose bodies one can pull at; of every number of the scene, or

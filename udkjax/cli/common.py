@@ -86,7 +86,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
     """Write what a command found to stdout: as text, or as one JSON object, and the text then to stderr.
 
     Args:
-        results: what was found, by names that scripts can rely on; arrays become lists, what is not finite becomes null.
+        results: results by names that scripts can rely on; arrays become lists, numbers that are not finite become null.
         text: the same for people.
         json: whether JSON was asked for.
     """

@@ -21,7 +21,7 @@ def convert(
 
     Args:
         scene: a scene file, or an MJCF model.
-        target: what to write: .toml, a scene file; .xml, an MJCF model.
+        target: file to write: .toml, a scene file; .xml, an MJCF model.
         leave_out: of an MJCF model, what may be passed over.
         key: the keyframe of an MJCF model from which the initial state is taken.
     """

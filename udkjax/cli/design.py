@@ -28,9 +28,9 @@ def design(
 
     Args:
         goal: file with the mechanism, the goal and the limits.
-        starts: from how many random mechanisms.
+        starts: number of random mechanisms to start from.
         seed: of these; the same seed gives the same designs.
-        results: how many designs, at most.
+        results: most designs to return.
         out: folder for each design as a drawing (design1.toml) and as a page that moves (design1.html).
     """
     for name, value, least in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):

@@ -67,12 +67,12 @@ def identify(
         out: folder for the results.
         noise: standard deviation, in SI units, of what was measured: of all channels, or of one; else it is estimated.
         guess: a first guess other than the scene's value.
-        bounds: what a parameter stays between.
-        prior: what was known of a parameter before.
-        estimate_initial_state: what of the state in which each run begins is to be found too.
+        bounds: lower and upper bound of a parameter.
+        prior: prior knowledge of a parameter.
+        estimate_initial_state: parts of the initial state of each run to estimate, too.
         ignore: columns of the data that are not to be read.
         loss: huber and soft_l1 let single wrong numbers count less.
-        n_starts: how many more first guesses may be tried.
+        n_starts: most further first guesses to try.
         tol: tolerance of the integration.
         seed: of the first guesses.
         profile: parameters whose confidence intervals are to be found by profile likelihood, which needs no linear model.

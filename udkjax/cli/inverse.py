@@ -26,7 +26,7 @@ def inverse(
         t1: end (s).
         t0: start (s).
         dt: time between two instants (s).
-        drivers: who exerts: drivers or coordinates, such as body.crank.angle; by default the scene's drivers.
+        drivers: drivers or coordinates that exert efforts, such as body.crank.angle; by default the scene's drivers.
         out: file to write (.nc, .h5, .csv or .npz): effort and power (time, driver).
         plot: picture to write (.png, .svg, .pdf or .jpg): efforts and powers over time.
     """

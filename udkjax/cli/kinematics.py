@@ -37,10 +37,10 @@ def kinematics(
         driver: a driver of the scene, by default its only one; or a coordinate: body.crank.angle, joint.B.angle, pin.C.x.
         first: first value (rad, m); by default the lower limit of travel, or where it starts if there is none.
         last: last value; by default the upper limit, or one turn after the first.
-        count: how many values.
+        count: number of values.
         rate: of the driver (rad/s, m/s), for velocities and accelerations.
         branches: find all ways to put it together for the first value, too.
-        channels: what else is written, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
+        channels: further channels to write, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
         plot: picture to write (.png, .svg, .pdf or .jpg): poses and angles, or the channels.
     """

@@ -54,15 +54,15 @@ def simulate(
         rtol: relative tolerance of a step.
         atol: tolerance of a step beside it, in the scene's own length and time, which `udkjax check` prints.
         method: pseudoinverse of the weighted constraint Jacobian.
-        rank_tol: what this method counts as rank deficient; by default, what suits the method.
-        formulation: how accelerations are found; partitioning integrates independent coordinates only, without Baumgarte.
+        rank_tol: threshold of the rank; by default, one that suits the method.
+        formulation: formulation of the accelerations; partitioning integrates independent coordinates only, without Baumgarte.
         solver: integrator, by its name in diffrax or, verner65, adams and bdf, here.
-        stabilization: what keeps the constraints: a projection of each step, Baumgarte's terms, or nothing.
+        stabilization: way to keep the constraints: a projection of each step, Baumgarte's terms, or nothing.
         alpha: Baumgarte's gain on the rate of the constraints (1/s).
         beta: Baumgarte's gain on the constraints (1/s).
         dt0: first step to try (s); by default it is chosen.
         max_steps: give up after so many steps.
-        channels: what else is written, such as pin.C.x, joint.A.fx or driver.motor.load; they have a picture of their own.
+        channels: further channels to write, such as pin.C.x, joint.A.fx or driver.motor.load; they have a picture of their own.
         plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png beside the file.
     """
     ts = output_times(t0, t1, dt)

@@ -21,7 +21,7 @@ def statics(
     Args:
         scene: the mechanism; its drivers hold.
         stable: go downhill to a stable position only.
-        starts: from how many positions to search; from more than one, all that are found are listed.
+        starts: number of positions to search from; from more than one, all that are found are listed.
         seed: of these positions.
         t: time of drivers and loads (s).
         out: file to write (.nc, .h5, .csv or .npz): q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier

@@ -25,7 +25,7 @@ def studio(
     Args:
         file: drawing to open, or to make; or the folder to work in.
         browser: open a browser.
-        port: to listen at; by default one that is free.
+        port: port to listen at; by default one that is free.
         json: print the address as JSON.
     """
     if not 0 <= port <= MOST_PORT:

@@ -38,11 +38,11 @@ def sweep(
 
     Args:
         scene: the mechanism.
-        grid: what is varied, and what is kept of each member.
+        grid: file of the axes, and of what to keep of each member.
         out: folder for the dataset, the pictures and what is finished so far.
-        engine: where members are computed: on the devices of this machine, or as tasks of dask.distributed.
+        engine: place to compute members: the devices of this machine, or as tasks of dask.distributed.
         scheduler: address of a scheduler of dask, such as tcp://host:8786; without one, workers are processes of this machine.
-        memory: what the members that are computed at a time may take (MiB).
+        memory: memory of the members that are computed at a time, at most (MiB).
         dry_run: say how many members there are, and what they will take, from a sample; compute nothing else.
     """
     if out is None and not dry_run:

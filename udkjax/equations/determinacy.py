@@ -51,7 +51,7 @@ def scaled_jacobian(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysi
         mechanism: The scene.
         t: Time (s).
         q: Coordinates (m, rad), (n,) or (bodies, 3).
-        analysis: That of `analyse`, for its scales; by default made here.
+        analysis: The mechanism's `Analysis`, for its scales; by default made here.
 
     Returns:
         J (m, n).
@@ -67,7 +67,7 @@ def singular_values(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysi
         mechanism: The scene.
         t: Time (s).
         q: Coordinates (m, rad), (n,) or (bodies, 3).
-        analysis: That of `analyse`, for its scales; by default made here.
+        analysis: The mechanism's `Analysis`, for its scales; by default made here.
 
     Returns:
         min(m, n) singular values, without a unit.
@@ -98,7 +98,7 @@ def uniqueness(
         mechanism: its numbers may be traced.
         t: time (s).
         q: coordinates of a closed position, (bodies, 3) or flat.
-        analysis: that of `analyse`, for its scales; by default made here.
+        analysis: the mechanism's `Analysis`, for its scales; by default made here.
         rank_tol: singular values of J up to so much of the largest count as zero.
 
     Returns:

@@ -86,7 +86,7 @@ class NullSpaceQR(PointwiseFormulation):
     the choice of rows jumps near it, in up to nine times the steps of `NullSpaceSVD`.
 
     Args:
-        rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
+        rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)
@@ -115,7 +115,7 @@ class NullSpaceSVD(PointwiseFormulation):
     Udwadia-Kalaba equation by singular values in the metric of rank and least squares: A is not weighted by the masses.
 
     Args:
-        rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
+        rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)

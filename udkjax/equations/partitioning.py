@@ -41,7 +41,7 @@ class CoordinatePartitioning(Formulation):
     Mechanisms only, since the rows of a `ConstrainedSystem` may be nonholonomic.
 
     Args:
-        rank_tol: what counts as dependent, relative to the longest row or the largest singular value.
+        rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
     """
 
     rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)

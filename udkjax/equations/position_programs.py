@@ -57,7 +57,7 @@ class PositionPrograms:
         positions: Whether the first n measures are q itself.
         derivatives: Whether measures have derivatives.
         rows: The scales of the m rows of Psi, by which what redundant rows leave is judged; by default one.
-        chosen: Which of the model's measures; by default all.
+        chosen: Chosen measures of the model; by default all.
         motion: Measures of the motion, after those of the position.
 
     Raises:

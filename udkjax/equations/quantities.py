@@ -51,7 +51,7 @@ def equations_of(
         method: The pseudoinverse; by default `Auto`.
         baumgarte: Gains to feed violations back; None: no stabilization.
         formulation: Another formulation; None: the Udwadia-Kalaba equation.
-        analysis: That of `analyse`; by default made here.
+        analysis: The mechanism's `Analysis`; by default made here.
 
     Returns:
         The equations, ready to be evaluated at states (n,).
@@ -115,7 +115,7 @@ def accelerations(
         stabilization: `Baumgarte`, or None.
         multipliers: Whether to return lambda, too.
         formulation: Another formulation, which finds a but not lambda; None: the Udwadia-Kalaba equation.
-        analysis: That of `analyse`; by default made here.
+        analysis: The mechanism's `Analysis`; by default made here.
 
     Returns:
         a (m/s^2, rad/s^2) in the shape of q; with `multipliers` also lambda (m,) in N and N m, in the order of the rows, with

@@ -31,7 +31,7 @@ BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
 # Constants of the scene, then of each body: M^(-1), of x and y, and of the angle.
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
-PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # how many for a body; which of them x, y and the angle take
+PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # entries of a body; the places of x, y and the angle among them
 
 AnyIndex = TypeVar("AnyIndex", int, np.ndarray)
 

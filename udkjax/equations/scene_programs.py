@@ -309,7 +309,7 @@ def scene_programs(
         mechanism: The scene; its numbers may be traced.
         redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`); None: marks among the numbers tell which.
         baumgarte: Whether the gains alpha and beta are fed back.
-        policy: What is done with a small pivot.
+        policy: Policy for small pivots.
         in_pieces: Whether the numbers are those of `Mechanism.at` a time, or all samples and knots.
 
     Returns:

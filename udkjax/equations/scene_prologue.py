@@ -26,9 +26,9 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
     """Write the program from the array `numbers` to `constants`.
 
     Args:
-        layout: Where the constants lie.
+        layout: Layout of the constants.
         places: The scene, with the place of each number in `numbers` instead of the number.
-        number_count: How many numbers the scene has; behind them are the gains, the marks of rows, `drop_tol` and `safe_tol`.
+        number_count: Number of numbers of the scene; behind them are the gains, the marks of rows, `drop_tol` and `safe_tol`.
 
     Returns:
         Loops over the bodies and over the elements of each group.

@@ -123,7 +123,7 @@ def prepare(
         mechanism: The scene; its numbers may be traced.
         method: The pseudoinverse, by default `Auto`; without a `rank_tol` it gets `rank_tolerance`.
         baumgarte: Gains to feed violations back; None: no stabilization.
-        analysis: That of `analyse`; by default made here.
+        analysis: The mechanism's `Analysis`; by default made here.
 
     Returns:
         The equations, ready to be evaluated at states (n,).

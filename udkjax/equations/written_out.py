@@ -41,8 +41,8 @@ class WrittenOut:
 
     Args:
         programs: The programs as loops.
-        names: Which of them.
-        differentiated: Which of the differentiable ones: the names of `ScenePrograms.differentiable`.
+        names: Names of those to write out.
+        differentiated: Names of those to differentiate, out of `ScenePrograms.differentiable`.
         active: Of the numbers that the prologue takes: along which there are derivatives.
         mode: Of derivatives: `FORWARD`, `TWICE`; `REVERSE`, from cotangents of the results to those of q, v and the constants.
     """

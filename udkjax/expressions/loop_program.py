@@ -154,7 +154,7 @@ def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.A
     order = np.argsort(places, kind="stable")
     first = np.searchsorted(places[order], places[order])
     turn = np.empty(len(places), int)
-    turn[order] = np.arange(len(places)) - first  # how many updates of the same place come before
+    turn[order] = np.arange(len(places)) - first  # earlier updates of the same place
     if turn.max() >= MOST_TURNS:
         at = x.at[places]
         return (at.add if update == ADD else at.set)(new, mode="promise_in_bounds")

@@ -36,7 +36,7 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
 
     Args:
         program: The program.
-        arrays: What it takes.
+        arrays: Its inputs by array.
         graph: The graph of all scalars.
         linear: A group of inputs in which the program is linear, such as tangents: a sum has one product for each number that it
             depends on, whose coefficients are added up beforehand.

@@ -38,7 +38,7 @@ def pack(
         ts: Times (s).
         q: Positions (n,).
         v: Velocities (n,).
-        settings: By name; those of the operation are taken.
+        settings: Settings by name; those of the operation are taken.
         rows: The scales of the rows of Psi.
         breaks: Times (s) where the motion is not smooth, in their order.
         xp: jax.numpy, without derivatives, or NumPy, where all is known.

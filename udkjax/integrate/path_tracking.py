@@ -45,8 +45,8 @@ class TrackedPaths(NamedTuple):
         z: unknowns (N, M).
         status: of each path (M,): ACCEPTED at a regular solution; INFINITE where an unknown goes to infinity or to zero; SINGULAR
             near a point where Newton's method does not converge to rounding; LOST short of the end.
-        t: how far it came (M,), up to 1.
-        steps: how many steps it took (M,).
+        t: end that each path reached (M,), up to 1.
+        steps: number of steps of each (M,).
     """
 
     z: np.ndarray
@@ -99,7 +99,7 @@ class PathTracker:
             z: solutions.
             start: parameters p0, complex.
             end: parameters p1.
-            precision: how closely.
+            precision: precision of the tracking.
             bend: c, of the way that s takes.
             most: steps of a path.
         """

@@ -105,7 +105,7 @@ def prepare_run(
 
     Args:
         compiled: The mechanism.
-        analysis: That of the mechanism; None: it is a system of the user's own.
+        analysis: The mechanism's `Analysis`; None of a system of the user's own.
         ts: Output times (s).
         state: The initial state, or None: that of `closure`.
         closure: The assembled initial guess.

@@ -94,17 +94,17 @@ def simulate(
             `NullSpaceSVD` or `CoordinatePartitioning`; `method` then serves projection and derivatives.
         throw: whether a run that does not reach its end raises; where numbers are traced, it never does.
         progress: True prints how far the run is; a progress meter of diffrax is used as it is.
-        analysis: that of `analyse`, by default made here.
+        analysis: the mechanism's `Analysis`, by default made here.
         engine: "native" is machine code made of the scene's expressions, on the CPU: explicit Runge-Kutta methods with
             elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every solver,
             adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
             was, and why.
-        events: what happens where a condition crosses zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
+        events: consequences where conditions cross zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
             actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. They are located to rounding, whatever `ts` is, and
             the run starts anew behind each; contacts that act on one another are hit together. Both engines serve them, and
             batches: each member has its own events. Such runs have first derivatives, forward and reverse, through the times of
             the events (saltation), but none by `ts`.
-        max_events: how many events may happen.
+        max_events: most events that may happen.
 
     Returns:
         A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` tells how the

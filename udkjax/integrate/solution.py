@@ -83,7 +83,7 @@ class SimulationError(RuntimeError):
     """A simulation did not reach its end. `solution` is what it got.
 
     Attributes:
-        message: what happened, and the cure.
+        message: the cause, and the cure.
         solution: the `Solution` as far as it came.
     """
 
@@ -103,9 +103,9 @@ class Solution(PrintsTable):
         q: x, y (m) and angle (rad) of each body.
         v: their rates (m/s, rad/s).
         code: the number of a `Result`; `result` is the member.
-        time: that was reached (s).
-        rtol: that was asked for.
-        atol: that was asked for.
+        time: time that was reached (s).
+        rtol: relative tolerance of the run.
+        atol: absolute tolerance of the run.
         bodies: the names of the bodies, in the order of q and v.
     """
 

@@ -58,8 +58,8 @@ def step(
         rtol: relative tolerance, as in `simulate`.
         atol: absolute tolerance, as in `simulate`.
         max_steps: the largest number of steps that are tried.
-        analysis: that of `analyse`, by default made here.
-        engine: as in `simulate`.
+        analysis: the mechanism's `Analysis`, by default made here.
+        engine: engine, as in `simulate`.
 
     Returns:
         The `State` at t + dt; while traced, not a number where the end was not reached.

@@ -15,7 +15,7 @@ class BatchProgram:
 
     Args:
         program: the program; its first inputs differ between members.
-        shared: how many of its inputs, the last ones, are the same for all members.
+        shared: number of inputs, the last ones, that are the same for all members.
     """
 
     def __init__(self, program: ScalarProgram, shared: int = 0):

@@ -57,12 +57,12 @@ def watch_inputs(
 
     Args:
         xp: jax.numpy or NumPy.
-        numbers: those of the conditions.
+        numbers: numbers of the conditions.
         sides: of zero, 0 where it is not known.
         watched: whether each condition counts.
         floors: below which each is zero.
-        directions: in which zeros count, 0 for either.
-        rate: that of the scene (1/s).
+        directions: directions in which zeros count, 0 for either.
+        rate: rate of the scene (1/s).
     """
     parts = (*numbers, sides, watched, floors, directions, xp.reshape(rate, (1,)))
     return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])

@@ -28,7 +28,7 @@ class LoopWriter:
             program: The program.
             name: The function's name.
             pointers: The names of its arguments.
-            at: Where each array begins: which pointer, and how many numbers behind it.
+            at: Place where each array begins: a pointer, and an index from there.
             width: The number of lanes, if it is another than that of the others.
         """
         width = width or self.width

@@ -31,7 +31,7 @@ class Module(Memory):
     """The text of one module of machine code: its functions.
 
     Args:
-        plan: What the code depends on.
+        plan: Choices that the code depends on.
         differentiated: Of which differentiable programs of the scene the module takes derivatives.
         active: Of the numbers of the scene: along which there are derivatives.
     """

@@ -73,8 +73,8 @@ class Operation(ABC):
 
         Args:
             width: The number of lanes.
-            beside: How many directions of a single member are side by side.
-            vector: How many float64 numbers a register holds.
+            beside: Number of directions of a single member side by side.
+            vector: Number of float64 numbers in a register.
         """
 
     @abstractmethod

@@ -72,7 +72,7 @@ class PositionCode:
             data: Data of the positions, of all members (J, D) or of each (M, J, D).
             guess: Positions from which each is closed (M, J, n); None: a march from the drawn position.
             longest: Step of s that a march takes, at most.
-            threads: How many threads share the members; by default as many as there are cores.
+            threads: Number of threads that share the members; by default that of the cores.
 
         Returns:
             Positions; not a number where one was not reached.

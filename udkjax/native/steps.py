@@ -46,7 +46,7 @@ POINTS = 4  # states that an interpolating polynomial goes through: with three, 
 # Of a step: a last one that were shorter takes half of it. Outputs of the first step wait for the second, and the polynomial
 # through two points that lie so close beside it takes rounding errors for velocities: by 1e-4 m/s where the last is 1 / 300.
 SHORTEST_LAST = 0.25
-STRETCH = 12.0  # how many times longer than those before the last step may be: steps grow tenfold at most
+STRETCH = 12.0  # ratio of the last step to those before, at most: steps grow tenfold
 
 # The states of a run. `NOT_FINITE`: its step became too small because of a number that is not finite. `LOST`: it left the
 # constraint manifold. Of runs that watch conditions: `CROSSED`: at the time at which one crosses zero. `UNSURE`: one may.

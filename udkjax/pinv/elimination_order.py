@@ -16,7 +16,7 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
             meets.setdefault(k, set()).add(i)
     near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
     order: list[int] = []
-    wait = [0] * len(rows)  # how many others, one after the other, come before
+    wait = [0] * len(rows)  # number of others that come before, one after the other
     queue, left = [(len(others), 0, i) for i, others in enumerate(near)], set(range(len(rows)))
     heapify(queue)
     while left:

@@ -18,7 +18,7 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
     batch share: here such a vector is broadcast before, and the transpose of that is the sum.
 
     Args:
-        name: As programs of JAX print it.
+        name: Name in printed programs of JAX.
         apply: (operator, vector) -> vector.
         shape: The same for shapes.
         derivative: The rule of forward mode.

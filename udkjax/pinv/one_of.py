@@ -46,7 +46,7 @@ class OneOf(Dense):
 
     Args:
         methods: the methods, without thresholds of their own; by default the five of the paper.
-        number: which of them, counted from zero; one that is traced and lies outside stands for the first or the last.
+        number: index of the method, from zero; one that is traced and lies outside stands for the first or the last.
     """
 
     methods: tuple[Dense, ...] = eqx.field(converter=tuple, default=(SVD(), Varga(), Greville(), Householder(), GramSchmidt()))

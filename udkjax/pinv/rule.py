@@ -69,7 +69,7 @@ class Pseudoinverse(PrintsLine):
     rank stays constant nearby; where it jumps no derivative exists.
 
     Args:
-        rank_tol: what counts as zero, of the method's scale of D; None: rounding.
+        rank_tol: threshold of the rank, relative to the method's scale of D; None: rounding.
         relative: whether it is relative to that scale, or in the units of D.
     """
 

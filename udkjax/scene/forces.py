@@ -34,7 +34,7 @@ class ForceElement(PrintsLine):
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
-    n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
+    n_bodies: ClassVar[int] = 2  # number of `bodies` of a type of the scene format
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
         """Return the potential energy V (J), or None; the load is -dV/dq."""
@@ -122,7 +122,7 @@ class Force(ForceElement):
     Args:
         body: the name of the body.
         vector: the force (N): constant, or a `Held` of values (N, 2).
-        point: where it acts, in the body's frame (m).
+        point: point of attack, in the body's frame (m).
         frame: the axes of the vector: "ground", or "body", with which it turns.
     """
 

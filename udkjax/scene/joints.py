@@ -42,7 +42,7 @@ class Constraint(PrintsLine):
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
-    n_bodies: ClassVar[int] = 2  # how many `bodies` a type of the scene format names
+    n_bodies: ClassVar[int] = 2  # number of `bodies` of a type of the scene format
 
     @abstractmethod
     def residual(self, t: Number, *frames: Frame) -> Sequence[Number]:

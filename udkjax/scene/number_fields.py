@@ -102,7 +102,7 @@ def replace_numbers(
         gravity: The acceleration of gravity (m/s^2).
         values: Numbers by their names, or those of entries.
         known: The numbers that there are, as `parameters_of` finds them.
-        name: That of the scene, for the message of an error.
+        name: Name of the scene, for the message of an error.
 
     Returns:
         The elements and gravity.

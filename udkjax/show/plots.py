@@ -142,10 +142,10 @@ def draw_reactions(
     """Draw the size of the force of each joint over time.
 
     Args:
-        axes: where.
+        axes: axes to draw on.
         ts: times (s).
-        loads: what `udk.reactions` returned: by joint and body, force x, force y (N) and torque (N m).
-        unique: what `udk.unique_reactions` returned. Of forces that are not unique at all times, which are dotted, the share of
+        loads: result of `udk.reactions`: by joint and body, force x, force y (N) and torque (N m).
+        unique: result of `udk.unique_reactions`. Of forces that are not unique at all times, which are dotted, the share of
             least norm is drawn: other shares would move the mechanism alike.
     """
     for k, (joint, bodies) in enumerate(loads.items()):
@@ -175,8 +175,8 @@ def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | Non
     """Draw what was measured of a channel as points, and what the identified mechanism shows as a line.
 
     Args:
-        axes: where.
-        data: what `Estimate.to_xarray` returned.
+        axes: axes to draw on.
+        data: result of `Estimate.to_xarray`.
         channel: the name of a channel.
         record: the name of a record; by default the first that has the channel.
 

@@ -38,7 +38,7 @@ class Studio:
     """The actions of the routes, on one folder.
 
     Args:
-        folder: whose files are opened and saved.
+        folder: folder of the files to open and save.
         reader: the process that reads and merges texts, which takes milliseconds.
         compiler: the one that compiles engines.
         examiner: the one that diagnoses and exports, which takes longest.
@@ -92,7 +92,7 @@ def application(studio: Studio, port: int, token: str) -> ASGIApp:
     Args:
         studio: the actions of its routes.
         port: at which it listens.
-        token: that each request of the interface must carry.
+        token: token that each request of the interface must carry.
     """
     actions = [studio.list, studio.open, studio.save, studio.compile, studio.diagnose]
     routes = [Route(f"{INTERFACE}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]

@@ -34,7 +34,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
     """Return a drawing in the form that an ending names.
 
     Args:
-        mechanism: that is drawn.
+        mechanism: mechanism that is drawn.
         text: its file.
         suffix: .html (a page that solves the motion anew), .svg, .png, .gif or .dxf, as `animate` saves them; .csv (positions
             over time) or .py (a script).

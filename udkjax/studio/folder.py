@@ -83,7 +83,7 @@ class Folder:
         Args:
             name: its path.
             data: its content.
-            revision: what the page believes to be on disk; None where it believes that there is no such file.
+            revision: revision that the page believes to be on disk; None: no such file.
             suffixes: the endings that it may have.
 
         Raises:

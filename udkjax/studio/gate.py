@@ -36,9 +36,9 @@ class Gate:
     """ASGI middleware that refuses requests of others, and adds the headers that keep the page to itself.
 
     Args:
-        app: what is behind the gate.
+        app: application behind the gate.
         port: of the server, which is part of its names.
-        token: that each request of the interface must carry.
+        token: token that each request of the interface must carry.
     """
 
     def __init__(self, app: ASGIApp, port: int, token: str):

@@ -30,7 +30,7 @@ def merge_document(text: str, document: Mapping[str, Any]) -> str:
     """Return a text whose tables are those of a document, changed in as few places as can be, with its comments.
 
     Args:
-        text: where the document came from, or empty.
+        text: text that the document came from, or empty.
         document: tables, lists, texts, numbers and truth values.
 
     Raises:

@@ -29,7 +29,7 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
     """Return how far a run, or part of one that failed, can be trusted.
 
     Args:
-        mechanism: what was simulated.
+        mechanism: mechanism that was simulated.
         solution: one run, no batch.
 
     Returns:

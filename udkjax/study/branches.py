@@ -34,10 +34,10 @@ def branches(
     are within half a turn of zero, and branches in the order of the bodies' angles, the first body's first.
 
     Args:
-        mechanism: whatever has no degree of freedom once its driver holds; its numbers must be known.
+        mechanism: a mechanism without a degree of freedom once its driver holds; its numbers must be known.
         driver: a driver, or a coordinate by name or as a `Coordinate`, as of `kinematics`; None: all drivers.
         value: of the driver (rad, m); of None the time (s).
-        starts: from how many positions to search.
+        starts: number of positions to search from.
         seed: of these positions.
         held: values that other drivers or coordinates hold, by name.
 

@@ -37,7 +37,7 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
     Args:
         mechanism: the mechanism that moved.
         solution: a `Solution`, or another pytree with ts (T,), q and v (T, bodies, 3).
-        channels: what is measured of it.
+        channels: channels to measure.
 
     Returns:
         Values (T, C) in SI units, one channel a column. Where a state is not a number, after a run has failed, nor are its
@@ -61,7 +61,7 @@ def path(
         mechanism: the mechanism that moved.
         solution: a `Solution`, a `Kinematics`, or another motion with ts (T,), q and v (T, bodies, 3).
         of: a body; or a pin, by the name of its joint or as it is drawn. Of a joint of two points it is that of its second body.
-        point: in the body's own frame (m); by default its centre of mass.
+        point: a point in the body's own frame (m); by default its centre of mass.
         derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2): those that the motion has, as a
             `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
 

@@ -68,7 +68,7 @@ class Quantity:
     """A channel of the user's own, equal only to itself: made once and used again, it compiles once.
 
     Attributes:
-        name: what it is called in tables and messages.
+        name: name in tables and messages.
         function: of the mechanism and its solution, written in jax.numpy; returns (T,) in `units`.
         units: SI units, as text.
     """

@@ -44,10 +44,10 @@ def differences(
                      expected from larger steps. Steps at which that is much of the whole are too large to tell anything.
 
     Args:
-        y: what is seen at +-steps; not a number where a run has failed, which leaves its step out.
+        y: values at +-steps; not a number where a run has failed, which leaves its step out.
         errors: of y.
-        series: which values belong together.
-        steps: from each to the next smaller by `STEP_RATIO`.
+        series: labels of values that belong together.
+        steps: steps, each smaller than the one before by `STEP_RATIO`.
 
     Source: L. F. Richardson, The approximate arithmetical solution by finite differences of physical problems, 1911.
     """

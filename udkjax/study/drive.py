@@ -287,8 +287,8 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
         driven: the mechanism with the driver.
         bare: the same without any driver.
         name: of the driver in the mechanism.
-        driver: what it is called in the message.
-        names: what other drivers are called in the message, where not by their names.
+        driver: its name in the message.
+        names: names of other drivers in the message, if not their own.
 
     Raises:
         SceneError: it names the drivers that hold the coordinate.

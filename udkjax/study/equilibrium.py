@@ -115,10 +115,10 @@ def equilibrium(
 
     Args:
         mechanism: its drivers hold the values of time t.
-        state: where to look from; by default the initial guess.
+        state: state to search from; by default the initial guess.
         t: time (s) of drivers and loads.
         stable: go downhill only, and so to a stable equilibrium; otherwise to any that is near.
-        analysis: that of `analyse`; needed where all numbers are traced.
+        analysis: the mechanism's `Analysis`; needed where all numbers are traced.
 
     Returns:
         An `Equilibrium`.

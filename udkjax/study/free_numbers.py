@@ -18,8 +18,8 @@ class FreeNumbers:
     """Some numbers of a mechanism by name (`pin.A`, `pin.C[0]`, `link.crank.width`), and all of their entries as one vector.
 
     Args:
-        mechanism: whose numbers.
-        names: which of them.
+        mechanism: mechanism that has the numbers.
+        names: names of those that are free.
 
     Raises:
         SceneError: a name is not that of a number, or named twice.
@@ -95,9 +95,9 @@ def position_model(
 
     Args:
         free: its numbers x.
-        driver: what drives the mechanism.
+        driver: driver of the mechanism.
         measures: of the mechanism, x, q (bodies, 3) and data.
-        origin: from which value of the driver s counts; by default from zero.
+        origin: value of the driver that s counts from; by default from zero.
         shifted: whether x has one more number, which s counts from.
     """
 

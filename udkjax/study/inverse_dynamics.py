@@ -135,8 +135,8 @@ def inverse_dynamics(
         mechanism: its drivers prescribe the motion where none is given; F holds its force elements and gravity.
         ts: times (s).
         motion: anything with q, v and a (T, bodies, 3); by default that of all drivers, by `kinematics`.
-        drivers: who exerts, by names of drivers, of coordinates (`body.crank.angle`) or as `Coordinate`; by default the scene's
-            drivers. More than there are degrees of freedom share by least weighted norm.
+        drivers: names of drivers or coordinates (`body.crank.angle`) that exert efforts, or each a `Coordinate`; by default the
+            scene's drivers. More than there are degrees of freedom share by least weighted norm.
         weights: w_i > 0 of each driver's squared effort, by name; by default 1.
 
     Returns:

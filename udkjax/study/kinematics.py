@@ -164,10 +164,10 @@ def kinematics(
     where velocities do not follow (`not_determined`) they have none by what moves the position.
 
     Args:
-        mechanism: whatever has one degree of freedom once its drivers hold.
+        mechanism: a mechanism of one degree of freedom once its drivers hold.
         driver: a driver of the scene, a coordinate by its name (`body.crank.angle`, `joint.B.angle`, `body.slider.x`), or a
             `Coordinate`; None: all drivers, along the times `values`.
-        values: those of the driver (rad, m), or times (s), in the order in which they are reached.
+        values: values of the driver (rad, m), or times (s), in the order in which they are reached.
         state: a position on the branch; by default the initial guess, assembled.
         rate: s_dot, for all values or each (rad/s, m/s; 1 for times).
         acceleration: s_ddot (rad/s^2, m/s^2).

@@ -77,9 +77,9 @@ def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, ana
 
     Args:
         mechanism: its drivers hold the values of time t.
-        state: where it rests; by default the equilibrium next to its initial guess.
+        state: state at rest; by default the equilibrium next to its initial guess.
         t: time (s) of drivers and loads.
-        analysis: that of `analyse`; needed where all numbers are traced.
+        analysis: the mechanism's `Analysis`; needed where all numbers are traced.
 
     Returns:
         `Modes`, of the f degrees of freedom.

@@ -57,8 +57,8 @@ class PositionBatch:
     dq/dx = -E^+ Psi_x, by one elimination. Redundant constraints do no harm.
 
     Args:
-        mechanism: whatever has one degree of freedom once its drivers hold.
-        driver: as of `kinematics`.
+        mechanism: a mechanism of one degree of freedom once its drivers hold.
+        driver: driver, as of `kinematics`.
         free: names of the numbers in which members differ: `pin.A`, `pin.C[0]`, `joint.B.points`.
         derivatives: whether there are derivatives by the value and the free numbers.
 
@@ -92,7 +92,7 @@ class PositionBatch:
             parameters: the free numbers of each member by name, (M, ...).
             values: of the driver (rad, m; s where all drivers go along time), of all members or of each, in the order in which
                 they are reached.
-            threads: how many; by default as many as there are cores.
+            threads: number of threads; by default that of the cores.
 
         Raises:
             SceneError: a free number is missing or of another shape.

@@ -101,8 +101,8 @@ def _matrices(
         values: K of them where branches meet.
         found: q, q' and q'' there.
         spacing: of points of the branch beside them; zero where there are none.
-        counts: which of the values are of interest.
-        active: which leaves of joints and drivers are the P numbers.
+        counts: mask of the values of interest.
+        active: mask of the leaves of joints and drivers that are the P numbers.
     """
     W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
     chosen, rest = eqx.partition(_constraints(curve.mechanism), active)

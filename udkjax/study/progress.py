@@ -21,11 +21,11 @@ class Progress:
     """Progress of a computation, as a callable given as `progress=` receives it, once at least for everything that is done.
 
     Attributes:
-        what: what is being computed, such as "identify".
-        done: how much of it is done, in the units of `total`.
-        total: how much there is to do; None where that is not known beforehand.
+        what: name of the computation, such as "identify".
+        done: part that is done, in the units of `total`.
+        total: amount to do; None where that is not known beforehand.
         seconds: time since the computation began (s).
-        message: what else there is to say of its state.
+        message: further words about its state.
     """
 
     what: str
@@ -71,8 +71,8 @@ def report_progress(
     Args:
         progress: None or "auto" writes a line to stderr if the computation takes longer than two seconds, True at once, False
             never; a callable gets a `Progress` at each report. What it raises ends the computation.
-        total: how much there is to do, in any unit; None where that is not known.
-        what: what is being computed, as it stands before the line.
+        total: amount to do, in any unit; None where that is not known.
+        what: name of the computation, as it stands before the line.
         patience: time (s) after which there is a line by default.
         interval: time (s) between two states of the line; by default what suits a terminal, or a file.
 

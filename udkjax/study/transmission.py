@@ -25,7 +25,7 @@ class Workspace(NamedTuple):
     """Places of a point, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,).
 
     Attributes:
-        points: where the point gets (m).
+        points: places that the point gets to (m).
         reached: the number of a `Reached` for each.
     """
 
@@ -105,11 +105,11 @@ def workspace(
     """Return where a point of a body gets over all pairs of values of two drivers, each reached along the branch of `state`.
 
     Args:
-        mechanism: whatever has two degrees of freedom once its drivers hold.
+        mechanism: a mechanism of two degrees of freedom once its drivers hold.
         drivers: the values (rad, m) of two drivers or coordinates, by name; the first are gone along with the second held at its
             first value.
-        body: whose point.
-        point: in the body's own frame (m).
+        body: body of the point.
+        point: a point in the body's own frame (m).
         state: a position on the branch; by default the initial guess, assembled.
 
     Raises:

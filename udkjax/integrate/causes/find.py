@@ -242,10 +242,10 @@ def explained(
 
     Args:
         solution: the solution, of known numbers.
-        mechanism: what moved.
-        analysis: that of the run.
-        drift_tol: that of the run.
-        solver: that of the run; None is the default.
+        mechanism: the mechanism that moved.
+        analysis: its `Analysis`.
+        drift_tol: the run's tolerance of drift.
+        solver: the run's solver; None: the default.
         end: the last state (t, (q, v)) of the integrator, if it is known.
     """
     assert analysis is not None  # a mechanism has one

@@ -46,9 +46,9 @@ def explain_open(
         t: the time (s).
         guess: the positions (n,) that it was closed from.
         names: the constraint of each row.
-        psi: what is left of Psi (m,), in m or rad.
-        psi_dot: what is left of Psi_dot (m,), in m/s or rad/s.
-        scales: those of the rows.
+        psi: residual Psi (m,), in m or rad.
+        psi_dot: residual Psi_dot (m,), in m/s or rad/s.
+        scales: scales of the rows.
     """
     is_open = bool(np.max(np.abs(psi) / scales) > CLOSED_TOL) or not np.all(np.isfinite(psi))
     residual = psi if is_open else psi_dot

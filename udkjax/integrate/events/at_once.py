@@ -36,7 +36,7 @@ class PlainRun:
     Args:
         run: the run without events.
         events: all events.
-        programs: those of their conditions.
+        programs: programs of their conditions.
         drift_tol: the violation of the constraints that ends a run.
     """
 
@@ -118,7 +118,7 @@ def run_at_once(
         events: all events.
         names: of the bodies.
         drift_tol: the violation of the constraints that ends a run.
-        max_events: how many events may happen.
+        max_events: most events that may happen.
     """
     programs = condition_programs(events, names)
     if programs is None or not (run.is_usable and run.is_closed) or run.has_missed_rows:

@@ -42,7 +42,7 @@ def solve_complementarity(
     Args:
         W: symmetric, and positive semidefinite.
         b: y where x is zero.
-        allowed: which x may be positive at all; the others are zero, whatever their y.
+        allowed: mask of the x that may be positive at all; the others are zero, whatever their y.
         floor: a y above minus that is not negative.
 
     Returns:

@@ -21,7 +21,7 @@ def side_of_zero(values: ConditionValues, rate: Float[Array, ""]) -> Int[Array, 
 
     Args:
         values: the conditions and their rates.
-        rate: that of the system (1/s).
+        rate: rate of the system (1/s).
     """
     h, dh, ddh, scale = values.h, values.rate, values.rate_2, values.scale
     by_second_rate = jnp.where(jnp.abs(ddh) > ZERO_RATE_2 * scale * rate**2, jnp.sign(ddh), 0.0)

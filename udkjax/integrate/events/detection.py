@@ -82,11 +82,11 @@ def detect(
         has_rates: of which conditions the rates are known; of others they are taken from differences.
         direction: the direction in which the zero of each counts, 0 for either.
         sides: the sides of zero at the first node.
-        scale: that of each condition.
-        watched: which conditions count.
+        scale: scale of each condition.
+        watched: mask of the conditions that count.
         quiet: the time up to which the dips of each are known.
         is_short: whether the window is so short that what is too coarse in it may be a jump.
-        unresolved: which conditions are not to be refined.
+        unresolved: mask of the conditions not to be refined.
     """
     t, g, g_dot, good = nodes
     finite = jnp.isfinite(g)

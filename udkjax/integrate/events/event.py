@@ -49,9 +49,9 @@ class Event(PrintsLine):
 
     Args:
         condition: (t, frames) -> a number.
-        action: what happens: `Stop`, `Log`, `Impact`, `Release`, `Attach` or `Lock`.
+        action: consequence of the event: `Stop`, `Log`, `Impact`, `Release`, `Attach` or `Lock`.
         direction: 1: where it rises; -1: where it falls; 0: both.
-        name: by which it is listed.
+        name: name in lists.
     """
 
     condition: Callable[[Number, Frames], Scalar]
@@ -76,7 +76,7 @@ class JointLimit(PrintsLine):
         upper: likewise.
         restitution: the part of the approaching speed that comes back, 0 to 1.
         at_rest: "hold": rest in contact; "stop": end the run.
-        name: by which it is listed; by default that of the joint.
+        name: name in lists; by default that of the joint.
     """
 
     joint: str = eqx.field(static=True)
@@ -115,7 +115,7 @@ class Contact(PrintsLine):
         restitution: the part of the approaching speed that comes back, 0 to 1.
         on: the body that has the line, or "ground".
         at_rest: "hold": rest in contact; "stop": end the run.
-        name: by which it is listed.
+        name: name in lists.
     """
 
     body: str = eqx.field(static=True)
@@ -155,7 +155,7 @@ class Events(PrintsTable):
         v_before: velocities right before it.
         q_after: positions right after it.
         v_after: velocities right after it.
-        count: how many there were.
+        count: number of events.
         names: of the conditions.
     """
 

@@ -211,7 +211,7 @@ class Hybrid(eqx.Module):
 
         Args:
             phase: the phase.
-            function: what is computed.
+            function: function to compute.
             *arguments: its arrays.
             among: the phases that there can be; None: all.
         """

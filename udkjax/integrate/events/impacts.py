@@ -113,7 +113,7 @@ def impulses_of_impact(
         rows: of all conditions.
         rate: g_dot before it.
         restitution: e of each contact, from 0 to 1.
-        closed: which contacts take part; they do not separate.
+        closed: mask of the contacts that take part; they do not separate.
         floor: a rate above minus that is not negative.
     """
     found = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor)
@@ -159,7 +159,7 @@ def hit_contacts(
         hybrid: the system.
         k: the number of the event; from `hybrid.count` on, of the contact that lets go.
         state: the state before, in the phase that is to follow but for contacts.
-        held: which contacts were held before.
+        held: mask of the contacts that were held before.
         values: the conditions before the event; their scales are used.
         closed: the contacts, as in `ContactChanges`; None where they are to be found.
     """

@@ -33,7 +33,7 @@ def apply_event(
 
     Args:
         hybrid: the system.
-        k: which event.
+        k: index of the event.
         state: the state before.
         values: the conditions there.
         closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None where they are to be found.

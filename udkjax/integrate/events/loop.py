@@ -56,14 +56,14 @@ class LoopState(NamedTuple):
     carried: Bool[Array, "E"]  # the contacts that are held at zero by others that are at rest
     pending: Int[Array, ""]  # the event that happens now; or NO_EVENT, or BEGIN
     search: Search
-    reach: Float[Array, ""]  # how far the next window goes (s)
+    reach: Float[Array, ""]  # length of the next window (s)
     sweeps: Bool[Array, ""]  # whether machine code is to run as far as it can first
     quiet: Float[Array, "2E"]  # the time up to which each condition has no crossings in pairs
     unresolved: Float[Array, "2E"]  # the time from which on a condition varies too quickly to be sure of its crossings, or inf
     undefined: Bool[Array, "E"]  # the conditions that are not a number where the run ends by that
     q: Float[Array, "T n"]  # outputs
     v: Float[Array, "T n"]
-    written: Int[Array, ""]  # how many of them
+    written: Int[Array, ""]  # number of these
     record: EventRecord
     code: Int[Array, ""]
     running: Bool[Array, ""]
@@ -83,10 +83,10 @@ def run_loop(
     Args:
         hybrid: the system.
         ts: the output times (s).
-        state: where the run begins.
+        state: state at the beginning of the run.
         code: the `Result` as far as it is known before.
         drift_tol: the violation of the constraints that ends the run.
-        max_events: how many events may happen.
+        max_events: most events that may happen.
     """
     first = _first_loop_state(hybrid, ts, state, code, max_events)
     sweepable, fixed = can_sweep(hybrid), (hybrid, ts, drift_tol)

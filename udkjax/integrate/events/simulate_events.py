@@ -61,12 +61,12 @@ def simulate_events(
     Args:
         mechanism: the scene.
         events: one event or several, ready-made ones among them.
-        analysis: that of the mechanism.
+        analysis: its `Analysis`.
         ts: the output times (s).
         state: the initial state, or None: that of `closure`.
         closure: the assembled initial guess.
         choices: the other arguments of `simulate`.
-        max_events: how many events may happen.
+        max_events: most events that may happen.
 
     Raises:
         ValueError: the events do not fit the mechanism, or machine code was asked for and cannot run it.

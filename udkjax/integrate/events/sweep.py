@@ -57,11 +57,11 @@ def sweep(
     Args:
         hybrid: the system.
         ts: the output times (s).
-        state: where the sweep begins.
+        state: state at the beginning of the sweep.
         sides: the sides of zero of all conditions there.
-        scale: that of each condition.
-        watched: which conditions count.
-        written: how many outputs there are already.
+        scale: scale of each condition.
+        watched: mask of the conditions that count.
+        written: number of outputs written already.
         drift_tol: the violation of the constraints that a sweep may have.
         runs: whether it is to run at all, as a member of a batch.
     """

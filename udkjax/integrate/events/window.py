@@ -129,11 +129,11 @@ def integrate_window(
     Args:
         hybrid: the system.
         window: its times.
-        state: where it begins.
+        state: state at its beginning.
         sides: the sides of zero of all conditions there.
-        scale: that of each condition.
-        watched: which conditions, and which contact forces, count.
-        search: what is searched for already.
+        scale: scale of each condition.
+        watched: mask of the conditions, and of the contact forces, that count.
+        search: searches under way already.
         quiet: the time up to which each condition has no crossings in pairs.
         unresolved: the conditions that are known to be too fast.
         drift_tol: the violation of the constraints that ends a run.

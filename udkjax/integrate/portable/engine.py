@@ -42,7 +42,7 @@ class PortableEngine(NamedTuple):
     """The engine of a mechanism as data that a page runs.
 
     Attributes:
-        data: as JSON: see the package.
+        data: the engine as JSON: see the package.
         numbers: the numbers of the equations as a function of the parameters, as Python evaluates it.
         mechanism: the mechanism that is simulated.
     """

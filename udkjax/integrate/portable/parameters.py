@@ -55,9 +55,9 @@ class NumberProgram:
 
     Attributes:
         base: all of them as they are.
-        changing: which of these depend on the parameters.
-        count: how many numbers there are before the breakpoints.
-        knots: how many breakpoints there are.
+        changing: the outputs that depend on the parameters.
+        count: count of the numbers before the breakpoints.
+        knots: number of breakpoints.
     """
 
     def __init__(

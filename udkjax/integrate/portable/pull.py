@@ -20,7 +20,7 @@ class Pull(ForceElement):
     Args:
         bodies: the name of the body.
         point: p in the body's frame (m).
-        target: in ground axes (m).
+        target: target point, in ground axes (m).
         stiffness: in N/m, not negative.
         damping: in N s/m, not negative.
     """

@@ -71,7 +71,7 @@ class Verner65(diffrax.AbstractERK):
     Between the steps a polynomial of order 4 (the pair has none of its own).
 
     Args:
-        scan_kind: how diffrax loops over the stages.
+        scan_kind: diffrax's way to loop over the stages.
     """
 
     tableau: ClassVar[diffrax.ButcherTableau] = TABLEAU

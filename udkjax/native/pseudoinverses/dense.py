@@ -47,10 +47,10 @@ class DenseLayout:
     Args:
         module: The module.
         matrices: The rows and columns of the matrices besides D, by name.
-        shape: Those of D.
+        shape: Shape of D.
         prefix: Of the names of their places.
         tol: The name of the threshold of the rank.
-        width: How many matrices lie side by side: one of each lane, or a single one. By default those of all lanes.
+        width: Number of matrices side by side: one of each lane, or a single one. By default those of all lanes.
     """
 
     def __init__(

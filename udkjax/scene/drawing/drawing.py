@@ -62,7 +62,7 @@ class Drawing(AbstractDrawing):
         velocities: Initial velocities of pins (m/s); the others are at rest. A link moves as its first two pins do.
         gravity: The acceleration of gravity, by default 9.81 m/s^2 along -y.
         name: The name of the mechanism.
-        units: Those of plain numbers, such as `{"length": "mm"}`; SI units and radians where it says nothing. A number may be a
+        units: Units of plain numbers, such as `{"length": "mm"}`; SI units and radians where it says nothing. A number may be a
             text with its unit, such as "60 rpm".
 
     Raises:

@@ -7,7 +7,7 @@ import numpy as np
 from udkjax.scene.mjcf.orientations import SpaceFrame, shortest_turn_of_z
 from udkjax.scene.mjcf.xml_tree import AttributeReader
 
-SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # how many sizes each has
+SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # number of sizes of each
 WITHOUT_MASS = ("plane", "hfield", "mesh", "sdf")  # the first two have none, that of the others is not computed here
 WATER = 1000.0  # kg/m^3, the density that MJCF starts from
 

@@ -38,7 +38,7 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
 
     Args:
         source: The file, or its text.
-        leave_out: What may be passed over, of "limits", "frictionloss", "forceranges" and "contacts"; the first three are else
+        leave_out: Parts to pass over, of "limits", "frictionloss", "forceranges" and "contacts"; the first three are else
             refused, and contacts are warned of.
         key: The keyframe of the initial state; by default that of the name "initial", or else the model as it is written.
 

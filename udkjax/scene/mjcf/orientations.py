@@ -32,7 +32,7 @@ def frame_of(read: AttributeReader, radians: float, sequence: str) -> SpaceFrame
 
     Args:
         read: the element's attributes.
-        radians: in one unit of the file's angles.
+        radians: radians in one unit of the file's angles.
         sequence: of Euler angles, as in the compiler's `eulerseq`.
     """
     given = [name for name in ORIENTATIONS if name in read]

@@ -16,7 +16,7 @@ SHAPELESS = ("material", "mesh", "texture", "pair")  # in defaults alone
 
 _POSE = "pos quat axisangle xyaxes zaxis euler"
 _LOOK = "group material rgba user"
-_SOFT = "solref solimp"  # how soft a constraint is: here constraints are ideal
+_SOFT = "solref solimp"  # softness of constraints: here constraints are ideal
 
 
 class _Attributes(NamedTuple):

@@ -42,12 +42,12 @@ class Animation:
     Python can steer.
 
     Attributes:
-        data: what the player shows, as JSON.
-        failures: how runs failed, by their labels.
+        data: data of the player, as JSON.
+        failures: causes of failed runs, by their labels.
     """
 
     def __init__(self, data: Json, failures: Mapping[str, str] | None = None):
-        self.data, self.failures = data, dict(failures or {})  # how runs failed, by their labels
+        self.data, self.failures = data, dict(failures or {})  # causes of failed runs, by their labels
         self._motions = [motion_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
 
@@ -133,17 +133,17 @@ def animate(
     """Show the motion of a mechanism, or several motions side by side and in step.
 
     Args:
-        mechanism: what moved; for runs of different mechanisms, one under each run's label.
-        solution: what `simulate` returned, or anything with ts (T,), q and v (T, bodies, 3); several under their labels,
+        mechanism: the mechanism that moved; for runs of different mechanisms, one under each run's label.
+        solution: a `Solution`, or anything with ts (T,), q and v (T, bodies, 3); several under their labels,
             {"projected": one, "not stabilized": other}. By default the mechanism stands as its scene says.
-        measures: what a strip shows over time: any of "violation" (m; radians as an arc of the characteristic length), "energy",
+        measures: curves of a strip over time: any of "violation" (m; radians as an arc of the characteristic length), "energy",
             "rank" and "effort" (of drivers, N or N m), or {"torque (N m)": array} for values of your own, of several runs
             {"torque (N m)": {label: array}}.
         reactions: draw the forces of the joints as arrows; of redundant joints, the shares of least norm.
         traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
             the pins that move, up to eight.
         shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
-        title: by default the mechanism's name.
+        title: title; by default the mechanism's name.
         live: numbers that the page changes by sliders, by their names (`parameters()`), whole or one entry: the motion is closed
             and solved anew in the page, which a hand can pull at, too. {"pin.B[0]": (0.5, 2.0)} gives a slider its range; True
             takes every number of the scene. Of several runs a slider changes all that have its number. By default ten
@@ -214,12 +214,12 @@ def animate_modes(
     """Show modes of vibration side by side: q + amplitude shape sin(phase), with an amplitude that one can change.
 
     Args:
-        mechanism: what vibrates.
+        mechanism: the mechanism that vibrates.
         q: coordinates (bodies, 3) around which it does (m, m, rad).
         shapes: a displacement of each body for each mode, of any size; each is scaled to a swing that one sees.
         frequencies: Hz, said beside each.
-        labels: by default "mode 1", "mode 2", ...
-        title: by default the mechanism's name.
+        labels: labels; by default "mode 1", "mode 2", ...
+        title: title; by default the mechanism's name.
 
     Raises:
         ValueError: shapes of another shape, or one that does not move anything.

@@ -36,7 +36,7 @@ def live_data(
 
     Args:
         runs: mechanisms, their motions, and these as the player has them.
-        live: which numbers have sliders.
+        live: numbers that have sliders.
         events: of all runs.
 
     Raises:

@@ -67,7 +67,7 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) 
     """Return the marks of a mechanism, the farthest first.
 
     Args:
-        mechanism: what is drawn.
+        mechanism: mechanism to draw.
         poses: all those that it will be drawn in.
         shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
 

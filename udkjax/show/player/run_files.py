@@ -22,7 +22,7 @@ class RunFile(NamedTuple):
     q: np.ndarray
     v: np.ndarray
     result: Result | None  # None: the file does not say
-    cause: str  # how it ended, in words
+    cause: str  # its end, in words
     others: dict[str, np.ndarray]  # further numbers over time, "name (unit)": they are measures
 
 

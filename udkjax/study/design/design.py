@@ -80,10 +80,10 @@ class DesignSearch:
         """Search from so many random mechanisms; return the best that differ.
 
         Args:
-            starts: from how many.
+            starts: number of mechanisms to start from.
             seed: of the random mechanisms; the same seed gives the same result.
-            results: how many designs, at most.
-            threads: how many; by default as many as there are cores.
+            results: most designs to return.
+            threads: number of threads; by default that of the cores.
         """
         for name, value in (("starts", starts), ("results", results)):
             require_count(name, value)
@@ -141,15 +141,15 @@ def design(
         free: names of the numbers that are free, such as `pin.A` or `pin.C[0]`; by default all pins.
         bounds: (low, high) by the names of free numbers; each end one number, or of the number's shape (m).
         lengths: (least, most) distances (m) by two pins.
-        areas: by the name of a pin, where it stays as it is drawn: a circle (x, y, radius) or the corners (k, 2) of a convex
+        areas: area that a pin stays in, by its name: a circle (x, y, radius) or the corners (k, 2) of a convex
             polygon (m).
         transmission: the least angle (rad) between the transmission and none: of a four-bar, by how much the transmission angle
             stays away from 0 and pi; over the whole turn if there is one.
         rotation: whether the driver has to make a whole turn; by default where it is an angle.
         driver: a driver or coordinate as of `kinematics`; by default the only driver.
-        starts: from how many mechanisms.
+        starts: number of mechanisms to start from.
         seed: of these; the same seed gives the same result.
-        results: how many designs, at most.
+        results: most designs to return.
 
     Returns:
         `Designs`, the best first; none where nothing was found within the limits.

@@ -30,7 +30,7 @@ class FoundDesign(PrintsTable):
         transmission: the least over the positions, from 0 to 1; of a four-bar the sine of the transmission angle.
         turns: whether the driver makes a whole turn.
         parameters: the numbers that were free, by name.
-        driver: what drives it.
+        driver: its driver.
     """
 
     loss: float
@@ -77,7 +77,7 @@ class Designs(PrintsTable):
     Attributes:
         found: the designs.
         losses: of all trials within the limits, sorted; the more often the best was found, the less is left to find.
-        starts: from how many mechanisms the search began.
+        starts: number of mechanisms that the search began from.
         reason: why nothing was found, and the cure; empty where something was.
     """
 

@@ -181,9 +181,9 @@ class PoseGoal(Goal):
         targets: x, y (m) and angle (rad) of each pose (J, 3).
         arm: the length (m) by which angles are weighted; by default the extent of the places.
         pin: a pin of the link that goes through the places; by default the link's origin, its centre of mass.
-        values: as in a `PathGoal`.
-        start: as in a `PathGoal`.
-        line: as in a `PathGoal`.
+        values: values of the driver, as in a `PathGoal`.
+        start: start, as in a `PathGoal`.
+        line: line, as in a `PathGoal`.
     """
 
     body: str = eqx.field(static=True)
@@ -228,7 +228,7 @@ class FunctionGoal(Goal):
         targets: of the output at each (rad, m).
         start: "free": the driver's values count from one that is found.
         output_start: "free": the output's, too.
-        line: as in a `PathGoal`.
+        line: line, as in a `PathGoal`.
     """
 
     output: str | Coordinate = eqx.field(static=True)

@@ -79,7 +79,7 @@ class LengthLimits:
     Args:
         free: the free numbers x.
         lengths: (least, most) in m by two pins.
-        areas: by a pin, a circle (x, y, radius) or the corners (k, 2) of a convex polygon, in m.
+        areas: areas by pin: a circle (x, y, radius) or the corners (k, 2) of a convex polygon, in m.
 
     Raises:
         SceneError: there is no drawing, no such pin, no such range, or no such area.

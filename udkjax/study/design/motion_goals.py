@@ -35,7 +35,7 @@ class MotionPoint(NamedTuple):
         a: accelerations (bodies, 3).
         rate: dq/ds by the value of the driver (bodies, 3).
         bend: d^2q/ds^2 (bodies, 3).
-        loads: what `loads` of a goal asked for (k, m).
+        loads: loads that `loads` of a goal asked for (k, m).
         numbers: the numbers that are free.
         x: their values in the trial (P,).
         psi: Psi (m,) of x (P,), at this position.
@@ -70,7 +70,7 @@ class MotionTerm(PrintsTable):
         most: the measure's upper end, above zero.
         least: its lower end, above zero.
         speed: the rate of the driver (rad/s, m/s); by default that of its motion at the time 0.
-        weight: what a measure at twice its end counts: as much as a place missed by so many scales of the first goal.
+        weight: weight of a measure at twice its end: as much as a place missed by so many scales of the first goal.
         samples: positions that are measured.
     """
 
@@ -194,7 +194,7 @@ class ToleranceGoal(MotionTerm):
     """The error of a point where numbers have errors t_k: sqrt(sum_k (t_k dp/dx_k)^2) (m) stays below `most`.
 
     Args:
-        point: as of a `PathGoal`.
+        point: point, as of a `PathGoal`.
         tolerances: of free numbers by their names, in their units; each entry of a pin has it by itself. The further arguments
             are those of a `MotionGoal`.
     """

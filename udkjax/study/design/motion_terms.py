@@ -36,11 +36,12 @@ class CompiledTerm:
         goal: the goal.
         mechanism: the mechanism.
         free: the numbers that are free.
-        driver: what drives it, and `driven` by it.
+        driver: its driver, and the mechanism `driven` by it.
         unit: units of the coordinates (n,).
         scale: of the residuals.
         span: the values of the driver between which it is measured, as the first goal has them; None: a whole turn.
-        unknowns: how many; of which one more than the free ones is the value that values count from, if they are `shifted`.
+        unknowns: number of unknowns, of which one more than the free ones is the value that values count from, if they are
+            `shifted`.
         origin: the value from which values count.
         shifted: see there.
     """

@@ -38,7 +38,7 @@ class Clearance(NamedTuple):
     smallest: float  # the smallest singular value that counts, relative to the largest
     estimate: float  # the distance by its slope, as in `RankChange`; infinite where it does not change
     nearest: RankChange | None  # the change found on the path; only a single degree of freedom has a path
-    searched: float  # how far along the path
+    searched: float  # length of the path that was searched
 
 
 def clearance(positions: RankedPositions, at: Configuration, rank: int, walk: bool = True) -> Clearance:

@@ -20,7 +20,7 @@ class Dependency(NamedTuple):
     """A minimal set of constraints whose rows depend on each other."""
 
     constraints: tuple[str, ...]
-    redundancy: int  # how many of their rows are redundant
+    redundancy: int  # number of their redundant rows
 
 
 def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple[str, ...]]) -> list[Dependency]:

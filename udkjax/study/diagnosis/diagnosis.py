@@ -23,13 +23,13 @@ class Diagnosis(NamedTuple):
 
     Attributes:
         mechanism: of which it is.
-        coordinates: how many.
-        rows: how many, of joints and drivers.
-        joint_rows: how many of them are of joints.
+        coordinates: number of coordinates.
+        rows: number of rows, of joints and drivers.
+        joint_rows: number of rows of joints.
         redundancies: minimal sets of dependent rows, with their fixes.
         branches: motions that meet in a singular configuration.
         forces: for each joint, which components of its forces are unique.
-        clearance: how far away the rank changes.
+        clearance: distance to where the rank changes.
         timeline: rank and singular values along a solution; None without one.
     """
 

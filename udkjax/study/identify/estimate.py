@@ -61,11 +61,11 @@ class Estimate:
         outliers: measured values too far from what the mechanism shows to be noise; `noise` is that of the others.
         whiteness: of the residuals of each record's channels, where they are more than rounding.
         converged: whether the fit has settled.
-        agreeing: how many first guesses led here, out of `guesses`.
-        ways: what was tried to find the fit.
+        agreeing: number of first guesses that led here, out of `guesses`.
+        ways: ways that were tried to find the fit.
         history: cost and Gauss-Newton step, evaluation by evaluation of the best fit.
         evaluations: of a record, each with its derivatives.
-        seconds: that the identification took.
+        seconds: time of the identification (s).
         tol: tolerances of the integration.
         z: all K unknowns of the `problem` that was fitted, by the least squares of `loss`.
     """

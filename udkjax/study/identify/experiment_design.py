@@ -35,7 +35,7 @@ class Candidate:
 
     Args:
         conditions: numbers of the scene that are different in it, by name.
-        initial_state: how it begins; None: as the scene says.
+        initial_state: state at its beginning; None: that of the scene.
         name: of the experiment, for tables.
     """
 
@@ -49,14 +49,14 @@ class Design:
     """A ranking of N candidates by what they would show of P parameters; each alone, with what was known before.
 
     Attributes:
-        criterion: by which they were ranked.
+        criterion: criterion of the ranking.
         names: of the parameters.
         candidates: their names.
         scores: of the criterion, the larger the better: log det M, -trace M^-1, or the least eigenvalue; -inf, or 0, where a
             direction is not known.
-        standard_errors: in the units of the parameters, inf where a candidate does not show one.
+        standard_errors: standard errors in the units of the parameters, inf where a candidate does not show one.
         order: the candidates, the best first.
-        chosen: those to be made together, the most useful first.
+        chosen: candidates to make together, the most useful first.
         together: standard errors after the first of them, the first two, and so on.
     """
 
@@ -102,12 +102,12 @@ def design_experiment(
     Args:
         mechanism: with values of the parameters, at which the experiments are predicted.
         candidates: each a `Candidate`, the conditions of one (a driver's amplitude and frequency by name), or its initial state.
-        parameters: that are to be identified, as for `identify`; their priors count.
-        channels: that would be measured in each.
+        parameters: parameters to identify, as for `identify`; their priors count.
+        channels: channels that would be measured in each.
         ts: times (T,) of the measurements, s.
         noise: standard deviation, of all channels or by channel.
         criterion: "D", the largest det M; "A", the smallest trace M^-1; "E", the largest least eigenvalue of M.
-        pick: how many are chosen one after another, each to the best together with those before.
+        pick: number of candidates to choose one after another, each to the best together with those before.
         of: names of the parameters that matter; by default all.
         given: an estimate whose values the parameters have, and whose records count as made.
         tol: tolerance of the integration.

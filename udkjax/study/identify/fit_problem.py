@@ -59,14 +59,14 @@ class FitProblem:
     Attributes:
         ts: times (records, times) of the records, from their beginning on (s).
         y: measured values (records, times, channels), not a number where nothing was measured.
-        present: where there is a value; `index` (R, 3) is the record, time and channel of each of these R residuals.
+        present: mask of the values that there are; `index` (R, 3) is the record, time and channel of each of these R residuals.
         sigma: standard deviations (R,) that residuals are divided by; `noise_given` (R,) says which of them were given.
         channel_scale: the size of what each channel shows (C,).
-        runs: what is simulated; `run` and `time` (R,) are the run and the place in its times that each residual is of.
+        runs: runs to simulate; `run` and `time` (R,) are the run and the place in its times that each residual is of.
         state_sizes: changes of the unknowns of initial states, in their units, by one of each z (K - P,).
-        columns: where in z the unknowns of the initial state of each run are (N, S), -1 where it has none.
+        columns: places in z of the unknowns of each run's initial state (N, S), -1 where it has none.
         beginnings: the run that each record begins with (records,).
-        priors: which parameters have a prior; their residuals follow the R.
+        priors: indices of the parameters that have a prior; their residuals follow the R.
         predictor: computes what the channels show, and counts evaluations.
     """
 
@@ -147,7 +147,7 @@ class FitProblem:
         Args:
             z: B sets of unknowns.
             tol: tolerances of the integration.
-            horizon: how much of each record counts, s since it began; residuals beyond are zero. None: all of it.
+            horizon: part of each record that counts, s since it began; residuals beyond are zero. None: all of it.
         """
         found = self.predictor(self.members(z, horizon), tol)
         found = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), found)

@@ -65,9 +65,9 @@ class GradientCheck:
         noise, truncation: errors of the differences, by step.
         derivative_error: errors of the derivatives.
         size: of the derivatives.
-        places: where each is furthest off (D, S).
+        places: places where each is furthest off (D, S).
         tol: tolerances of the integration.
-        other_tol: those that errors were measured with.
+        other_tol: tolerances that errors were measured with.
     """
 
     title: str
@@ -157,8 +157,8 @@ def check_gradients(
 
     Args:
         mechanism: with first guesses.
-        data: as for `identify`; only times, names of channels and initial states matter.
-        parameters: as for `identify`.
+        data: records, as for `identify`; only times, names of channels and initial states matter.
+        parameters: parameters, as for `identify`.
         tol: tolerance of the integration, relative and absolute.
         ignore: columns of tables that are not read.
         seed: of the directions in which all unknowns move.

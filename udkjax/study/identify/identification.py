@@ -67,7 +67,7 @@ def identify(
             the residuals of the fit.
         initial_state: the `Start` of every record, or what of it is to be estimated ("position", "velocity", "both"); by default
             the records' own, and for those of tables the scene's.
-        n_starts: how many more first guesses may be followed, the best of eight times as many; 0: none.
+        n_starts: most further first guesses to follow, the best of eight times as many; 0: none.
         guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
         loss: "least_squares"; "huber" or "soft_l1", for which single wrong numbers count less; or a function of the weighted
             residuals (R,) by JAX (standard errors stay those of squares).

@@ -36,7 +36,7 @@ class Parameter:
         of: the name of a number of the scene (`body.link1.mass`, `joint.A.points[1][0]`), a `length`, several of either that are
             tied, or a pure function (mechanism, value) -> mechanism. As text, ties are written with equals signs
             (`body.a.mass = body.b.mass`, `length(a) = length(b)`), a shared factor as `scale(body.a.mass, body.b.mass)`.
-        name: what it is called; by default the text.
+        name: its name; by default the text.
         guess: the first guess, in SI units; by default the scene's value. A function needs one.
         bounds: (low, high), between which the value stays.
         prior: (mean, standard deviation), what was known of it before.

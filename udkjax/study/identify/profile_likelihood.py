@@ -164,7 +164,7 @@ def trace_profile(
         fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns from z0 on; a cost that is not finite is a
             failure, before which the walk ends.
         index: of the unknown, whose estimate has the `cost`, and whose standard error is about a first `step`.
-        noise: where it was estimated, how many times larger it is than what residuals were divided by; then it leaves
+        noise: ratio of the noise that was estimated to what residuals were divided by; then it leaves
             `degrees_of_freedom`, and the quantile is that of F.
         value: x of z_k, which increases between the `bounds` of z_k.
         steps: fits at most, to one side.

@@ -45,7 +45,7 @@ class Start:
 
     Attributes:
         state: the guess that is closed; by default the scene's own.
-        estimate: what of it is to be estimated. The unknowns are as many coordinates ("position") or rates ("velocity") as the
+        estimate: parts of it to estimate. The unknowns are as many coordinates ("position") or rates ("velocity") as the
             mechanism has degrees of freedom there.
         name: starts of one name are tied: they are the same state, estimated from all of their records.
     """
@@ -71,9 +71,9 @@ class Record:
         noise: standard deviation of all channels, or of each by channel, a number or (T,). Where it is not given, it is estimated
             from the residuals of the fit.
         initial_state: the `State` or `Start` at t0; by default the scene's own.
-        t0: when the motion begins (s); by default at the first time.
+        t0: time when the motion begins (s); by default at the first time.
         conditions: values, by name of a parameter, that are known to have held in this record: a payload, a driver's amplitude.
-        name: what messages call it.
+        name: name in messages.
 
     Raises:
         IdentificationError: with every mistake.

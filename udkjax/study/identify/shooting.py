@@ -61,7 +61,7 @@ class MultipleShooting(FitProblem):
         weight: w of the defects, over how far coordinates move in a piece.
         pieces: N parts of records, which are the runs; `following` are those that another leads to.
         guess: the first guess (K,): pieces along the records.
-        scale: how far coordinates move in a piece (S,).
+        scale: distance that coordinates move in a piece (S,).
     """
 
     def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, samples: float = RESIDUALS_PER_UNKNOWN):

@@ -193,7 +193,7 @@ class SweepDesign(abc.ABC):
     """`n` members in the ranges of the axes; the same `seed` gives the same members.
 
     Args:
-        n: how many members.
+        n: number of members.
         seed: of the random numbers.
     """
 

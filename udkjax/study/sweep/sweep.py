@@ -62,9 +62,9 @@ def sweep(
             output times are stretched, or `mechanism`, for mechanisms beside each other. `Axis(values, of=...)` gives an axis a
             name of its own and may tie several quantities; `Zipped({...})` lets axes advance together.
         ts: output times (T,), s.
-        measure: what is stored of each member; nothing else is. By name: "final" (q and v at the end), "states" (at all `ts`),
-            "violation" (the largest, m and rad), "energy_drift" (J), "error" (the largest of a coordinate and of an angle,
-            against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x" (at all `ts`). Or a
+        measure: measures to store of each member; nothing else is stored. By name: "final" (q and v at the end), "states" (at
+            all `ts`), "violation" (the largest, m and rad), "energy_drift" (J), "error" (the largest of a coordinate and of an
+            angle, against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x" (at all `ts`). Or a
             function of (mechanism, solution), which returns an array or a dict of arrays; or several of these, in a list, or in
             a dict of names.
         design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are ranges (low, high), or frozen distributions
@@ -75,7 +75,7 @@ def sweep(
         engine: "dask": on the workers of a `client`; "devices": in this process; "auto": on a client where one is given.
         client: of dask.distributed; by default the one that was made last.
         out: a folder in which finished chunks are stored: the same sweep again goes on from there.
-        memory: what members in computation take at most (bytes).
+        memory: memory of the members in computation, at most (bytes).
         progress: None shows a line where it takes longer than two seconds, True at once, False never; a function gets a
             `SweepProgress` after each chunk.
         settings: any other that `simulate` has, of all members.
@@ -118,7 +118,7 @@ class SweepProgress(Progress):
     Attributes:
         rate: members a second, in this run; None until something is done.
         remaining: time that the rest takes (s), by the work that is left; None until it can be said.
-        failures: how many members ended with which `Result`, successes left out.
+        failures: number of members that ended with each `Result`, successes left out.
         slowest: the member that took most steps, and how many; None where steps are not stored.
         slowest_chunk: the chunk that took longest, and how long (s).
     """

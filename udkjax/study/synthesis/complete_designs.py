@@ -31,11 +31,11 @@ class CompleteDesign(PrintsTable):
         branches: likewise.
         order: the positions in the order in which a motion along the first one's circuit passes them.
         transmission: the least over the positions, from 0 to 1: the sine of the transmission angle.
-        confirmed: which positions motions of the mechanism passed (J,), each from the first one of its branch on.
+        confirmed: mask of the positions that motions of the mechanism passed (J,), each from the first one of its branch on.
         radius: m: the exact four-bar has its pins no farther than that from these.
         number: of its class: four-bars of one class trace one curve.
-        cognate: which of the class (0, 1, 2).
-        driver: what drives it.
+        cognate: index within the class (0, 1, 2).
+        driver: its driver.
     """
 
     mechanism: Mechanism
@@ -120,17 +120,17 @@ class CompleteDesigns(PrintsTable):
         branches: of each position (M, J).
         order: the positions as motions pass them (M, J), then -1.
         transmission: the least over the positions (M,).
-        confirmed: which positions motions passed (M, J).
+        confirmed: mask of the positions that motions passed (M, J).
         radius: of the certificates (M,) (m).
         numbers: of classes (M,).
-        cognates: which of the class (M,).
-        classes: how many real classes, or dyads of a link in poses, were proven, all different.
+        cognates: index within the class (M,).
+        classes: number of real classes, or dyads of a link in poses, proven to be different.
         others: the other solutions, complex ones counted, that are singular, infinite, lost or unproven.
-        left_out: how many designs are left out because they exceed a limit.
-        paths: what became of the solutions of the whole problem, complex ones counted, by name.
+        left_out: number of designs left out because they exceed a limit.
+        paths: counts of the solutions of the whole problem, complex ones too, by what became of them.
         mechanism: the drawing's, as it was given.
         coupler: the name of its coupler.
-        driver: what drives.
+        driver: the driver.
     """
 
     pins: dict[str, Float[np.ndarray, "M 2"]]

@@ -19,7 +19,7 @@ class DrawnFourBar(NamedTuple):
 
     Attributes:
         mechanism: the mechanism that is drawn.
-        driver: what drives the crank.
+        driver: driver of the crank.
         pins: the pins by what they are: O, A, B, C, P.
         coupler: the link with the traced point.
         sign: 1.0 where the driver counts the crank's angle, -1.0 where it counts against it.

@@ -33,8 +33,8 @@ class RealDyads(NamedTuple):
     Attributes:
         boxes: proven to hold one solution each: the joint (two), the crank from the pivot to it (two).
         turns: of the link in each pose, as complex numbers (5,).
-        infinite: how many have a joint or a pivot at infinity, complex ones counted.
-        unproven: what else appears to be real, but could not be proven: joints and cranks (4, K).
+        infinite: number of those with a joint or a pivot at infinity, complex ones counted.
+        unproven: dyads that appear to be real, but could not be proven: joints and cranks (4, K).
         scale: m, a power of two.
     """
 

@@ -18,9 +18,9 @@ class FourBars(NamedTuple):
 
     Attributes:
         O: the fixed joint of the crank, which drives (M,).
-        C: that of the rocker (M,).
+        C: ground pivot of the rocker (M,).
         A: the moving joint of the crank (M, J).
-        B: that of the rocker (M, J).
+        B: coupler joint of the rocker (M, J).
         P: the traced point (J,).
     """
 

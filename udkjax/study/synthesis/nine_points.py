@@ -39,7 +39,7 @@ class Paths(NamedTuple):
     """Counts of the ends of a homotopy's paths.
 
     Attributes:
-        tracked: how many there are: one for each class of generic data.
+        tracked: number of paths: one for each class of generic data.
         regular: distinct classes that were found.
         infinite: paths to four-bars with a joint at infinity.
         singular: paths to solutions at which others meet, or which are no isolated ones.
@@ -65,8 +65,8 @@ class RealClasses(NamedTuple):
 
     Attributes:
         boxes: proven to hold one solution each: joint and crank of both dyads, then cosines less one and sines of turns.
-        paths: what became of all paths.
-        ends: where the other paths came to, and what appears to be real, but could not be proven.
+        paths: outcome of all paths.
+        ends: ends of the other paths, and of those that appear to be real, but could not be proven.
         scale: m, a power of two.
     """
 
