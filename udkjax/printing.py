@@ -12,13 +12,13 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-MOST_ROWS = 14  # of a table as text, whose title and remarks fit on a screen beside it: what is more is counted
+MOST_ROWS = 14  # of a table as text, whose title and remarks fit on a screen beside it: further rows are counted
 MOST_HTML_ROWS = 30  # of a table in a notebook, which scrolls
 MOST_NUMBERS = 6  # numbers of an array that are written out; of more, their shape and range
 MOST_CHARACTERS = 96  # of a cell
 MOST_LINE = 400  # characters of what prints as one line
 DIGITS = 6  # of a number in a table: enough to compare runs by eye
-PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # of the largest number beside it: what thousands of operations leave prints as 0
+PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # of the largest number beside it: rounding of thousands of operations prints as 0
 
 Plain = bool | int | float | complex | np.ndarray | np.generic
 
@@ -102,7 +102,7 @@ def format_numbers(value: Any, unit: str = "") -> str:
     """Return a number or an array with its unit as text: few numbers, or the shape and range of many.
 
     Args:
-        value: an array, a number, a truth value, or None. What is traced is named as such, with its shape, and not computed on.
+        value: an array, a number, a truth value, or None. Traced numbers are named as such, with their shape.
         unit: of all its entries; several, such as "m, m, rad", of those along its last axis.
     """
     if value is None:

@@ -32,7 +32,7 @@ def sweep(
 ) -> None:
     """Simulate a scene with all combinations of some of its numbers, tolerances and methods, or with a design over their ranges.
 
-    What is finished is kept in the folder, whatever happens: the same command again goes on from there. At the end the folder
+    Finished members stay in the folder, whatever happens: the same command again goes on from there. At the end the folder
     holds the dataset, sweep.nc, with the scene, settings and versions, and a picture of each number that was kept of a member.
     Members that fail have a result that says how; examples/grids shows what a grid can be.
 

@@ -53,10 +53,10 @@ class Augmented(PointwiseFormulation):
     is singular, and LU does not notice: it divides by a pivot that is a rounding error. If that is exactly zero, as of a joint
     that is given twice, nothing is a number, and a run ends at once with `Result.not_finite`. In the paper's linkage (rank 11 of
     12) it depends on rounding whether it is. Where it is not, what the rows disagree by at a stage is divided by the pivot: steps
-    become ever smaller. With a pseudoinverse as `method`, for instance
-    `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm: what is redundant is shared, and the accelerations are
-    right, also in singular configurations where the right-hand side is consistent. Its default `rank_tol` is the square of the
-    others': a singular value sigma of D = A M^(-1/2) is one of about sigma^2 here.
+    become ever smaller. With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are the solution of
+    minimum norm: redundant multipliers are shared, and the accelerations are right, also in singular configurations where the
+    right-hand side is consistent. Its default `rank_tol` is the square of the others': a singular value sigma of D = A M^(-1/2)
+    is one of about sigma^2 here.
 
     Args:
         method: a pseudoinverse, such as `SVD()`; None: LU with partial pivoting.

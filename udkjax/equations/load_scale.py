@@ -1,4 +1,4 @@
-"""The scale of forces of a mechanism: what loads are compared with that ought to vanish, also where all of them do.
+"""The scale of forces of a mechanism, for loads that ought to vanish, also where all of them do.
 
 Loads that balance leave rounding errors of their parts: of gravity, of each force element by itself, and of the change of the
 loads along a characteristic length, which a spring at its natural length has, too.

@@ -6,7 +6,7 @@ At Psi = 0, by one elimination of Psi_q (expressions/elimination.py),
     q <- q - Psi_q^+ Psi,      dq/ds = -Psi_q^+ Psi_s,      dq/dx = -Psi_q^+ Psi_x,
     dg/dx = g_x - y^T Psi_x,   dg/ds = g_s - y^T Psi_s,     Psi_q^T y = g_q^T.
 
-What depends on x alone is computed once a mechanism: the `constants`.
+Numbers that depend on x alone are computed once a mechanism: the `constants`.
 """
 
 from collections.abc import Callable, Sequence

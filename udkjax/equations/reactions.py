@@ -8,7 +8,7 @@ the least elastic energy,
 
 what bodies that are stiff beside their joints do. With mu = lambda / w in units of the rows, P = I - D D^+ the projector on the
 null space of D^T, and K = diag(w c w), the minimum over mu + P z is at z = -(P K P)^+ P K mu. Joints of no compliance carry what
-the others leave; what is still open among these alone is shared by the least norm.
+the others leave; shares still open among these alone are those of least norm.
 """
 
 from collections.abc import Callable, Mapping

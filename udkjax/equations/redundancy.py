@@ -23,7 +23,7 @@ from udkjax.scene.mechanism import Mechanism
 POSITION_SAMPLES = 24  # positions of the random motion, where the first one shows rows that depend on each other
 FEWER_SAMPLES_FROM = 300  # rows of Psi: a scene of more takes a third of the positions, each of which takes long
 FAILURES = 3  # positions in a row that cannot be closed: drivers ask for the impossible, and will go on to do so
-CREEP = 1e-3  # of the drivers' step in time, where they ask for it from the first on: what drivers contradict stays impossible
+CREEP = 1e-3  # of the drivers' step in time, where they ask for it from the first on: contradictions of drivers stay impossible
 HEADING_NOISE = 0.3  # share of the direction of the random motion that is new at each position
 ORDINARY_TOL = 0.05  # of the largest singular value: a position whose smallest one is above decides on the rows
 

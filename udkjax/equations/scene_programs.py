@@ -32,9 +32,9 @@ RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces roo
 class ScenePrograms:
     """Programs over arrays of numbers: the results `RESULTS` from constants, t, q, v, dq and dv, as each needs them.
 
-    What a program computes on the way stays in arrays of its own, of the sizes `scratch`: no number is written again once it has
+    Intermediate results of a program stay in arrays of its own, of the sizes `scratch`: no number is written again once it has
     been read. `safe` is whether all pivots exceed `safe_tol`, `distance` the root of the smallest pivot relative to its diagonal
-    entry: the distance from dependence. What the `policy` does with small pivots concerns the accelerations; corrections leave
+    entry: the distance from dependence. The `policy` for small pivots concerns the accelerations; corrections leave
     out the rows whose pivots do not exceed `drop_tol`.
     """
 

@@ -15,8 +15,7 @@ REFINEMENTS = 2
 class SceneSolver:
     """The linear systems of a scene: J M^(-1) J^T x = right with J = Psi_q, by elimination, numbered from zero in each program.
 
-    What the `policy` does with small pivots concerns the accelerations; corrections leave out the rows whose pivots do not exceed
-    `drop_tol`.
+    The `policy` for small pivots concerns the accelerations; corrections leave out rows whose pivots do not exceed `drop_tol`.
     """
 
     def __init__(self, terms: SceneTerms, policy: RankPolicy):

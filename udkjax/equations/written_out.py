@@ -1,6 +1,6 @@
 """The programs of a small scene written out: as expressions of one graph, without loops and without arrays in between.
 
-What depends on numbers of the scene alone is computed once a run: the `constants`, which `prologue` computes. They are not those
+Results that depend on numbers of the scene alone, the `constants`, are computed once a run, by `prologue`. They are not those
 of the loops, but whatever the programs need.
 """
 
@@ -32,7 +32,7 @@ class WrittenOutProgram(NamedTuple):
 class WrittenOutDerivative(NamedTuple):
     """A program, and its derivative along directions, or the transpose of that."""
 
-    evaluation: WrittenOutProgram  # the results, and "stored": what the derivative needs of a state
+    evaluation: WrittenOutProgram  # the results, and "stored": numbers that the derivative needs
     derivative: WrittenOutProgram
 
 

@@ -63,7 +63,7 @@ def _is_array(x: Any) -> bool:
 
 
 class _ClosesOverError(Exception):
-    """A function among the arguments knows numbers that are traced: what is found for it serves no other call."""
+    """A function among the arguments knows numbers that are traced: results for it serve no other call."""
 
 
 class _Out:

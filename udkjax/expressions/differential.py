@@ -4,7 +4,7 @@ A differential is a combination of those of the inputs, d f = sum (df/dx) dx, ke
 are expressions of the same graph, so that what they share with the function, a cosine, say, is one node, and what is zero
 vanishes. They hold for any number of directions at once, and transposed for reverse mode: neither is taken through the nodes.
 
-What an opaque node (an array primitive, `call`) returns counts as further inputs, whose differentials
+Results of an opaque node (an array primitive, `call`) count as further inputs, whose differentials
 follow from those of its arguments by JAX's own rule for the primitive, forward or transposed.
 """
 

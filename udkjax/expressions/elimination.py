@@ -1,7 +1,7 @@
 """Linear systems of expressions, solved once and for all: a sparse matrix of scalars, factored while the graph is built.
 
 Entries that are known numbers are pivots first, the sparsest rows and columns before others: no number of a run can make them
-small. What is left of the matrix A (m, n), m >= n, of full column rank, is rotated to a triangle (Givens), which needs no choice
+small. The rest of the matrix A (m, n), m >= n, of full column rank, is rotated to a triangle (Givens), which needs no choice
 of pivots either: in lanes, all members take the same operations. With E for the row operations, E A = [U, V; 0, B], B = Q R,
 
     A x = b:      B x_2 = (E b)_2 by R x_2 = Q^T (E b)_2, then U x_1 = (E b)_1 - V x_2,
@@ -25,7 +25,7 @@ class SymbolicFactors:
 
     Args:
         graph: The graph of all entries.
-        rows: The entries of each row by column; what is absent is zero.
+        rows: The entries of each row by column; absent entries are zero.
         columns: The number n of columns.
 
     Raises:

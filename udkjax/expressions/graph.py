@@ -1,7 +1,7 @@
 """A graph of scalar expressions.
 
 Equal expressions are one node, zeros and ones vanish while the graph is built, and a sign costs nothing: a `Scalar` is a
-signed reference to a node, so that a - b, b - a and -(a - b) share one subtraction. What is built but not asked for is
+signed reference to a node, so that a - b, b - a and -(a - b) share one subtraction. Nodes that no output needs are
 never emitted (scalar_program.py), so a caller builds freely and chooses later.
 """
 

@@ -1,6 +1,6 @@
 """Derivatives of programs of loops, forward and reverse: kernel by kernel.
 
-Every array x has another one, for its changes (named d_x) or for its cotangents (bar_x). What a program has computed on the way
+Every array x has another one, for its changes (named d_x) or for its cotangents (bar_x). Intermediate results of a program
 must still be there: no number is written again once it has been read.
 """
 

@@ -104,7 +104,7 @@ class LoopProgram(NamedTuple):
 def evaluate_loops(program: LoopProgram, arrays: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Return the arrays as a program leaves them, by JAX; no row of a loop may read what another writes.
 
-    What a loop reads of an array, and what it writes to one, is one operation each: XLA takes milliseconds to compile any.
+    All reads of a loop from an array, and all its writes to one, are one operation each: XLA takes milliseconds to compile any.
     """
     found = dict(arrays)
     for part in program.parts:
@@ -195,7 +195,7 @@ class NumpyLoops:
         return part.array(address.array), places, ADD_ONE_BY_ONE if update == ADD and len(set(places)) < len(places) else update
 
     def __call__(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the arrays as the program leaves them; what is given stays as it is."""
+        """Return the arrays as the program leaves them; the given arrays stay as they are."""
         found = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
         for program, inputs, outputs in self._parts:
             if isinstance(program, ScalarProgram):

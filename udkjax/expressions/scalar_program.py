@@ -21,7 +21,7 @@ Value: TypeAlias = Any  # a number of Python, NumPy or JAX, or an array: each ha
 
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # the standard library's math and NumPy have them under the same names
-# Of Python's numbers: what other primitives compute, without a call of JAX, which takes some hundred times as long.
+# Of Python's numbers: the computation of other primitives, without a call of JAX, which takes some hundred times as long.
 _NUMBER_FUNCTIONS: dict[str, Callable] = {
     **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")},
     "abs": abs,

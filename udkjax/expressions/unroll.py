@@ -1,6 +1,6 @@
 """Write a program of loops out: as expressions of one graph, on arrays of scalars.
 
-What a number is stored for, and read from again, is no memory then but an argument. Equal expressions of different elements are
+A number that is stored and read again passes as an argument then, not through memory. Equal expressions of different elements are
 one node, and what is zero vanishes, as everywhere in a graph.
 """
 
@@ -32,7 +32,7 @@ class _Joined(list[Scalar]):
 
 
 def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], graph: Graph, linear: str | None = None) -> Arrays:
-    """Return the arrays as a program leaves them; what is given stays as it is.
+    """Return the arrays as a program leaves them; the given arrays stay as they are.
 
     Args:
         program: The program.

@@ -22,7 +22,7 @@ Scalar = Float[ArrayLike, ""]
 Vector = Float[Array, "..."] | Float[np.ndarray, "..."]
 APPROACH = 16  # steps from where the mechanism is to the first value
 MOST_KNOTS = 100  # of motions by splines: their programs are whole, and take 10 ms to compile for each
-DEPENDENT = 1e-10  # of a row's square: what is left of one that depends on others; march ends long before
+DEPENDENT = 1e-10  # of a row's square: the rest of a row that depends on others; march ends long before
 
 
 class MarchResult(NamedTuple):

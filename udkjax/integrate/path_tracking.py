@@ -15,7 +15,7 @@ from udkjax.native.batch_program import BatchProgram
 
 FIRST_STEP = 0.02  # of the way; predicted along the rate, and shortened where that is too far
 SHORTEST_STEP = 1e-10  # of the way: a path that takes shorter ones does not go on
-LEAST_SIZE = 1e-2  # units: what an unknown is judged by at least
+LEAST_SIZE = 1e-2  # units: least scale of an unknown
 LARGEST = 1e12  # units: an unknown beyond that has gone to infinity; generic solutions may be as far away as 1e8
 END_TOL = 1e-12  # a Newton step at the end, beside the unknowns, that rounding alone explains where F' is well conditioned
 END_CORRECTIONS = 12  # of Newton, which doubles the digits: far more than a regular solution takes

@@ -23,7 +23,10 @@ def project(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, 
 def error_after_projection(
     equations: AbstractSystem, t: Float[ArrayLike, ""], q: Array, v: Array, dq: Array, dv: Array
 ) -> TangentPart:
-    """Return the errors dq and dv of a step that ends in q and v; what projection takes back counts by `NORMAL_ERROR_WEIGHT`."""
+    """Return the errors dq and dv of a step that ends in q and v.
+
+    The part that projection removes counts by `NORMAL_ERROR_WEIGHT`.
+    """
     equations, t, q, v, dq, dv = stop_gradients((equations, t, q, v, dq, dv))
     left = equations.tangent_part(t, q, v, dq, dv)
     return TangentPart(left.dq + NORMAL_ERROR_WEIGHT * (dq - left.dq), left.dv + NORMAL_ERROR_WEIGHT * (dv - left.dv))

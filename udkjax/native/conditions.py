@@ -14,13 +14,13 @@ RESOLVED = 0.05
 # Of the error over two intervals: the error that counts for one. Of a cubic it is 1/16, by the fourth power of the length, where
 # the interval is fine; four times that is on the safe side where it is not yet. Where rates are differences, it counts whole.
 MISS = 1 / 4
-# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same: what it would have
-# to change to get there would be resolved.
+# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same: a change large
+# enough to get there would be resolved.
 FAR = 1 / RESOLVED
 FINER = 8  # times as fine as an interval that is too coarse is the next one
 SHORT = 1e-6  # T: within a window of that length a condition has a jump or a kink, or varies all along
 SHORT_PAIR = SHORT / 16  # T: two of the 32 intervals of a window of that length
-FINEST = 1e-9  # T: what varies within a window of that length is not resolved any more
+FINEST = 1e-9  # T: changes within a window of that length are not resolved any more
 MOST_JUMPS = 3  # of conditions, before intervals are as long again as they were: of more, some are oscillations
 # Two intervals meet at this share of them, and are shorter than they may be by up to another, which turns by the golden ratio, so
 # that no oscillation is zero at all nodes.

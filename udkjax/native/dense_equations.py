@@ -5,7 +5,7 @@ With D = W Psi_q M^(-1/2), W the weights of the rows, and a method of pseudoinve
     a = a_F + M^(-1/2) D^+ W b,        q - M^(-1/2) D^+ W Psi,        v - M^(-1/2) D^+ W Psi_dot,
 
 and the part of a small change within the manifold, dq - M^(-1/2) D^+ W Psi_q dq. The functions have the names and results of the
-scene's programs by elimination. What belongs to one state is solved by the same factors.
+scene's programs by elimination. Systems of one state are solved by the same factors.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """A thin layer over LLVM's text, in which an algorithm reads like one: values with operators, variables, loops, branches.
 
 A `Function` is written once for one state, or for W of them side by side: wide values are vectors of W lanes, and plain numbers
-where W is one. Numbers meet wide values by being repeated. Of W lanes no branch is taken by one alone: what differs between them
-is chosen (`select`), and a condition of all of them is `any_of`.
+where W is one. Numbers meet wide values by being repeated. Of W lanes no branch is taken by one alone: differences between them
+are chosen (`select`), and a condition of all of them is `any_of`.
 """
 
 from collections.abc import Callable, Iterator, Sequence

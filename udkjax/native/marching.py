@@ -1,8 +1,8 @@
 """Machine code that follows the positions of a driven mechanism from value to value: a batch of members in W lanes.
 
 A step predicts by the Taylor polynomial of q(s) to the third order, from q', q'' and the change of q'', and corrects twice by
-Newton's method with elimination. All lanes take the same steps: nothing depends on how one of them fares. What is to be relied
-on is counted: as long as each position is closed to rounding, lies near its prediction, the tangent has turned little since the
+Newton's method with elimination. All lanes take the same steps: nothing depends on how one of them fares. Positions to be
+relied on are counted: as long as each is closed to rounding, lies near its prediction, the tangent has turned little since the
 one before, and no row is near dependence. From there on, the caller goes on by singular values.
 
 Where the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows:

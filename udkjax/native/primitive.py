@@ -121,8 +121,8 @@ _LOADING = Lock()
 def load(text: str) -> tuple[str, Any]:
     """Load the code of a module; return the name that XLA knows it by, and `run`.
 
-    XLA takes one address for a name, and programs that it has compiled call that whenever they run: what was loaded once stays,
-    and serves everyone who asks for the same text.
+    XLA takes one address for a name, and programs that it has compiled call that whenever they run: code that was loaded once
+    stays, and serves every caller with the same text.
     """
     name = f"udkjax_{machine.digest(text)}"
     with _LOADING:

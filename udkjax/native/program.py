@@ -48,7 +48,7 @@ def write(
 ) -> Function:
     """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
 
-    `lanes` are those of pointers to numbers of another width: what depends on single numbers alone is computed once for all.
+    `lanes` are those of pointers to numbers of another width: results of single numbers alone are computed once for all.
     """
     f = Function(name, [(POINTER, x) for x in pointers], width, cold=cold)
     writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})

@@ -25,7 +25,7 @@ from udkjax.native.tableau import EULER
 STEP = 0.03
 STAYS = 0.5  # of the step: where branches meet, Newton's method leads a position on neither of them back to where it began
 CORRECTIONS = 6  # of Newton's method, which doubles the digits in each: four are usual
-FREE = 1e-6  # of a direction or a velocity, in the scene's units: what is less is rounding, and constraints allow no motion
+FREE = 1e-6  # of a direction or a velocity, in the scene's units: anything less is rounding, and constraints allow no motion
 
 
 class RowMarks(Module):

@@ -19,7 +19,7 @@ RETRIES = 3  # of a step that meets a pivot which elimination must not trust, be
 # Elimination trusts no pivot that is closer than 1e-3 (`BRANCH_TOL`); from here on a step has no stage where it does.
 NEAREST_STAGE = 1.5e-3
 # Rounding errors of accelerations are about a unit of rounding over the third power of the distance, in the scene's own units;
-# what a step's velocity has of them must be less than the tolerance.
+# their share of a step's velocity must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14
 # Of a step: a configuration that is expected by then lies behind its end, though it is expected a little too early, by up to
 # a tenth of a step. Where it is far away, it may be expected by three tenths too early, and just be ahead of the end: less than
@@ -34,7 +34,7 @@ ENDS_BEFORE, BEGINS_BEHIND = 2 * UNIT, UNIT
 GAP = ENDS_BEFORE + BEGINS_BEHIND
 
 # Pieces of the state.
-EDGE = 1e-7  # of a step: how long the one across is. What another piece does to a step is the square of the part that is there
+EDGE = 1e-7  # of a step: how long the one across is. Another piece affects a step by the square of the part that is there
 # Of a step: where a piece ends so close to either of its ends, these tell when to rounding.
 NEAR_END = 0.01
 # A step that is taken again ends a little beyond the piece; or, once it is known when that ends, just before; or it leads across.

@@ -2,11 +2,11 @@
 
 Conditions g(t, q, v) are programs, as accelerations are. They are looked at, with their rates along the motion, at nodes behind
 the accepted steps, two intervals at a time. Between two nodes a condition is Hermite's cubic up to E, by which the cubic over
-both intervals misses the value, or the rate, at the node in between: of one it is a sixteenth, so E is on the safe side.
-Where Bernstein's coefficients of the cubic plus and minus E do not change their sign, there is no crossing; where they change it
-once, there is one, which bisection finds on the polynomial that outputs lie on; a step is then taken to end there, and the last
-change of the time, by Newton's method, is a step of Taylor's. All else is looked at again, an eighth as far at a time; what then
-varies all the same is a jump or a kink. Where there is one after another, or no number, the run ends: whoever called looks on.
+both intervals misses the value, or the rate, at the node in between: of one it is a sixteenth, so E is on the safe side. Where
+Bernstein's coefficients of the cubic plus and minus E do not change their sign, there is no crossing; where they change it once,
+there is one, which bisection finds on the polynomial that outputs lie on; a step is then taken to end there, and the last change
+of the time, by Newton's method, is a step of Taylor's. All else is looked at again, an eighth as far at a time; conditions that
+still vary then have a jump or a kink. Where there is one after another, or no number, the run ends: whoever called looks on.
 """
 
 from udkjax.native.condition_intervals import write_judge

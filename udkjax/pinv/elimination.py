@@ -33,8 +33,8 @@ class Elimination(Dense):
     """Eliminate D D^T by its largest pivots; a pivot whose square root is at most the threshold is dropped.
 
     Each row is compared with what remains of it when those before are taken out, so that rows of unlike sizes, as of masses far
-    apart, do no harm. Errors grow as eps cond(D)^2. The default threshold is eps^(1/3): what rounding leaves of a dependent row
-    stays well below it, and what lies below it has lost most of its digits.
+    apart, do no harm. Errors grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding of a dependent row stays well
+    below it, and pivots below it have lost most of their digits.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> EliminationFactors:

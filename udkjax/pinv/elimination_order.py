@@ -8,7 +8,7 @@ from typing import NamedTuple
 def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
     """Order rows so that eliminating D D^T fills little: always the row that meets the fewest others.
 
-    Of several the one that waits for the fewest before it (ties: the first): what does not wait is computed side by side.
+    Of several the one that waits for the fewest before it (ties: the first): rows that do not wait are computed side by side.
     """
     meets: dict[int, set[int]] = {}
     for i, row in enumerate(rows):

@@ -1,9 +1,8 @@
-"""The one door: what public functions are called with is checked before anything is computed.
+"""The one door: arguments of public functions are checked before anything is computed.
 
 `@checked` reads the annotations and names of a function's parameters. A parameter annotated with classes takes their instances,
 one annotated `Literal` its choices; arrays are told by their names (named_arguments.py): shapes are those of the mechanism,
-numbers are real, finite and of the right sign. Of traced values the shapes and dtypes are checked; what they turn out to be is
-data.
+numbers are real, finite and of the right sign. Of traced values the shapes and dtypes are checked; their values are data.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -72,7 +72,7 @@ def _format_element(element: eqx.Module) -> str:
 
 
 def format_pose(pose: np.ndarray, size: float) -> str:
-    """Return x, y (m) and angle (rad) of a body as text; what is rounding beside `size` (m) or one radian prints as 0."""
+    """Return x, y (m) and angle (rad) of a body as text; rounding beside `size` (m) or one radian prints as 0."""
     x, y = (format_number(value, scale=size) for value in pose[:2])
     return f"({x}, {y}) m, {format_number(pose[2], 'rad', 1.0)}"
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.annotations import Number as Number
 from udkjax.annotations import Numbers as Numbers
 
-# Of the largest of its kind: what a number that is zero in theory may be as it is computed, some hundred units of rounding.
+# Of the largest of its kind: bound on a number that is zero in theory, as it is computed: some hundred units of rounding.
 ROUNDING = 256 * float(np.finfo(float).eps)
 
 Module = TypeVar("Module")
@@ -95,7 +95,7 @@ def direction(value: Numbers | None) -> Float[Array, ""]:
 
 
 def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a converter for fields of a scene's elements: what cannot be converted stays as it is.
+    """Return a converter for fields of a scene's elements: values that cannot be converted stay as they are.
 
     The mechanism that the element is put into refuses it, and names its place.
     """

@@ -18,7 +18,7 @@ def load(path: str | os.PathLike[str]) -> Mechanism:
     """Read a mechanism from a TOML file of format 1, or of format 2: a drawing; or from an MJCF model, as `read_mjcf`.
 
     Args:
-        path: The file; what begins as XML is MJCF.
+        path: The file; a text that begins as XML is MJCF.
 
     Returns:
         The mechanism; that of a drawing has it as `drawing`.

@@ -1,6 +1,6 @@
 """Numbers that are held between samples: what a digital controller puts out, or a table of measured forces.
 
-Whatever has samples, splines among them, is constant or a cubic from one breakpoint to the next: programs are made of one such
+Numbers with samples, splines among them, are constant or a cubic from one breakpoint to the next: programs are made of one such
 interval, and a run changes the numbers of the interval where it begins anew behind a breakpoint.
 """
 

@@ -239,7 +239,7 @@ class Rack(Joint):
     """Body 2, a pinion of `radius` r centred at its centre of mass, rolls on a rack along `axis` of body 1, on the rack's left.
 
     1 row (m): s + r (theta2 - theta1) - constant, s the displacement of body 2's origin from body 1's along the axis. The
-    constant is the initial guess's. Only the rolling is held: what keeps the pinion at its height is another joint, a `Slot`.
+    constant is the initial guess's. Only the rolling is held: another joint, a `Slot`, keeps the pinion at its height.
 
     Args:
         bodies: the names of the rack and of the pinion.

@@ -82,7 +82,7 @@ class AbstractDrawing(PrintsTable):
 class Mechanism(PrintsTable):
     """Bodies, joints, drivers and force elements, each under its name, and gravity.
 
-    Data alone: what follows from it, such as which rows are redundant, is for `udkjax.analyse` to find. A pytree whose leaves
+    Data alone: `udkjax.analyse` finds what follows from it, such as redundant rows. A pytree whose leaves
     are all of its numbers; names, topology and types are static. Names, orders and rows are the user's: `constraints` are the
     joints in their order, then the drivers. `forces` may be a list: an element without a name is called TYPE1, TYPE2, ... by its
     place among those of its type. Numbers that a joint leaves to the initial guess are filled in here.

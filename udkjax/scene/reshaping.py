@@ -1,7 +1,7 @@
 """Mechanisms with other lengths and starts, whose initial guess stays as closed as it was.
 
 A length is not one number of a scene: a link that gets longer moves its attachments, and with them the bodies that hang on it. So
-does an initial angle. What is changed here is passed on along the pins, body after body from the ground on, each turned as its
+does an initial angle. A change is passed on along the pins, body after body from the ground on, each turned as its
 guess has it: along a tree of pins, which holds each body once, no pin opens. The rest is for `assemble` to close.
 """
 

@@ -59,7 +59,7 @@ def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, "
     closed, around = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
     steps, slopes = jnp.diff(closed), jnp.diff(around) / jnp.diff(closed)
     right = 6 * (slopes - jnp.roll(slopes, 1))
-    # The last row and column apart: what is left is tridiagonal (Schur complement).
+    # The last row and column apart: the rest is tridiagonal (Schur complement).
     diagonal = 2 * (jnp.roll(steps, 1) + steps)
     corner = jnp.concatenate([steps[-1:], jnp.zeros(n - 3, knots.dtype), steps[-2:-1]])
     one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T

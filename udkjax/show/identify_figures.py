@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MOST_WRITTEN = 14  # parameters up to which correlations are written as numbers too
 LARGEST_ERROR = 1e3  # percent: standard errors that are larger are drawn as this
-HIGHEST_COST = 3.0  # times the limit of a profile likelihood: what is higher is not drawn
+HIGHEST_COST = 3.0  # times the limit of a profile likelihood: higher costs are not drawn
 ZERO_DRAWN = 1e-18  # zero is drawn as this on a logarithmic axis
 
 

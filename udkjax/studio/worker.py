@@ -1,4 +1,6 @@
-"""A second process that reads, compiles and diagnoses drawings: what takes too long ends with it, and the page stays served.
+"""A second process that reads, compiles and diagnoses drawings.
+
+Requests that take too long end with it, and the page stays served.
 
 Requests and answers are JSON, so that nothing of a scene is ever unpickled.
 """

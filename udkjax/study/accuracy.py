@@ -22,7 +22,7 @@ class Accuracy(NamedTuple):
     kinetic_energy: float  # J
     error: float | None  # of any coordinate against the exact solution, m or rad; None where none is known
     work: float | None  # of drivers, dampers, loads and impacts up to the end, J; None where there are none
-    length: float  # characteristic, m: what a violation is measured by
+    length: float  # characteristic, m: unit of a violation
 
 
 def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:

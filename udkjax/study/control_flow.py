@@ -1,6 +1,6 @@
 """Loops and branches of an algorithm that is written once: by NumPy and Python where all numbers are known, else by JAX.
 
-What JAX compiles takes seconds before it takes its first step; NumPy begins at once.
+Programs that JAX compiles take seconds before their first step; NumPy begins at once.
 """
 
 from collections.abc import Callable, Sequence

@@ -66,7 +66,7 @@ def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array
         tau: the direction of the branch there, roughly.
 
     Returns:
-        What was found, and whether it is to be relied on.
+        The crossing that was found, and whether it is to be relied on.
     """
 
     def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:

@@ -28,8 +28,8 @@ from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize, with_unit_mass
 
 MOST_NEWTON_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
-FORCE_TOL = 1e-9  # of the scale of forces: what may be left of the loads along free directions; rounding leaves 1e-15
-FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: what is left is rounding, which no step makes less
+FORCE_TOL = 1e-9  # of the scale of forces: tolerance of the loads along free directions; rounding leaves 1e-15
+FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: the rest is rounding, which no step reduces
 NEUTRAL_STIFFNESS = 1e-10  # of the largest stiffness: one below it resists nothing
 SMALLEST_STIFFNESS = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
 

@@ -1,4 +1,4 @@
-"""Numbers of a mechanism that are free, as one vector: what batches of mechanisms differ in, and what design searches over."""
+"""Numbers of a mechanism that are free, as one vector: batches of mechanisms differ in them, design searches over them."""
 
 from collections.abc import Callable, Mapping, Sequence
 

@@ -212,7 +212,7 @@ def _efforts(
             free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
         wanted, A = free(missing), free((C * units).T * share)
         f = share * (SVD(RANK_TOL).plus(A) @ wanted)
-        # Of the parts, which may balance: what is left of them then is rounding.
+        # Of the parts, which may balance: their rest is rounding then.
         parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))
         size = jnp.maximum(jnp.max(parts), scales.mass * (scales.length * scales.rate) ** 2)
         left = jnp.max(jnp.abs(wanted - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)

@@ -34,7 +34,7 @@ class Modes(PrintsTable):
     s: Complex[Array, "2f"]  # 1/s, with damping, by imaginary part and then by real part
     damped_shapes: Complex[Array, "2f bodies 3"]  # of s, of unit length
     q: Float[Array, "bodies 3"]
-    residual: Float[Array, ""]  # N/sqrt(kg): what is left of the loads along free directions: zero at rest
+    residual: Float[Array, ""]  # N/sqrt(kg): remaining loads along free directions: zero at rest
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
 
     _units = units(omega2="(rad/s)²", s="1/s", q="m, m, rad", residual="N/sqrt(kg)")
@@ -99,7 +99,7 @@ def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, 
     C, K = with_unit_mass(at, by)
     omega2, eta = xp.linalg.eigh(0.5 * (K + K.T))
     shapes = (N @ eta).T.reshape(free, -1, 3)
-    # In units of the fastest: what is far from one costs an eigenvalue its digits.
+    # In units of the fastest: scales far from one cost an eigenvalue its digits.
     unit = stop_gradients(xp.sqrt(xp.max(xp.abs(K), initial=0.0)))
     unit = xp.where(unit > 0, unit, 1.0)
     companion = xp.block([[xp.zeros_like(K), xp.eye(free)], [-K / unit**2, -C / unit]])

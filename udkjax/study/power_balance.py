@@ -33,7 +33,7 @@ from udkjax.study.channels import StateHistory
 
 @prints_table
 class PowerBalance(NamedTuple):
-    """Powers (W) at each output time. What they do not explain of the energies' rates is `residual`.
+    """Powers (W) at each output time. The rest of the energies' rates is `residual`.
 
     Attributes:
         drivers: power of each driver over time (W).

@@ -70,7 +70,7 @@ def report_progress(
 
     Args:
         progress: None or "auto" writes a line to stderr if the computation takes longer than two seconds, True at once, False
-            never; a callable gets a `Progress` at each report. What it raises ends the computation.
+            never; a callable gets a `Progress` at each report. An exception from it ends the computation.
         total: amount to do, in any unit; None where that is not known.
         what: name of the computation, as it stands before the line.
         patience: time (s) after which there is a line by default.

@@ -20,7 +20,7 @@ def row_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray,
 
 
 def echelon(rows: Float[np.ndarray, "R K"], tol: float = SMALLEST_COEFFICIENT) -> Float[np.ndarray, "D K"]:
-    """Return independent rows in reduced echelon form; what is below `tol`, relative to a row's largest entry, is made zero."""
+    """Return independent rows in reduced echelon form; entries below `tol`, relative to a row's largest, are made zero."""
     rows, done = np.array(rows, float), 0
     for column in range(rows.shape[1]):
         if done == len(rows):

@@ -18,7 +18,7 @@ from udkjax.scene.mechanism import Mechanism
 BESIDE = 1e-9  # of the span: between two instants so close only what jumps changes much
 # Of the span: where the integrator, which tries steps ten times as long as those before, may have met what is not finite.
 AHEAD = (0.0, *np.geomspace(1e-6, 0.1, 80))
-JUMP = 1e-3  # of a load: what it changes by over `BESIDE`, if it jumps; a smooth one by a millionth of that
+JUMP = 1e-3  # of a load: its change over `BESIDE`, if it jumps; a smooth one by a millionth of that
 GROWN = 1e6  # times as large as before: a load that grows without bound
 NEAR_REACH = 1e-2  # of the span: how far from its end a run may be by a dead point
 STIFF = 0.1  # rate times step: explicit methods of any order lose stability between 1 and 10

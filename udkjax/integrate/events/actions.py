@@ -66,7 +66,7 @@ class Attach(Action):
 class Lock(Action):
     """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
 
-    What it adds is called as the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
+    Its constraint has the name of the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
 
     Args:
         joint: the name of a joint of the scene.

@@ -6,7 +6,7 @@ name, as joints and force elements see theirs:
     udk.Event(lambda t, at: at["link"].angle, udk.Log(), name="vertical")
 
 Ready-made ones: `JointLimit`, `Contact`. Numbers that are traced or differentiated belong into an equinox module whose `__call__`
-is the condition, as those of the ready-made ones do: what a plain function closes over is fixed when it is compiled.
+is the condition, as those of the ready-made ones do: numbers that a plain function closes over are fixed when it is compiled.
 """
 
 from collections.abc import Callable, Sequence

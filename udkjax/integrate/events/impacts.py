@@ -14,7 +14,8 @@ Newton's law of restitution, with complementarity (Moreau 1988; Glocker, Set-Val
     0 <= Lambda_i,        g_dot+_i + e_i g_dot-_i >= 0,        one of them zero.
 
 No contact pulls, none is penetrated, one alone has g_dot+ = -e g_dot-, and one that the others lift opens. Those take part that
-are closed and do not separate already, g_dot- <= 0: what is penetrated by their impact hits next. So a scleronomic mechanism has
+are closed and do not separate already, g_dot- <= 0: contacts that their impact penetrates hit next. So of a scleronomic
+mechanism
 
     T+ - T- = (g_dot+ + g_dot-) . Lambda / 2 = sum_i (1 - e_i) g_dot-_i Lambda_i / 2 <= 0:
 
@@ -45,7 +46,7 @@ from udkjax.integrate.gradients import stop_gradients
 BLOCKED = 1e-16
 # Of a condition's scale: contacts that are no farther from zero when another one hits are hit with it. It is above the errors of
 # a run at ordinary tolerances in what is symmetric, and what is done too early by it lasts 1e-9 T. Of the fastest approach in an
-# impact, or of the strongest pull: what that leaves of another is zero, since the rows of these contacts are known that well.
+# impact, or of the strongest pull: less of another contact is zero, since the rows of these contacts are known that well.
 CLOSED = STILL = 1e-9
 # The square of the sine between the row of a contact and those of contacts that are held: below it they hold it, too. A row that
 # depends on others in theory has a sine of some CLOSED over the distance of the contacts, here down to a thousandth of L.

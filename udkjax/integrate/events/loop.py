@@ -173,7 +173,7 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
 def _after_event(hybrid: Hybrid, loop: LoopState, jumped: LoopState, values: ConditionValues) -> LoopState:
     """Return the loop after an event, or at the start, with the event that happens at once."""
     new = choose(loop.pending == BEGIN, _begin(hybrid, jumped, values), jumped)
-    # The contacts that were closed are settled: what they do next takes time.
+    # The contacts that were closed are settled: their next event takes time.
     settled = (loop.pending >= 0) & (new.record.closed[jnp.maximum(new.record.count - 1, 0)] > OPEN)
     now = jnp.where(jnp.append(settled, jnp.zeros_like(settled)), new.sides, side_of_zero(values, hybrid.rate))
     pending = first_crossing(hybrid, new.state.phase, new.carried, new.sides, now)
@@ -183,7 +183,7 @@ def _after_event(hybrid: Hybrid, loop: LoopState, jumped: LoopState, values: Con
 def _begin(hybrid: Hybrid, loop: LoopState, values: ConditionValues) -> LoopState:
     """Return the loop with the sides of zero of the conditions at the start."""
     is_zero = jnp.abs(values.h) <= ZERO * values.scale
-    # Contacts are approached from the side that is allowed: what is zero and falls at the start happens at once.
+    # Contacts are approached from the side that is allowed: a condition that is zero and falls at the start happens at once.
     impacts = np.append(hybrid.impacts, np.zeros(hybrid.count, bool))
     sides = jnp.where(impacts & is_zero, 1, side_of_zero(values, hybrid.rate))
     beyond = jnp.any(impacts & (values.h < 0) & ~is_zero)

@@ -139,7 +139,7 @@ def _contact(event: Event) -> str:
 
 
 def _analysis(phase: Mechanism, of_own: Callable[[], Analysis]) -> Analysis:
-    """Return the analysis of a phase. What is added by traced numbers counts as independent of the scene's own constraints."""
+    """Return the analysis of a phase. Constraints added with traced numbers count as independent of the scene's own."""
     found = analyse(phase)
     own = of_own() if found.redundant_rows is None else found
     if own.redundant_rows is None or found.redundant_rows is not None:

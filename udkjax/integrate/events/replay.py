@@ -51,7 +51,7 @@ class RunInput(NamedTuple):
 
 
 def run_events(hybrid: Hybrid, given: RunInput, max_events: int) -> EventRun:
-    """Run a system with events. What is smooth in the result has first derivatives, forward and reverse."""
+    """Run a system with events. The smooth parts of the result have first derivatives, forward and reverse."""
     arrays, rest = eqx.partition((hybrid, given), eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
     return _run(FixedPart(rest, tree, max_events), xs)

@@ -1,6 +1,6 @@
 """A sweep of a run with events: machine code runs as far as it is certain what happens, to the first crossing at most.
 
-What it cannot tell, windows look at more closely (`window`). In phases in which contacts are at rest there are no sweeps: their
+Windows look more closely where it cannot tell (`window`). In phases in which contacts are at rest there are no sweeps: their
 forces are no conditions of machine code.
 """
 

@@ -1,8 +1,8 @@
 """A window of a run with events: integrate it, look for the first crossing in it, and locate that.
 
 A window has the output times within it, and nodes at which the conditions and the forces of contacts at rest are looked at
-(`detection`); where these are too coarse for a condition, the window is done again, an eighth as long. What is found is located
-by Newton's method on the event time, safeguarded by the bracket, with the state integrated anew from the bracket's beginning; the
+(`detection`); where these are too coarse for a condition, the window is done again, an eighth as long. Events are located by
+Newton's method on the event time, safeguarded by the bracket, with the state integrated anew from the bracket's beginning; the
 last change of the time, too small to matter for anything but g, is a step of Taylor's. So g is zero to rounding.
 """
 

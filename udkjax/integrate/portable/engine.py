@@ -167,7 +167,7 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
 
 
 def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
-    """Return the module of runs; what it takes goes into the data."""
+    """Return the module of runs; its inputs go into the data."""
     operation, inputs = packed(problem)
     given = dict(zip(INPUTS, inputs, strict=False))
     data |= {
@@ -183,7 +183,7 @@ def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
 
 
 def _close(mechanism: Mechanism, data: Json) -> Json:
-    """Return the module of closing; what it takes goes into the data."""
+    """Return the module of closing; its inputs go into the data."""
     tol = float(rank_tolerance(mechanism))
     settings = [data["scales"]["length"], tol]
     data["closing"] = {"thresholds": [tol**2, 0.0], "settings": settings, "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}

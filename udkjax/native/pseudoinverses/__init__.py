@@ -2,7 +2,7 @@
 
 `dense` has matrices in the memory of a run, one of each lane: rows of whole registers, with the few operations that all methods
 are made of. A method says what arrays it needs, how D becomes factors, and how these solve. Each lane has pivots and a rank of
-its own: what differs between lanes is chosen, as everywhere in machine code.
+its own: differences between lanes are chosen (`select`), as everywhere in machine code.
 """
 
 from udkjax import pinv

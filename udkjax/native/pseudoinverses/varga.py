@@ -39,7 +39,7 @@ class VargaCode(DenseMethod):
         f, b, x = d.f, d.row("b"), d.row("x")
         apply_q_transposed(d)
         x.clear()
-        with f.each(d.steps) as k:  # L y = b: what of row k lies behind column k meets zeros
+        with f.each(d.steps) as k:  # L y = b: entries of row k behind column k meet zeros
             x.put(k, (b.entry(k) - d.dot(d.row("D", k), x)) * d.row("inverse").entry(k))
         with reversed_each(d, d.steps) as k:
             apply_reflector(d, "z", "tau_z", k, "x")

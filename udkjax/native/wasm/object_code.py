@@ -1,7 +1,7 @@
 """LLVM's WebAssembly object code as a module that can be loaded: with exports, and without what is for linkers.
 
 An object has all its functions under their final numbers and its data from address 0 on, so that nothing has to be relocated; its
-memory and the pointer to its stack are imports. What it lacks is a section of exports: the numbers of its functions are in the
+memory and the pointer to its stack are imports. It lacks a section of exports: the numbers of its functions are in the
 table of symbols, in the section "linking" (the tool conventions' Linking.md).
 """
 

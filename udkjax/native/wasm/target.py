@@ -1,6 +1,6 @@
 """The compiler for WebAssembly: 32-bit addresses, registers of two float64, and no fused multiply-add.
 
-What LLVM's text says holds there as well: the record that `run` is called with has fields of 8 bytes, of which addresses take
+The same text of LLVM holds there: the record that `run` is called with has fields of 8 bytes, of which addresses take
 four; a product and a sum are rounded each. Functions that are no instructions (exp, pow, atan2) and the memory of a run (malloc,
 free) are imports.
 """

@@ -134,7 +134,7 @@ class Units:
     def convert_table(
         self, path: str, cls: type, table: Table, problems: list[str], variant: str = "", law: str = ""
     ) -> dict[str, Any]:
-        """Return the table of an element of a class in SI units; what is wrong with a number is added to the problems.
+        """Return the table of an element of a class in SI units; mistakes of numbers are added to the problems.
 
         `variant` is the name by which the units of its fields are known, by default that of the class; `law` that of a motion.
         """

@@ -181,5 +181,5 @@ class DrawnBody(NamedTuple):
 
 
 def with_known_numbers(tree):
-    """Return a tree with NumPy's arrays in place of all that are not traced: what follows from them alone stays known."""
+    """Return a tree with NumPy's arrays in place of all that are not traced: results of these alone stay known."""
     return jax.tree.map(lambda x: x if isinstance(x, Tracer) else np.asarray(x), tree)

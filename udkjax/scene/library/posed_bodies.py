@@ -27,7 +27,7 @@ COMPLEX_STEP = 1e-100  # of the coordinate: its square is lost beside 1, and a r
 
 
 def with_known_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Give a function of the library all numbers that are not traced as NumPy's: what follows from them alone stays known."""
+    """Give a function of the library all numbers that are not traced as NumPy's: results of these alone stay known."""
     parameters = signature(build)
 
     @wraps(build)

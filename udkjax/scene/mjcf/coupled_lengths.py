@@ -8,7 +8,7 @@ from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-EVEN = 1e-12  # of the largest term: what angles that cancel leave
+EVEN = 1e-12  # of the largest term: the rounding of angles that cancel
 
 
 class CoupledLength(NamedTuple):

@@ -12,7 +12,7 @@ from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneMotion
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-MESHED = 1e-9  # rad; what rounding leaves between gears
+MESHED = 1e-9  # rad; rounding between gears
 
 
 class EqualityReader:

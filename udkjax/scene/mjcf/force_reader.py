@@ -1,4 +1,4 @@
-"""Springs, dampers and actuators of an MJCF model as force elements; what they have beside is refused or left out by name."""
+"""Springs, dampers and actuators of an MJCF model as force elements; other parts of them are refused or left out by name."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple

@@ -22,7 +22,7 @@ from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
 
 INITIAL = "initial"  # the keyframe that `mjcf_text` writes velocities and controls into
-OPEN_LOOP = 1e-9  # of the model's size: what rounding leaves open of a loop
+OPEN_LOOP = 1e-9  # of the model's size: rounding of a closed loop
 ROTOR_MASS = 0.01  # of the mass of the body that carries it
 
 

@@ -1,4 +1,4 @@
-"""XML with the line of each element, and attributes read as numbers; what is wrong is collected, not raised."""
+"""XML with the line of each element, and attributes read as numbers; mistakes are collected, not raised."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

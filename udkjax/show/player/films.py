@@ -15,8 +15,8 @@ with OptionalImport():
 
 SMOOTH = 3  # times: a picture of pixels is drawn so much larger, and made smaller
 MOST_FRAMES = 1500  # of a film
-SAME_COLOUR = 8  # of 255: what a nearest colour of a palette is off by
-GIF_TICK = 0.01  # s: what a GIF counts the time of a frame in
+SAME_COLOUR = 8  # of 255: error of a palette's nearest colour
+GIF_TICK = 0.01  # s: unit of a GIF's frame times
 
 
 def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> Image.Image:

@@ -2,7 +2,7 @@
 
 A table of numbers becomes whole numbers of a stated step; down each column their second differences, which are small where a
 motion is smooth; zigzag (0, -1, 1, -2 ... become 0, 1, 2, 3 ...); bytes of seven bits each, the least first, the eighth bit set
-where another follows (LEB128); base64. What is read back is within half a step.
+where another follows (LEB128); base64. Numbers that are read back are within half a step.
 """
 
 import base64

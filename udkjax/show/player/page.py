@@ -36,7 +36,7 @@ def frame(data: Json, height: int) -> str:
 
 
 def as_json(data: object) -> str:
-    """Return data as JSON that may stand inside <script>. What is not finite has no place in it: ValueError."""
+    """Return data as JSON that may stand inside <script>. Numbers that are not finite have no place in it: ValueError."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).translate(ESCAPES)
 
 

@@ -51,7 +51,7 @@ SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 1
 MODE_PERIOD = 2.0  # s: how long one cycle of a mode takes
 MODE_AMPLITUDE = 0.12  # of the characteristic length, or rad: how far a mode is shown to move
 PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # of a path: for each instant of its run, and in all
-SMALLEST_PATH = 1e-6  # characteristic lengths: what moves less has no path
+SMALLEST_PATH = 1e-6  # characteristic lengths: points that move less have no path
 
 
 def run_record(

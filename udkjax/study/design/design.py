@@ -131,7 +131,7 @@ def design(
 
     Random mechanisms within the bounds are turned once; the best of them, moved and scaled to the goal as a whole where that is
     free, are improved by Levenberg and Marquardt's method, all side by side in machine code, with exact derivatives by all free
-    numbers. Branches are kept, positions come in their order, limits hold. What is returned has been moved by `kinematics`.
+    numbers. Branches are kept, positions come in their order, limits hold. Every design has been moved by `kinematics`.
 
     Args:
         drawing: the structure: a drawing, or a mechanism with one degree of freedom once its drivers hold. Its pins say nothing

@@ -263,7 +263,7 @@ class DesignProblem:
         else:
             unit = MARGIN_WEIGHT * self.scale
             limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
-            by_x = table[:, :, G, 2:]  # values that are unknowns are held: what moves them is another residual's matter
+            by_x = table[:, :, G, 2:]  # values that are unknowns are held: moving them is another residual's matter
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
         terms, by_terms = self._terms_of(x, is_there, threads)
         return TrialResiduals(found.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, is_there)

@@ -22,7 +22,7 @@ FIRST_WEIGHT, HARDEN, MOST_WEIGHT = 0.5, 6.0, 100.0
 HIGH = 20.0  # of weights, for each scale of the root of the loss: walls that are low beside the loss hold nothing back
 # Squares of transmissions: where limits begin, and by what they shrink to what is asked for, whenever a trial has settled.
 FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
-KEPT_TO = 1e-8  # scales: what a limit may be exceeded by in the end, before the last polish
+KEPT_TO = 1e-8  # scales: final excess over a limit, before the last polish
 SETTLED = 1e-9  # relative fall of the loss below which a trial has settled
 PRESSED = 1e-5  # barrier of a design beyond a limit, or pressing on it, which is to harden
 ROUNDING = 1e-26  # of the squared scale: a loss below is zero to rounding

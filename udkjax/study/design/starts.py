@@ -14,7 +14,7 @@ from udkjax.study.design.trials import Trials, Turn
 
 PHASES = 12  # first values that are tried, around a turn
 SPANS = (1.0, 0.6, 0.3)  # of a turn, from the first value to the last, that are tried for open curves
-LEAST_SCALE = 0.03  # of the curve beside its targets: what fits best as a point does not fit at all
+LEAST_SCALE = 0.03  # of the curve beside its targets: a curve that fits best as a point does not fit at all
 ROUNDS = 2  # of moving to the targets and assigning anew
 CLEAR = 0.02  # transmission over the whole turn, at least: those that come closer to where branches meet end there soon
 

@@ -19,7 +19,7 @@ from udkjax.study.diagnosis.configuration import NEIGHBOUR_STEP, Configuration, 
 
 SLOPE_STEP = 1e-5  # of the characteristic length, and rad: the third root of rounding, for central differences
 WALK_STEPS = 160  # steps along the path in each direction: about a turn of everything, or more
-POINTS_BESIDE = 4  # positions on each side of a root that the polynomial goes through: what it misses is a step to the eighth
+POINTS_BESIDE = 4  # positions on each side of a root that the polynomial goes through: it misses a step to the eighth
 
 
 class RankChange(NamedTuple):

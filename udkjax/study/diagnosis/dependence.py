@@ -2,8 +2,8 @@
 
 N spans the null space of J^T. The rows of a set S of constraints are dependent if and only if a combination y of the columns of N
 vanishes outside S, N[outside] y = 0, and redundant by nullity(N) - rank(N[outside]). S is minimal if no constraint can be taken
-out of it. One set is grown around each constraint; the smallest are taken until their combinations y span all of N. What is
-still missing is looked for without a row of each combination that is known.
+out of it. One set is grown around each constraint; the smallest are taken until their combinations y span all of N. Further
+combinations are searched for without a row of each that is known.
 """
 
 from collections.abc import Iterable, Sequence

@@ -29,7 +29,7 @@ GUESS_SPREAD = 1.0  # of an unknown: how far it is taken to be from its guess; a
 # Of what a channel shows: up to there what is predicted is nearly a linear function of the unknowns. A sine of the wrong phase is
 # off by sqrt(2) times the error of the phase: it is 0.2 rad, and five times that still leads to the right minimum.
 LINEAR_PART = 0.3
-LEAST_GROWTH, MOST_GROWTH = 1.3, 30.0  # from one part to the next: what has no end is not waited for
+LEAST_GROWTH, MOST_GROWTH = 1.3, 30.0  # from one part to the next: endless fits are not waited for
 MOST_PARTS = 30  # even at the least growth they lead to two thousand times the first part
 HUBER_LIMIT = 4.0  # standard deviations: on the way larger residuals count as by Huber's loss
 LOST_RATIO = 3.0  # times the root mean square of residuals of the part before: the larger part has led to another minimum

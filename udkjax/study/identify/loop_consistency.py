@@ -35,8 +35,8 @@ from udkjax.study.row_spaces import SMALLEST_COEFFICIENT, connected_columns, ech
 DEPENDENT_PART = 1e-6
 DIFFERENCE_STEP = 1e-5  # of a parameter's value: the step of the central differences
 # Of a parameter's size, which is its value, or less where that changes a row by more than the row's own size: the step after
-# which a mechanism must close again. What opens to second order does so by 1e-4 of the size, ten million times what is left of
-# closing (`position_closure.CLOSED_TOL`).
+# which a mechanism must close again. A loop that opens to second order does so by 1e-4 of the size, ten million times what is
+# left of closing (`position_closure.CLOSED_TOL`).
 CLOSING_STEP = 1e-2
 SMALL_VALUE = 1e-5  # of the size by effect: a value as small as this, such as that of a coordinate, counts as zero
 MOST_POSITIONS = 4  # positions that are closed again
@@ -94,7 +94,10 @@ def nearest_closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tup
 
 
 def require_consistent_loops(mechanism: Mechanism, unknowns: Unknowns) -> None:
-    """Raise where the parameters would open a loop. What keeps it closed does so for other numbers with the same structure."""
+    """Raise where the parameters would open a loop.
+
+    Parameters that keep loops closed do so for other numbers with the same structure.
+    """
     structure = jax.tree.structure(mechanism), unknowns.targets
     if structure in _consistent:
         return

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # imported where a fit begins: it takes a second
     import optax
 
 GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
-FAILED_COST = 100.0  # times the first cost: what is taken for the cost where nothing can be computed
+FAILED_COST = 100.0  # times the first cost, in place of a cost that cannot be computed
 TUNING_CONSTANT = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
 
 Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones

@@ -42,7 +42,7 @@ class Parameter:
         prior: (mean, standard deviation), what was known of it before.
         transform: "positive", "bounded" or "free"; by default what must not be negative stays positive.
         scale: the typical size of a change of a free one; by default its own size, or 1 SI unit.
-        share: "value": what is tied has one value; "scale": it has one factor by which the scene's values are multiplied.
+        share: "value": tied parameters have one value; "scale": they have one factor by which the scene's values are multiplied.
     """
 
     of: str | Length | Sequence[str] | Setter

@@ -48,7 +48,7 @@ class Table(NamedTuple):
 
 
 def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: list[str]) -> Iterator[Table]:
-    """Iterate over the tables of one file or object; what is wrong with it is added to `problems`."""
+    """Iterate over the tables of one file or object; its mistakes are added to `problems`."""
     if isinstance(data, str | os.PathLike):
         yield from _read_file(Path(data), bodies, problems)
     elif hasattr(data, "data_vars"):

@@ -1,7 +1,7 @@
 """Chunks of a sweep: members of one group that take a few seconds together, by what a first chunk of the group took.
 
-Members come in the order of the steps that they are expected to take, the longest first: what is left for the end, where devices
-wait for the last chunk, is short.
+Members come in the order of the steps that they are expected to take, the longest first: the end, where devices wait for the
+last chunk, is short.
 """
 
 import sys
@@ -20,7 +20,7 @@ from udkjax.study.sweep.plan import Chunk, SweepPlan
 
 MEMORY = 2**30  # bytes that members in computation take at most, by default
 CHUNK_COPIES = 4  # of what is stored of a chunk, in memory while it is computed: parts on the device, joined, of other chunks
-CHUNK_SECONDS = 2.0  # of work in a chunk, roughly: what an interruption loses, and how often progress is seen
+CHUNK_SECONDS = 2.0  # of work in a chunk, roughly: bounds the loss by an interruption, and the time between two signs of progress
 CHUNKS_FOR_EACH = 4  # chunks for each that computes at a time, so that all have something to do to the end
 SHORTEST_CHUNK = 0.05  # s of work in a chunk for that: to call a program and to store what it gave takes a few hundredths of it
 MOST_TRIED_GROUPS = 3  # groups timed to estimate a cost; others are taken to be as fast, on average

@@ -80,7 +80,7 @@ def bytes_per_member(plan: SweepPlan) -> int:
 def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
     """Return the xarray Dataset of a plan, from (members, what was stored of them) in any order.
 
-    What is not among them is not a number, and has the result -1.
+    Other members are not a number, and have the result -1.
     """
     import xarray
 

@@ -82,7 +82,7 @@ class ClusterError(RuntimeError):
 def dask_engine(client: "distributed.Client | None" = None) -> Engine:
     """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
 
-    Workers may come and go: what a lost one had not delivered is computed by another. Each result is handed over when it
+    Workers may come and go: another one computes what a lost one had not delivered. Each result is handed over when it
     arrives, and stored nowhere else. Raises `ClusterError` where there is no client, where a worker has
     other versions of the packages that decide the results, and where workers die time and again over one chunk.
     """

@@ -49,7 +49,7 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
 
 
 class _GridReader:
-    """Reads the file of a sweep. What is not as it should be becomes one of `problems`, and None or something empty.
+    """Reads the file of a sweep. A mistake becomes one of `problems`, and its value None or something empty.
 
     `drawn`: members are drawn by a design, from ranges and distributions, instead of from lists of values. Other files are looked
     for beside it, in `folder`.

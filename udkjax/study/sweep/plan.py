@@ -67,7 +67,7 @@ class SweepPlan:
     measures: tuple[Measure, ...]
     derivatives: tuple[str, ...] = ()
     design: SweepDesign | None = None
-    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy: what was compiled for one serves all
+    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy: code compiled for one serves all
 
     def __hash__(self) -> int:
         return hash(self.token)

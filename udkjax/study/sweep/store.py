@@ -1,4 +1,4 @@
-"""The finished chunks of a sweep, on disk: whatever ends the process, what is there is whole, and is not computed again.
+"""The finished chunks of a sweep, on disk: however a process ends, its finished chunks are whole, and are not computed again.
 
 A folder holds `sweep.json`, which says what the sweep is, and `chunks/`, one file for each chunk. A file comes into being under
 its name only when all of it is on the disk; the name ends with digests of the sweep and of the file. So where `sweep.json` is

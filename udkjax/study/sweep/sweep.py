@@ -82,7 +82,7 @@ def sweep(
 
     Returns:
         A dataset along the axes. Each member's `result` says how it ended, as a number whose meanings are in its attributes;
-        what failed is not a number, and nothing is raised for it.
+        a failed member is not a number, and nothing is raised for it.
 
     Raises:
         SweepError: with every mistake in the arguments.

@@ -1,4 +1,4 @@
-"""Real numbers known to within a radius, in arrays: what is computed from them holds whatever was rounded on the way.
+"""Real numbers known to within a radius, in arrays: results hold whatever was rounded on the way.
 
 A ball is a middle and a radius. Middles are of the longest floating-point type that the processor has, or fractions, which
 are exact; each operation adds to the radius what its rounding may be off by, and radii, in float64, are rounded up by

@@ -19,7 +19,7 @@ from udkjax.expressions.selection import absolute
 JOINTS = 8  # unknowns besides the turns: x, X, r, R, y, Y, s, S
 POINTS = 8  # displacements from the first of nine points
 UNKNOWNS = JOINTS + POINTS
-LEAST = 1e-3  # unit: what a joint is measured by at least, so that pivots are chosen by what they do
+LEAST = 1e-3  # unit: least scale of a joint, so that pivots are chosen by their effect
 
 
 def newton_and_tangent() -> ScalarProgram:

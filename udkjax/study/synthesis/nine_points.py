@@ -236,7 +236,7 @@ def _merged(*sets: np.ndarray) -> np.ndarray:
 
 
 def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ends (16, M) and their status: what has not converged is tried with longer numbers."""
+    """Return ends (16, M) and their status: paths that have not converged are tried with longer numbers."""
     status, z = status.copy(), z.copy()
     open_ends = np.flatnonzero((status != ACCEPTED) & np.isfinite(z).all(axis=0))
     if not len(open_ends):
