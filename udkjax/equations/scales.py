@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, numbers_as_vector
+from udkjax.expressions.deferred import deferred
 from udkjax.printing import prints_table, units
 from udkjax.scene.fields import ROUNDING, library_for, number
 from udkjax.scene.mechanism import Mechanism
@@ -82,9 +83,14 @@ def known_scales(mechanism: Mechanism) -> Scales:
 
 def traced_scales(mechanism: Mechanism) -> Scales:
     """Return the same in a trace; without derivatives."""
-    mechanism = jax.lax.stop_gradient(mechanism.at(0.0))
+    return _traced_scales(jax.lax.stop_gradient(mechanism.without_origin))
+
+
+@deferred
+def _traced_scales(mechanism: Mechanism) -> Scales:
+    mechanism = mechanism.at(0.0)
     q, v = mechanism.q0.ravel(), mechanism.v0.ravel()
-    return jax.lax.stop_gradient(_scales(mechanism, _guess_terms(mechanism, q, v, jnp), jnp))
+    return _scales(mechanism, _guess_terms(mechanism, q, v, jnp), jnp)
 
 
 def _guess_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: ArrayLibrary) -> GuessTerms:
