@@ -20,7 +20,7 @@ BELOW = {
     **{module: set() for module in GROUND_FLOOR},
     "expressions": set(),
     "pinv": {"expressions"},
-    "scene": set(),
+    "scene": {"expressions"},
     "equations": {"scene", "pinv", "expressions"},
     "native": {"equations", "scene", "pinv", "expressions"},
     "integrate": {"native", "equations", "scene", "pinv", "expressions"},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from udkjax.expressions import deferred as deferred_module
-from udkjax.expressions.deferred import deferred
+from udkjax.expressions.deferred import deferred, deferred_if_traced
 from udkjax.expressions.numpy_program import Meter, numpy_program
 
 X = np.random.default_rng(3).uniform(-2.0, 2.0, (4, 5))
@@ -193,3 +193,28 @@ def test_static_parts_and_trees_come_through():
     )
     np.testing.assert_array_equal(found["sum"], [2.0, 2.0])
     assert found["name"] == "x"
+
+
+@pytest.mark.skipif(deferred_module.deferred_p is None, reason="this JAX evaluates such a function operation by operation")
+def test_what_is_known_beside_traced_numbers_stays_known_and_is_traced_once_for_its_content():
+    seen = []
+
+    @deferred_if_traced
+    def scaled(x, by, names):
+        seen.append(by)
+        if by[0] < 0:
+            raise ValueError("by must not be negative")
+        return {name: x * by[k] for k, name in enumerate(names)}, 2 * by
+
+    by = np.array([2.0, 3.0])
+    for turn in range(3):
+        by = by.copy()
+        slope = jax.grad(lambda x, by=by: scaled(x, by, ("a", "b"))[0]["b"])(1.0)
+        found, known = jax.vmap(lambda x, by=by: scaled(x, by, ("a", "b")), out_axes=(0, None))(X[0])
+        assert slope == 3.0 and np.array_equal(found["a"], 2 * X[0]) and isinstance(known, np.ndarray)
+        assert len(seen) <= 2, f"traced again in turn {turn}"  # a batch's number is no weak one, as Python's is
+    assert jax.grad(lambda x: scaled(x, np.array([2.0, 4.0]), ("a", "b"))[0]["b"])(1.0) == 4.0
+    assert jax.jit(lambda x: scaled(x, by, ("a",))[0]["a"])(X[0]).tolist() == (2 * X[0]).tolist()
+    with pytest.raises(ValueError, match="must not be negative"):
+        jax.grad(lambda x: scaled(x, -by, ("a",))[0]["a"])(1.0)
+    assert scaled(1.0, by, ("a",))[0]["a"] == 2.0

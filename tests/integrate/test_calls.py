@@ -11,9 +11,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.expressions.deferred import deferred_p
 
 ROOT = Path(udk.__file__).parent
 TS = np.linspace(0.0, 0.2, 5)
+SIX_BAR = ROOT.parent / "examples" / "six_bar.toml"
 
 
 def called(function: Callable[[], object]) -> set[tuple[str, str]]:
@@ -100,3 +102,19 @@ def test_a_first_event_and_its_derivative_take_few_programs(compilations):
 
     assert len([seconds for seconds in compilations(lambda: time(1.5)) if seconds]) <= 4
     assert len([seconds for seconds in compilations(lambda: jax.grad(time)(1.5)) if seconds]) <= 16
+
+
+@pytest.mark.skipif(deferred_p is None, reason="this JAX evaluates a program operation by operation")
+@pytest.mark.parametrize(
+    "simulated",
+    [
+        lambda a: udk.simulate(udk.library.four_bar(a), TS),
+        lambda a: udk.simulate(udk.library.parallelogram(a), TS),
+        lambda a: udk.simulate(udk.load(SIX_BAR).with_parameters({"pin.B": a * np.ones(2)}), TS, throw=False),
+        lambda a: udk.kinematics(udk.library.four_bar(a), "body.crank.angle", 1.0 + TS),
+    ],
+    ids=["function of the library", "with redundant rows", "drawing", "kinematics"],
+)
+def test_eager_transformations_over_a_geometry_take_few_operations(simulated):
+    """Each is some 0.1 ms of every call outside jit; geometry and scales are one operation each, whatever the mechanism."""
+    assert len(jax.make_jaxpr(lambda a: simulated(a).q)(1.0).eqns) < 300

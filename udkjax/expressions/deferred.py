@@ -58,6 +58,61 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     return run
 
 
+def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return the same of a function whose known numbers decide something, or are checked: they stay known.
+
+    So do NumPy's results of these alone. Where nothing is traced, the function itself is called.
+    """
+
+    call: Callable[..., Any] = function
+
+    def with_known(leaves: list[Any], tree: Any, known: tuple["_Known", ...]) -> Any:
+        numbers = iter(known)
+        found = [x if _is_traced(x) else next(numbers).value for x in leaves]
+        args, kwargs = jax.tree.unflatten(tree, found)
+        traced, rest = eqx.partition(call(*args, **kwargs), _is_traced)
+        return traced, _Rest(rest)
+
+    program = deferred(with_known)
+
+    @wraps(function)
+    def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        leaves, tree = jax.tree.flatten((args, kwargs))
+        if deferred_p is None or not any(map(_is_traced, leaves)):
+            return function(*args, **kwargs)
+        known = tuple(_Known(x) for x in leaves if not _is_traced(x))
+        traced, rest = program([x if _is_traced(x) else None for x in leaves], tree, known)
+        return eqx.combine(traced, rest.value)
+
+    return run
+
+
+class _Known:
+    """A number, or anything else that is not traced, compared by its content: what is traced for it serves its equals."""
+
+    def __init__(self, value: Any):
+        self.value = value
+        content = np.asarray(value) if isinstance(value, float | jax.Array | np.ndarray | np.generic) else value
+        self._key = (content.shape, content.dtype.str, content.tobytes()) if isinstance(content, np.ndarray) else content
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and type(self.value) is type(other.value) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+class _Rest:
+    """The part of a result that is known, and no part of a program."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+
+def _is_traced(x: Any) -> bool:
+    return isinstance(x, Tracer)
+
+
 def _is_array(x: Any) -> bool:
     return isinstance(x, jax.Array | np.ndarray | np.generic)
 

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.expressions.deferred import deferred_if_traced
 from udkjax.printing import PrintedTable
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, quote, suggestion
@@ -156,6 +157,7 @@ class Drawing(AbstractDrawing):
 
     _shapes = _table  # traced numbers are named as such, element by element
 
+    @deferred_if_traced
     def mechanism(self) -> Mechanism:
         """Return the mechanism that is drawn; its numbers follow from those of the drawing, and may be traced."""
         groups = known_elements(self.groups)

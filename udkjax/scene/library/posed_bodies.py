@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from udkjax.expressions.deferred import deferred_if_traced
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import array_namespace, number
 from udkjax.scene.mechanism import Mechanism
@@ -28,7 +29,7 @@ COMPLEX_STEP = 1e-100  # of the coordinate: its square is lost beside 1, and a r
 
 def with_known_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
     """Give a function of the library all numbers that are not traced as NumPy's: results of these alone stay known."""
-    parameters = signature(build)
+    parameters, build_deferred = signature(build), deferred_if_traced(build)
 
     @wraps(build)
     def build_with_known_numbers(*arguments: P.args, **named: P.kwargs) -> Mechanism:
@@ -37,7 +38,7 @@ def with_known_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
         for name, value in bound.arguments.items():
             if not isinstance(parameters.parameters[name].default, int):  # counts and switches stay what they are
                 bound.arguments[name] = jax.tree.map(_known, value)
-        return build(*bound.args, **bound.kwargs)
+        return build_deferred(*bound.args, **bound.kwargs)
 
     return build_with_known_numbers
 
