@@ -20,7 +20,7 @@ from experiments.common import described, panels, tracked
 from experiments.parts.nine_point_monodromy import check, complex_numbers, loops, random_four_bar
 from udkjax.integrate.path_tracking import ACCEPTED
 from udkjax.show.plots import COLOURS
-from udkjax.study.synthesis.dyad_programs import JOINTS, POINTS
+from udkjax.study.synthesis.dyads import JOINTS, POINTS
 from udkjax.study.synthesis.nine_points import CLASSES, CLOSE, STARTS, distinct, find_real_classes, start_solutions, tracker
 
 SEEDS = 3

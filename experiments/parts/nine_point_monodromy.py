@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from udkjax.integrate.path_tracking import ACCEPTED
-from udkjax.study.synthesis.dyad_programs import JOINTS, POINTS
+from udkjax.study.synthesis.dyads import JOINTS, POINTS
 from udkjax.study.synthesis.nine_points import CLASSES, CLOSE, class_keys, distinct, tracker, turns_of
 
 

@@ -64,7 +64,7 @@ def test_the_fit_is_that_of_the_whole_record(problem):
     pieces, fit = fit_pieces(problem, np.zeros(problem.K), TOL, Minimizer(), samples=6)
     assert fit.settled[0] and explains(pieces, fit, TOL)
     assert pieces.gaps(fit.z, TOL)[0] < 1e-7
-    whole = Minimizer().minimize(problem, fit.z[:, :2], TOL, undamped=True)
+    whole = Minimizer().minimize(problem, fit.z[:, :2], TOL)
     assert np.abs(fit.z[0, :2] - whole.z[0]).max() < 1e-5
     assert np.all(np.abs(problem.unknowns.values(fit.z[0, :2]) / [0.375, 0.2] - 1.0) < 0.02)
     # Errors of the integration, 1e-9, count in defects, which weigh 1e7.

@@ -19,7 +19,7 @@ FOUR_BAR = udk.library.four_bar()
 
 def test_a_measure_goes_by_the_name_that_it_is_given():
     def names(measure):
-        return [name for one in measures_of(measure, None, TS, FOUR_BAR) for name in one.variables]
+        return [name for one in measures_of(measure, None, TS, FOUR_BAR) for name in one.labels]
 
     assert names("final") == ["q_end", "v_end"] and names({"final": "final"}) == ["q_end", "v_end"]
     assert names({"last": "final", "open": "violation"}) == ["last_q_end", "last_v_end", "open"]

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from scipy.spatial import ConvexHull, QhullError
 
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
@@ -95,7 +96,9 @@ class LengthLimits:
         rows = [(pins, way, end) for pins, low, high, _ in ranges for way, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf]
         rows += [((None, pin), 1.0, area[2]) for pin, area in found.items() if area.ndim == 1]
         centres = np.array([area[:2] for area in found.values() if area.ndim == 1]).reshape(-1, 2)
-        sides = [(pin, *side) for pin, area in found.items() if area.ndim == 2 for side in zip(*_sides(area), strict=True)]
+        # Outward normal and distance from the origin of each side.
+        polygons = {pin: ConvexHull(area).equations for pin, area in found.items() if area.ndim == 2}
+        sides = [(pin, side[:2], -side[2]) for pin, equations in polygons.items() for side in equations]
         self.count, self._free = len(rows) + len(sides), free.count
         ends = [f"the area of {pin}" if a is None else f"the length {a}-{pin}" for (a, pin), *_ in rows]
         self.names = [*ends, *(f"the area of {pin}" for pin, *_ in sides)]
@@ -152,19 +155,13 @@ def box_of(area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_convex(corners: np.ndarray) -> bool:
-    way = np.roll(corners, -1, 0) - corners
-    after = np.roll(way, -1, 0)
-    turn = way[:, 0] * after[:, 1] - way[:, 1] * after[:, 0]
-    around = np.sum(np.arctan2(turn, np.sum(way * after, 1)))
-    return bool(np.all(turn > 0) or np.all(turn < 0)) and abs(around) < 3 * np.pi  # once around
-
-
-def _sides(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outward normal (k, 2) of each side of a convex polygon, and its distance from the origin (k,)."""
-    way = np.roll(corners, -1, 0) - corners
-    normal = np.stack([way[:, 1], -way[:, 0]], 1) / np.linalg.norm(way, axis=1)[:, None]
-    outward = np.sign(np.sum(normal * (corners - corners.mean(0)), 1, keepdims=True))
-    return outward * normal, np.sum(outward * normal * corners, 1)
+    """Return whether points (k, 2) are the corners of a convex polygon, one after another."""
+    try:
+        around = ConvexHull(corners).vertices
+    except (QhullError, ValueError):  # on a line, or no numbers
+        return False
+    steps = {*(np.diff(around, append=around[:1]) % len(corners)).tolist()}
+    return len(around) == len(corners) and steps in ({1}, {len(corners) - 1})
 
 
 def _read_range(mechanism: Mechanism, pins: Sequence[str], ends: Range) -> tuple[tuple[str, ...], float, float, list[str]]:

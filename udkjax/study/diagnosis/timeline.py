@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
+from scipy.interpolate import BPoly
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import singular_values
@@ -142,24 +143,12 @@ class _Path:
 
     def __init__(self, mechanism: Mechanism, analysis: Analysis, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
         self.mechanism, self.analysis = mechanism.without_origin, analysis
-        self.ts, self.states = ts, (q, v, np.asarray(_accelerations(self.mechanism, analysis, ts, q, v)))
+        a = np.asarray(_accelerations(self.mechanism, analysis, ts, q, v))
+        self.q = BPoly.from_derivatives(ts, np.stack([q, v, a], 1)) if len(ts) > 1 else lambda times: np.tile(q, (len(times), 1))
 
     def singular_values(self, times: np.ndarray) -> np.ndarray:
         """Return the singular values of the scaled Jacobian (times, k)."""
-        k = np.clip(np.searchsorted(self.ts, times, side="right") - 1, 0, max(len(self.ts) - 2, 0))
-        following = np.minimum(k + 1, len(self.ts) - 1)
-        h = (self.ts[following] - self.ts[k])[:, None]
-        s = (times - self.ts[k])[:, None] / np.where(h > 0, h, 1.0)
-        one, two = ([x[i] for x in self.states] for i in (k, following))
-        return np.asarray(_singular_values(self.mechanism, self.analysis, times, _quintic(s, h, one, two)))
-
-
-def _quintic(s: np.ndarray, h: np.ndarray, one: list[np.ndarray], two: list[np.ndarray]) -> np.ndarray:
-    """Evaluate the polynomial of degree five through q, v and a at both ends, at the part s of the way."""
-    (q, v, a), (p, w, c) = one, two
-    rest, slope, bend = p - q - h * v - h**2 * a / 2, h * (w - v - h * a), h**2 * (c - a)
-    third, fourth, fifth = 10 * rest - 4 * slope + bend / 2, -15 * rest + 7 * slope - bend, 6 * rest - 3 * slope + bend / 2
-    return q + s * (h * v + s * (h**2 * a / 2 + s * (third + s * (fourth + s * fifth))))
+        return np.asarray(_singular_values(self.mechanism, self.analysis, times, self.q(times)))
 
 
 @deferred

@@ -13,7 +13,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, Residuals, Strategy, build_problem
-from udkjax.study.identify.least_squares import FEW_STEPS, LOOSE_STEP, Fit, History
+from udkjax.study.identify.least_squares import Fit, History
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
 from udkjax.study.identify.parameters import ParametersLike
@@ -51,8 +51,8 @@ def identify(
 ) -> Estimate:
     """Find the values of parameters with which a mechanism moves as was measured.
 
-    With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized by
-    Levenberg-Marquardt with exact forward derivatives, through the closure of all loops. Where the first guess does not lead to a
+    With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized by SciPy's
+    `least_squares` with exact forward derivatives, through the closure of all loops. Where the first guess does not lead to a
     fit that explains the records, as it is wrong by a swing somewhere, they are fitted as they grow, each time as far as what is
     known by then predicts them; then from other guesses, up to a factor of 2.5 away. Where none leads to a fit, as along chaotic
     motion, the records are cut into pieces that are held together.
@@ -71,7 +71,7 @@ def identify(
         guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
         loss: "least_squares"; "huber" or "soft_l1", for which single wrong numbers count less; or a function of the weighted
             residuals (R,) by JAX (standard errors stay those of squares).
-        optimizer: of optax, instead of Levenberg-Marquardt (for a loss of your own: of L-BFGS); one without a line search.
+        optimizer: of optax, instead of SciPy's least squares (for a loss of your own: of L-BFGS); one without a line search.
         strategy: "pieces" cuts the records into pieces at once; "auto": only where nothing else leads to a fit.
         tol: tolerance of the integration at the end, relative and absolute.
         seed: of further first guesses.
@@ -133,25 +133,16 @@ def _require_finite(problem: FitProblem, found: SearchResult) -> None:
 def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[Fit, History]:
     """Fit to the end, each channel weighted by the noise that it has turned out to have."""
     problem = found.problem
-    fit = _polish(problem, found.fit.z, tol, minimizer)
+    fit = minimizer.minimize(problem, found.fit.z, tol)
     history = [*found.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
     robust = minimizer.loss is not squares  # outliers depend on the noise
     for _ in range(MOST_REWEIGHTINGS if len(unknown) + problem.noise_given.any() > 1 or (robust and len(unknown)) else 0):
         if not reweigh(problem, fit.z, tol, minimizer.loss, NOISE_FLOOR):
             break
-        fit = _polish(problem, fit.z, tol, minimizer)
+        fit = minimizer.minimize(problem, fit.z, tol)
         history += fit.history
     return fit, history
-
-
-def _polish(problem: FitProblem, z: np.ndarray, tol: Tolerances, minimizer: Minimizer) -> Fit:
-    """Fit from beside a minimum; with damped steps where other weights have moved it far along what hardly shows."""
-    near = minimizer.minimize(problem, z, tol, steps=FEW_STEPS, undamped=True)
-    if near.settled[0] or near.history[-1][1] <= LOOSE_STEP:
-        return near
-    fit = minimizer.minimize(problem, near.z, tol)
-    return fit._replace(history=near.history + fit.history)
 
 
 def reweigh(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:

@@ -1,19 +1,18 @@
-"""Least squares by Levenberg-Marquardt: several fits at once, each with a damping of its own.
+"""Least squares: the trust-region method of SciPy from several first guesses, ended by steps that are known to be small enough.
 
-Each step asks for residuals and their Jacobian at one trial point of every fit that goes on. With J = U S V^T and the damping d,
+Within a radius around a point z the residuals are taken to be linear, r + J dz. Where the cost falls as that promises, the radius
+grows, and it shrinks where it does not, or where a trial cannot be computed. Near a minimum steps are those of Gauss and Newton.
 
-    z_next = z - V (S^2 + d)^-1 S U^T r,
-
-and d falls where the cost decreases as promised, and rises where it does not.
-
-Source: J. J. More, The Levenberg-Marquardt algorithm, 1978.
+Source: M. A. Branch, T. F. Coleman & Y. Li, SIAM Journal on Scientific Computing 21 (1999) 1.
 """
 
-from collections.abc import Callable, Generator, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import lstsq
 
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
 from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN
@@ -27,13 +26,8 @@ FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
 # Cosine of the angle between residuals and what the unknowns can change of them, at which a fit has settled: times the root of
 # their number it is a Gauss-Newton step in standard errors, of which a thousandth changes nothing either.
 ORTHOGONAL_COSINE = 1e-5
-# The first damping, of the square of the largest singular value of J. Where a minimum is near there is none to speak of. Of first
-# dampings from 1e-2 to 1e-6 and factors of 3.5 or 10, with these the most fits from 50 % off settle along the whole record.
-FIRST_DAMPING, NO_DAMPING = 1e-3, 1e-16
-SHORT_STEP = 0.3  # of an unknown: where the first Gauss-Newton step is no longer, a minimum is taken to be near
-# Part of the decrease promised from which on the damping falls, and by how much; and by how much it rises after a refused step.
-GOOD_DECREASE, LESS_DAMPING, MORE_DAMPING = 0.75, 0.1, 4.0
 MOST_REFUSED_STEPS = 8  # steps one after another, before a fit is given up
+ROUNDING = 4 * float(np.finfo(float).eps)  # of the unknowns: shorter steps change nothing
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
 Report: TypeAlias = Callable[[str], None]  # is called with a text after each step
@@ -78,88 +72,81 @@ def minimize_squares(
     z: Float[np.ndarray, "B K"],
     steps: int = STEPS,
     settled: float = EXACT_STEP,
-    undamped: bool = False,
     report: Report = lambda text: None,
 ) -> Fit:
     """Minimize r.r / 2 from several first guesses.
 
-    A fit has settled where its Gauss-Newton step is below `settled` (dimensionless); `undamped` says that the guesses are at a
-    minimum already, up to the tolerance of the integration.
+    A fit has settled where its Gauss-Newton step is below `settled` (dimensionless).
     """
-    fits = [_minimize(guess, steps, settled, undamped) for guess in z]
-    trials = {k: next(fit) for k, fit in enumerate(fits)}
-    ended: dict[int, End] = {}
-    best, count = np.inf, 0
-    while trials:
-        found, count = evaluate(np.array(list(trials.values()))), count + 1
-        for k, r, J, ok in zip(list(trials), found.r, found.J, found.ok, strict=True):
-            linear = _Linear.of(r, J) if ok else None
-            best = best if linear is None else min(best, linear.cost)
-            try:
-                trials[k] = fits[k].send(linear)
-            except StopIteration as end:
-                ended[k] = end.value
-                del trials[k]
-        report(f"step {count}, cost {best:.4g}, {len(trials)} going")
-    return Fit.of([ended[k] for k in range(len(fits))])
+    return Fit.of([_minimize(evaluate, guess, steps, settled, report) for guess in z])
 
 
-class _Linear(NamedTuple):
-    """Residuals around a point, as singular values and vectors of J; `part` is U^T r."""
+def _minimize(evaluate: Objective, guess: Float[np.ndarray, "K"], steps: int, settled: float, report: Report) -> End:
+    from scipy.optimize import least_squares
 
-    part: Float[np.ndarray, "K"]
-    singular: Float[np.ndarray, "K"]
-    vt: Float[np.ndarray, "K K"]
-    cost: float
-
-    @classmethod
-    def of(cls, r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> "_Linear":
-        u, s, vt = np.linalg.svd(J, full_matrices=False)
-        return cls(r @ u, s, vt, float(0.5 * r @ r))
-
-    def gauss_newton(self) -> tuple[float, float]:
-        """Return the largest entry of the Gauss-Newton step in directions that show, and the cosine of the angle of r to J."""
-        shows = self.singular > INVISIBLE_RATIO * self.singular.max(initial=0.0)
-        if not shows.any():
-            return np.inf, np.inf
-        step = (self.part[shows] / self.singular[shows]) @ self.vt[shows]
-        size = np.sqrt(2.0 * self.cost)
-        return float(np.abs(step).max()), float(np.linalg.norm(self.part) / size) if size else 0.0
-
-    def damped(self, damping: float) -> tuple[np.ndarray, float]:
-        """Return the step with a damping, and the decrease of the cost that it promises."""
-        left = damping / (self.singular**2 + damping)  # of the residuals along each direction
-        step = -(self.singular * self.part / (self.singular**2 + damping)) @ self.vt
-        return step, float(0.5 * np.sum(self.part**2 * (1.0 - left**2)))
+    fit = _TrustRegionFit(evaluate, guess, settled, report)
+    # What ends a fit, but for its steps, is said by `Descent`.
+    choices: dict[str, Any] = {"jac": fit.jacobian, "ftol": None, "gtol": None, "xtol": ROUNDING, "max_nfev": steps}
+    with suppress(StopIteration):
+        least_squares(fit.residuals, np.zeros(len(guess)), **choices)
+    return fit.end
 
 
-def _minimize(
-    guess: Float[np.ndarray, "K"], steps: int, settled: float, undamped: bool
-) -> Generator[np.ndarray, "_Linear | None", End]:
-    """Minimize from one guess: yield points to try, and take residuals around each; None where they cannot be computed."""
-    linear = yield guess
-    if linear is None:
-        return End(guess, np.inf, False, [(np.inf, np.inf)])
-    at, refused, history = guess, 0, []
-    largest = max(float(linear.singular.max(initial=0.0)) ** 2, np.finfo(float).tiny)
-    near = undamped or linear.gauss_newton()[0] <= SHORT_STEP
-    damping = largest * (NO_DAMPING if near else FIRST_DAMPING)
-    while True:
-        size, cosine = linear.gauss_newton()
-        history.append((linear.cost, size))
-        if size <= settled or cosine <= ORTHOGONAL_COSINE or (size <= FINE_STEP and refused >= 2):
-            return End(at, linear.cost, True, history)
-        if refused >= MOST_REFUSED_STEPS or len(history) >= steps:
-            return End(at, linear.cost, False, history)
-        step, promised = linear.damped(damping)
-        trial = at + step
-        found = (yield trial) if np.abs(trial).max() < FARTHEST_UNKNOWN else None
-        kept = -np.inf if found is None else (linear.cost - found.cost) / max(promised, np.finfo(float).tiny)
-        if found is not None and found.cost < linear.cost:
-            at, linear, refused = trial, found, 0
-        else:
-            refused += 1
-        if refused and near and not undamped:  # no minimum was near, after all: from the best point on with damped steps
-            near, damping = False, largest * FIRST_DAMPING
-        elif refused or kept >= GOOD_DECREASE:
-            damping *= MORE_DAMPING if refused else LESS_DAMPING
+class Descent:
+    """One fit, whose best point is `end`; StopIteration ends it."""
+
+    def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], settled: float, report: Report):
+        self.evaluate, self.guess, self.settled, self.report = evaluate, guess, settled, report
+        self.end, self.size = End(guess, np.inf, False, []), np.inf
+
+    def note(self, size: float) -> None:
+        """Note the length of the step that the best point asks for; end where that is short enough."""
+        self.size = size
+        self.end.history.append((self.end.cost, size))
+        self.report(f"step {len(self.end.history)}, cost {self.end.cost:.4g}")
+        if size <= self.settled:
+            self.stop(True)
+
+    def stop(self, settled: bool) -> NoReturn:
+        """End the fit."""
+        self.end = self.end._replace(settled=settled)
+        raise StopIteration
+
+
+class _TrustRegionFit(Descent):
+    """Residuals and Jacobians at changes of a guess, as SciPy asks for them."""
+
+    refused = 0  # trials since the last better one
+
+    def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R"]:
+        """Return the residuals; infinite ones where they cannot be computed."""
+        z = self.guess + change
+        self.found = self.evaluate(z[None])
+        r, ok = self.found.r[0], self.found.ok[0] and np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN
+        cost = float(0.5 * r @ r) if ok else np.inf
+        if cost < self.end.cost:
+            self.end, self.refused = self.end._replace(z=z, cost=cost), 0
+            return r
+        self.refused += 1
+        is_finest = self.size <= FINE_STEP and self.refused >= 2  # what is left is rounding
+        if not self.end.history or is_finest or self.refused >= MOST_REFUSED_STEPS:
+            self.stop(is_finest)
+        return r if ok else np.full_like(r, np.inf)
+
+    def jacobian(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R K"]:
+        """Return the Jacobian of the residuals that were asked for last."""
+        J = self.found.J[0]
+        size, cosine = gauss_newton(self.found.r[0], J)
+        self.note(size)
+        if cosine <= ORTHOGONAL_COSINE:
+            self.stop(True)
+        return J
+
+
+def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:
+    """Return the largest entry of the Gauss-Newton step in directions that show, and the cosine of the angle of r to J."""
+    step, _, rank, _ = lstsq(J, r, cond=INVISIBLE_RATIO, lapack_driver="gelsy")
+    if not rank:
+        return np.inf, np.inf
+    size = np.linalg.norm(r)
+    return float(np.abs(step).max()), float(np.linalg.norm(J @ step) / size) if size else 0.0

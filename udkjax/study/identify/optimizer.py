@@ -1,9 +1,10 @@
 """Losses of a fit, and their minimization: least squares, plain or robust; losses of the user's own by their gradients."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float
 
 from udkjax.extras import OptionalImport
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
-from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, End, Fit, Objective, Report, minimize_squares
+from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, Descent, Fit, Objective, Report, minimize_squares
 from udkjax.study.identify.prediction import Tolerances
 from udkjax.study.identify.records import IdentificationError
 
@@ -36,7 +37,7 @@ class GradientMethod(NamedTuple):
 
 
 def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod | None:
-    """Return the method for an optimizer and a loss: None is Levenberg-Marquardt.
+    """Return the method for an optimizer and a loss: None is least squares.
 
     Raises:
         IdentificationError: the optimizer searches along lines, for which it would have to call the loss itself.
@@ -122,7 +123,7 @@ def weighted_residuals(problem: Evaluated, tol: Tolerances, loss: Loss, horizon:
 
 @dataclass(frozen=True)
 class Minimizer:
-    """The method of all fits of an identification: Levenberg-Marquardt (None), or by gradients."""
+    """The method of all fits of an identification: least squares (None), or by gradients."""
 
     method: GradientMethod | None = None
     loss: Loss = squares
@@ -136,13 +137,12 @@ class Minimizer:
         horizon: float | None = None,
         steps: int = STEPS,
         settled: float = EXACT_STEP,
-        undamped: bool = False,
     ) -> Fit:
         """Fit the first `horizon` seconds of each record (None: all of it) from several first guesses: see `minimize_squares`."""
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if self.method is not None:
             return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)
-        return minimize_squares(evaluate, z, steps, settled, undamped, self.report)
+        return minimize_squares(evaluate, z, steps, settled, self.report)
 
     def with_label(self, what: str) -> "Minimizer":
         """Return the same one, with reports that begin with what is fitted."""
@@ -162,35 +162,26 @@ def minimize_by_gradient(
     A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
     taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
     """
-    descents = [_Descent(evaluate, method.loss or _half_square, max(settled, FINE_STEP), report) for _ in z]
-    for first, descent in zip(z, descents, strict=True):
-        if method.optimizer is None:
-            _descend_by_scipy(descent, first, steps)
-        else:
-            _descend_by_optax(method.optimizer, descent, first, steps)
-    return Fit.of([descent.end for descent in descents])
+    ends = []
+    for first in z:
+        descent = _LossDescent(method.loss or _half_square, evaluate, first, max(settled, FINE_STEP), report)
+        with suppress(StopIteration):
+            _descend(method.optimizer, descent, steps)
+        ends.append(descent.end)
+    return Fit.of(ends)
 
 
-def _descend_by_scipy(descent: "_Descent", first: np.ndarray, steps: int) -> None:
-    import scipy.optimize
+def _descend(optimizer: Optimizer, descent: "_LossDescent", steps: int) -> None:
+    if optimizer is None:
+        import scipy.optimize
 
-    def after_step(_) -> None:
-        if descent.is_over():
-            raise StopIteration
-
-    if np.isfinite(descent(first)[0]):
         options = {"maxiter": steps, "maxfun": 20 * steps, "ftol": 0.0, "gtol": 0.0}
-        scipy.optimize.minimize(descent, first, jac=True, method="L-BFGS-B", callback=after_step, options=options)
-
-
-def _descend_by_optax(optimizer: "optax.GradientTransformation", descent: "_Descent", first: np.ndarray, steps: int) -> None:
-    at, state = jnp.asarray(first), optimizer.init(jnp.asarray(first))
-    update = jax.jit(partial(_update, optimizer))
+        scipy.optimize.minimize(descent, descent.guess, jac=True, method="L-BFGS-B", options=options)
+        return
+    at = jnp.asarray(descent.guess)
+    state, update = optimizer.init(at), jax.jit(partial(_update, optimizer))
     for _ in range(steps):
-        value, gradient = descent(np.asarray(at))
-        if descent.is_over():
-            return
-        at, state = update(state, at, value, gradient)
+        at, state = update(state, at, *descent(np.asarray(at)))
 
 
 def _update(optimizer: "optax.GradientTransformation", state, at, value, gradient):
@@ -201,38 +192,31 @@ def _update(optimizer: "optax.GradientTransformation", state, at, value, gradien
     return optax.apply_updates(at, change), state
 
 
-class _Descent:
-    """A loss and its gradient at the points of one descent, of which `end` is the best."""
+class _LossDescent(Descent):
+    """A loss and its gradient, as optimizers ask for them."""
 
-    def __init__(self, evaluate: Objective, rho: UserLoss, settled: float, report: Report):
-        self.evaluate, self.settled, self.report = evaluate, settled, report
-        self.value_and_slope = jax.value_and_grad(rho)
-        self.failed_cost, self.step = np.inf, np.inf
-        self.end = End(np.zeros(0), np.inf, False, [])
+    def __init__(self, rho: UserLoss, *fit: Any):
+        super().__init__(*fit)
+        self.value_and_slope, self.failed_cost = jax.value_and_grad(rho), np.inf
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value of the loss, and its gradient (K,)."""
-        if not self.end.z.size:
-            self.end = self.end._replace(z=z.copy())
-        found = self.evaluate(z[None])
+        found, size = self.evaluate(z[None]), self.size
         if not found.ok[0]:
+            if not self.end.history:
+                self.stop(False)
             return self.failed_cost, np.zeros(len(z))
         value, slope = self.value_and_slope(jnp.asarray(found.r[0]))
         value, gradient = float(value), found.J[0].T @ np.asarray(slope)
-        if not np.isfinite(self.failed_cost):
+        if not self.end.history:
             self.failed_cost = FAILED_COST * (abs(value) + 1.0)
         if value < self.end.cost:
             _, s, vt = np.linalg.svd(found.J[0], full_matrices=False)
             shows = s > INVISIBLE_RATIO * s.max(initial=0.0)
-            self.step = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
-            self.end = End(z.copy(), value, self.step <= self.settled, self.end.history)
+            size = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
+            self.end = self.end._replace(z=z.copy(), cost=value)
+        self.note(size)
         return value, gradient
-
-    def is_over(self) -> bool:
-        """Note how far the descent is; return whether it has ended."""
-        self.end.history.append((self.end.cost, self.step))
-        self.report(f"step {len(self.end.history)}, cost {self.end.cost:.4g}")
-        return self.end.settled or not np.isfinite(self.end.cost)
 
 
 def _half_square(r: Array) -> Array:

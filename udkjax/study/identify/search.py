@@ -131,7 +131,7 @@ def fit_in_pieces(
         if explains(pieces, fit, loose):
             found = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)
             along = fit.z[:, : problem.K]
-            whole = minimizer.with_label("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP, True)
+            whole = minimizer.with_label("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP)
             if explains(problem, whole, tol):
                 return found._replace(fit=whole, history=fit.history + whole.history, problem=problem)
             return found

@@ -200,12 +200,8 @@ def fit_pieces(
         shooting.weight = weight
         one = minimizer.with_label(f"pieces held together by {weight:.0e}")
         steps, settled = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
-        # From one weight to the next the Gauss-Newton step is right, but for a few: these take damped ones.
-        for undamped in (False,) if weight == WEIGHTS[0] else (True, False):
-            fit = one.minimize(shooting, fit.z, tol, None, steps, settled, undamped)
-            history += fit.history
-            if fit.settled[0]:
-                break
+        fit = one.minimize(shooting, fit.z, tol, None, steps, settled)
+        history += fit.history
         if weight > WEIGHTS[0] and not fit.settled[0]:  # with larger weights they would only be farther from a minimum
             break
     return shooting, fit._replace(history=history)

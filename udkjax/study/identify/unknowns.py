@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.linalg import qr
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.scales import known_scales
@@ -248,19 +249,14 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
 
 def _independent_rows(free: np.ndarray) -> list[int]:
     """Choose as many rows as there are columns, far from dependent on each other: of angles alone if possible."""
-    for rows in (np.arange(2, len(free), 3), np.arange(len(free))):
-        left, chosen = free / np.linalg.norm(free, 2), []
-        for _ in range(free.shape[1]):
-            sizes = np.linalg.norm(left[rows], axis=1)
-            k = int(rows[np.argmax(sizes)])
-            if sizes.max() < SMALLEST_READABLE_PART:
-                break
-            chosen.append(k)
-            unit = left[k] / np.linalg.norm(left[k])
-            left = left - np.outer(left @ unit, unit)
-        else:
-            return sorted(chosen)
-    return sorted(chosen)
+    count, every = free.shape[1], np.arange(len(free))
+    chosen = every[:0]
+    for rows in (every[2::3], every):
+        _, R, order = qr(free[rows].T / np.linalg.norm(free, 2), mode="economic", pivoting=True)
+        chosen, sizes = rows[order[:count]], np.abs(np.diag(R))
+        if len(sizes) == count and sizes.min(initial=1.0) >= SMALLEST_READABLE_PART:
+            break
+    return sorted(chosen.tolist())
 
 
 # --- what else differs between records

@@ -34,7 +34,7 @@ NOT_COMPUTED = -1  # the result of a member that is not among what is finished
 def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
     """Return the variables that are stored of each member of a group."""
     bodies, found = len(plan.mechanism_of(group).body_names), {}
-    known = {name: label for measure in plan.measures for name, label in measure.variables.items()} | LABELS
+    known = {name: label for measure in plan.measures for name, label in measure.labels.items()} | LABELS
     outputs = group_run(plan, group.index).outputs
     slopes = {f"d_{of}_d_{by}": (of, by) for of in outputs for by in plan.derivatives}
     for name, info in outputs.items():

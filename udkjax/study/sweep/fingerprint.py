@@ -47,7 +47,7 @@ def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, Json]:
 
 
 def _measure(plan: SweepPlan, measure: Measure) -> dict[str, Json]:
-    found: dict[str, Json] = {"under": measure.renamed}
+    found: dict[str, Json] = {"variables": list(measure.labels)}
     if measure.function is not None:
         found["function"] = _function(measure.function, plan.mechanism, _solution(plan))
     if callable(measure.reference):

@@ -1,8 +1,9 @@
 """Measures: what is stored of each member, and nothing else is computed."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, cast
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +40,9 @@ class MeasuredRun(NamedTuple):
     reference: Reference
 
 
+Compute: TypeAlias = Callable[[MeasuredRun], dict[str, Array]]
+
+
 class Label(NamedTuple):
     """The labels of a variable in a dataset."""
 
@@ -49,34 +53,29 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True)
 class Measure:
-    """The part of a run to be stored: `compute(run)` gives arrays by name."""
+    """The part of a run to be stored: `compute(run)` gives arrays, which are stored by the names of `labels`, in their order.
+
+    Without labels it is a user's `function`, whose arrays have names of their own.
+    """
 
     name: str
-    along: bool  # whether it needs all output times, not only the end
     compute: Callable[[MeasuredRun], Mapping[str, Array]]
-    labels: Mapping[str, Label]  # empty: of a user's function
+    labels: Mapping[str, Label] = field(default_factory=dict)
+    along: bool = True  # whether it needs all output times, not only the end
     reference: Reference = None
-    renamed: str = ""  # the key that it was given under
+    function: UserMeasure | None = None
 
     def of(self, mechanism: Mechanism, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
         """Return the arrays that are stored, under their names in the dataset."""
         found = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
-        return {self._key(name): jnp.asarray(value) for name, value in found.items()}
+        return {name: jnp.asarray(x) for name, x in zip(self.labels or found, found.values(), strict=True)}
 
-    @property
-    def variables(self) -> dict[str, Label]:
-        """The labels of its variables, by their names in the dataset; those of a user's function are not known."""
-        return {self._key(name): label for name, label in self.labels.items()}
-
-    @property
-    def function(self) -> UserMeasure | None:
-        """The user's function, if it is one."""
-        return self.compute.function if isinstance(self.compute, _UserMeasure) else None
-
-    def _key(self, name: str) -> str:
-        if not self.renamed or not self.labels:
-            return name
-        return self.renamed if len(self.labels) == 1 else f"{self.renamed}_{name}"
+    def renamed(self, key: str) -> "Measure":
+        """Return the same one, stored under a key: its only variable, or in front of the names of several."""
+        if key in ("", self.name):
+            return self
+        alone = len(self.labels) == 1
+        return replace(self, labels={key if alone else f"{key}_{name}": label for name, label in self.labels.items()})
 
 
 def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Label:
@@ -99,60 +98,44 @@ def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mech
     else:
         several = given if isinstance(given, list | tuple) else [cast(OneMeasure, given)]
         items = [("", value) for value in several]
-    found = tuple(_measure(key, value, reference, ts, mechanism) for key, value in items)
-    if reference is not None and not any(measure.name == "error" for measure in found):
-        raise ValueError('reference: only the measure "error" looks at it, which is not among the measures')
-    return found
+    found = tuple(_measure(key, value, mechanism).renamed(key) for key, value in items)
+    if not any(measure.name == "error" for measure in found):
+        if reference is not None:
+            raise ValueError('reference: only the measure "error" looks at it, which is not among the measures')
+        return found
+    reference = _reference(reference, ts)
+    return tuple(replace(measure, reference=reference) if measure.name == "error" else measure for measure in found)
 
 
-def _measure(key: str, given: OneMeasure, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> Measure:
+def _measure(key: str, given: OneMeasure, mechanism: Mechanism) -> Measure:
     if isinstance(given, str):
-        if given not in MEASURES and "." in given:
-            return _channel_measure(key, given, mechanism)
-        if given not in MEASURES:
+        if given in MEASURES:
+            return MEASURES[given]
+        if "." not in given:
             near = suggestion(given, MEASURES) or f"; known are {', '.join(MEASURES)}, and channels such as pin.A.x"
             raise ValueError(f"measure {quote(given)}: there is none of this name{near}")
-        along, compute, labels = MEASURES[given]
-        if given == "error":
-            reference = _reference(reference, ts)
-        return Measure(given, along, compute, labels, reference if given == "error" else None, "" if key == given else key)
+        try:
+            channel = channel_of(mechanism, given)
+        except ValueError as problem:
+            raise ValueError(f"measure {quote(given)}: {problem}") from None
+        label = Label(("time",), channel.units, channel.name)
+        return Measure(channel.name, partial(_evaluate_channel, channel), {channel.name: label})
     if not callable(given):
         raise ValueError(f"measure {quote(key or str(given))}: must be a name or a function of (mechanism, solution)")
     name = key or getattr(given, "__name__", "measure").strip("<>")
-    return Measure(name, True, _UserMeasure(given, name), {})
+    return Measure(name, partial(_call, given, name), function=given)
 
 
-def _channel_measure(key: str, given: str, mechanism: Mechanism) -> Measure:
-    try:
-        channel = channel_of(mechanism, given)
-    except ValueError as problem:
-        raise ValueError(f"measure {quote(given)}: {problem}") from None
-    labels = {channel.name: Label(("time",), channel.units, channel.name)}
-    return Measure(channel.name, True, _ChannelMeasure(channel), labels, None, "" if key == channel.name else key)
+def _evaluate_channel(channel: Channel, run: MeasuredRun) -> dict[str, Array]:
+    return {channel.name: evaluate_channels(run.mechanism, run.solution, (channel,))[:, 0]}
 
 
-@dataclass(frozen=True)
-class _ChannelMeasure:
-    """A channel over time."""
-
-    channel: Channel
-
-    def __call__(self, run: MeasuredRun) -> dict[str, Array]:
-        return {self.channel.name: evaluate_channels(run.mechanism, run.solution, (self.channel,))[:, 0]}
-
-
-@dataclass(frozen=True)
-class _UserMeasure:
-    """A user's function, whose single array has the measure's name."""
-
-    function: UserMeasure
-    name: str
-
-    def __call__(self, run: MeasuredRun) -> dict[str, Array]:
-        found = self.function(run.mechanism, run.solution)
-        if isinstance(found, Mapping):
-            return {f"{self.name}_{key}": jnp.asarray(value) for key, value in found.items()}
-        return {self.name: jnp.asarray(found)}
+def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array]:
+    """Call a user's function, whose single array has the measure's name."""
+    found = function(run.mechanism, run.solution)
+    if isinstance(found, Mapping):
+        return {f"{name}_{key}": jnp.asarray(value) for key, value in found.items()}
+    return {name: jnp.asarray(found)}
 
 
 def _reference(given: Reference, ts: np.ndarray) -> Reference:
@@ -173,33 +156,76 @@ def _largest(x: Array) -> Array:
     return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), initial=0.0)
 
 
+# --- measures by name
+
+MEASURES: dict[str, Measure] = {}
+_STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
+
+
+def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute], Compute]:
+    """Decorator of what computes a measure: its name, whether it needs all output times, and its variables."""
+
+    def add(compute: Compute) -> Compute:
+        MEASURES[name] = Measure(name, compute, labels, along)
+        return compute
+
+    return add
+
+
+@_named(
+    "final",
+    along=False,
+    q_end=Label(_STATE, "m, m, rad", "coordinates at the end"),
+    v_end=Label(_STATE, "m/s, m/s, rad/s", "velocities at the end"),
+)
 def _final(run: MeasuredRun) -> dict[str, Array]:
     return {"q_end": run.solution.q[-1], "v_end": run.solution.v[-1]}
 
 
+@_named(
+    "states",
+    q=Label(_OVER_TIME, "m, m, rad", "coordinates: centre of mass and angle"),
+    v=Label(_OVER_TIME, "m/s, m/s, rad/s", "velocities"),
+)
 def _states(run: MeasuredRun) -> dict[str, Array]:
     return {"q": run.solution.q, "v": run.solution.v}
 
 
+@_named("violation", violation=Label((), "m, rad", "largest constraint violation at an output time"))
 def _violation(run: MeasuredRun) -> dict[str, Array]:
     return {"violation": _largest(violation(run.mechanism, run.solution))}
 
 
+@_named("energy_drift", energy_drift=Label((), "J", "largest change of the total energy, by whatever does work, too"))
 def _energy_drift(run: MeasuredRun) -> dict[str, Array]:
     total = energy(run.mechanism, run.solution).total
     return {"energy_drift": _largest(total - total[0])}
 
 
+@_named(
+    "error",
+    position_error=Label((), "m", "largest error of a coordinate of a centre of mass"),
+    angle_error=Label((), "rad", "largest error of an angle"),
+)
 def _error(run: MeasuredRun) -> dict[str, Array]:
     reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
     error = run.solution.q - jnp.asarray(getattr(reference, "q", reference))
     return {"position_error": _largest(error[..., :2]), "angle_error": _largest(error[..., 2])}
 
 
+@_named(
+    "counts",
+    along=False,
+    accepted=Label((), "1", "steps accepted"),
+    rejected=Label((), "1", "steps rejected"),
+    right_hand_sides=Label((), "1", "evaluations of the accelerations; -1: not known"),
+    projections=Label((), "1", "returns to the constraint manifold"),
+)
 def _counts(run: MeasuredRun) -> dict[str, Array]:
-    return {name: count for name, count in run.solution.stats.items() if name != "steps"}
+    return {name: run.solution.stats[name] for name in MEASURES["counts"].labels}
 
 
+@_named("rank", rank=Label(("time",), "1", "rank of D by the method's own rule; -1: not reached"))
 def _rank(run: MeasuredRun) -> dict[str, Array]:
     """Compute ranks by the method's own rule; that of `Auto` is the rule of the singular values that it falls back to."""
     method = Auto() if run.method is None else run.method
@@ -210,50 +236,3 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     reached = jnp.all(jnp.isfinite(q), axis=1)
     ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
     return {"rank": jnp.where(reached, ranks, RANK_NOT_REACHED)}
-
-
-_STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
-# Whether all output times are needed, the function, and its variables.
-MEASURES: dict[str, tuple[bool, Callable[[MeasuredRun], dict[str, Array]], dict[str, Label]]] = {
-    "final": (
-        False,
-        _final,
-        {
-            "q_end": Label(_STATE, "m, m, rad", "coordinates at the end"),
-            "v_end": Label(_STATE, "m/s, m/s, rad/s", "velocities at the end"),
-        },
-    ),
-    "states": (
-        True,
-        _states,
-        {
-            "q": Label(_OVER_TIME, "m, m, rad", "coordinates: centre of mass and angle"),
-            "v": Label(_OVER_TIME, "m/s, m/s, rad/s", "velocities"),
-        },
-    ),
-    "violation": (True, _violation, {"violation": Label((), "m, rad", "largest constraint violation at an output time")}),
-    "energy_drift": (
-        True,
-        _energy_drift,
-        {"energy_drift": Label((), "J", "largest change of the total energy, by whatever does work, too")},
-    ),
-    "error": (
-        True,
-        _error,
-        {
-            "position_error": Label((), "m", "largest error of a coordinate of a centre of mass"),
-            "angle_error": Label((), "rad", "largest error of an angle"),
-        },
-    ),
-    "counts": (
-        False,
-        _counts,
-        {
-            "accepted": Label((), "1", "steps accepted"),
-            "rejected": Label((), "1", "steps rejected"),
-            "right_hand_sides": Label((), "1", "evaluations of the accelerations; -1: not known"),
-            "projections": Label((), "1", "returns to the constraint manifold"),
-        },
-    ),
-    "rank": (True, _rank, {"rank": Label(("time",), "1", "rank of D by the method's own rule; -1: not reached")}),
-}

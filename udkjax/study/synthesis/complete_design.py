@@ -17,14 +17,21 @@ from udkjax.study.design.limits import LengthLimits, Range, read_bounds
 from udkjax.study.drive import Drive
 from udkjax.study.free_numbers import FreeNumbers
 from udkjax.study.synthesis.balls import ComplexBall
-from udkjax.study.synthesis.boxes import FourBarBoxes, cognate_joints, radius_of
 from udkjax.study.synthesis.complete_designs import CompleteDesigns, OtherSolution
 from udkjax.study.synthesis.drawn_four_bar import DrawnFourBar, read_four_bar
 from udkjax.study.synthesis.five_poses import DYADS, find_real_dyads
-from udkjax.study.synthesis.four_bars import DEFECTS, KINDS, FourBars, classify, stack_four_bars
+from udkjax.study.synthesis.four_bars import (
+    DEFECTS,
+    KINDS,
+    FourBarBoxes,
+    FourBars,
+    classify,
+    cognate_joints,
+    radius_of,
+    stack_four_bars,
+)
 from udkjax.study.synthesis.motion_check import check_motions
 from udkjax.study.synthesis.nine_points import find_real_classes
-from udkjax.study.synthesis.refusals import require_five_poses, require_nine_points
 
 
 class _Solutions(NamedTuple):
@@ -165,7 +172,6 @@ class CompleteSearch(NamedTuple):
 
 
 def _through_points(targets: np.ndarray) -> _Solutions:
-    require_nine_points(targets)
     found = find_real_classes(targets)
     J, u, R = len(targets), found.boxes.middle.astype(float), found.boxes.middle.shape[1]
     P = targets[:, 0] + 1j * targets[:, 1]
@@ -190,7 +196,6 @@ def _through_points(targets: np.ndarray) -> _Solutions:
 
 
 def _through_poses(targets: np.ndarray) -> _Solutions:
-    require_five_poses(targets)
     found = find_real_dyads(targets)
     u, P = found.scale * found.boxes.middle.astype(float), targets[:, 0] + 1j * targets[:, 1]
     pairs = np.array(list(combinations(range(u.shape[1]), 2)), int).reshape(-1, 2)

@@ -14,8 +14,8 @@ import numpy as np
 
 from udkjax.study.synthesis.balls import ROUNDING, Ball
 from udkjax.study.synthesis.certificate import Certificate, certify
-from udkjax.study.synthesis.nine_points import displacements, power_of_two_near
-from udkjax.study.synthesis.planar_dyads import dyad_system
+from udkjax.study.synthesis.dyads import dyad_system
+from udkjax.study.synthesis.nine_points import SAME, displacements, power_of_two_near
 
 DYADS = 4  # of generic poses, complex ones counted
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
@@ -45,8 +45,21 @@ class RealDyads(NamedTuple):
     scale: float
 
 
+def require_five_poses(poses: np.ndarray) -> None:
+    """Raise `ValueError` unless dyads through five poses may be isolated solutions."""
+    if len(poses) != 5:
+        raise ValueError(f"goal: finitely many four-bars go through five poses; there are {len(poses)}: use `design`")
+    extent = float(np.max(np.ptp(poses[:, :2], axis=0))) or 1.0
+    for i, j in combinations(range(5), 2):
+        off = poses[i] - poses[j]
+        turn = abs((off[2] + np.pi) % (2 * np.pi) - np.pi)
+        if np.max(np.abs(off[:2])) <= SAME * extent and turn <= SAME:
+            raise ValueError(f"goal: targets {i} and {j} are the same pose: four poses leave infinitely many four-bars")
+
+
 def find_real_dyads(poses: np.ndarray) -> RealDyads:
     """Return the real dyads through five poses (5, 3); raise `ValueError` where dyads are no isolated ones."""
+    require_five_poses(poses)
     scale = power_of_two_near(poses[:, :2]) if np.ptp(poses[:, :2], axis=0).any() else 1.0
     d = displacements(np.asarray(poses[:, :2], np.longdouble) / scale)
     angle = np.asarray(poses[:, 2], np.longdouble) - np.longdouble(poses[0, 2])

@@ -10,6 +10,7 @@ linkages, J. Mech. Des. 114 (1992).
 """
 
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +19,9 @@ from scipy.spatial import KDTree
 
 from udkjax.integrate.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
 from udkjax.study.synthesis.balls import LONG, Ball
-from udkjax.study.synthesis.boxes import certainly_different
 from udkjax.study.synthesis.certificate import Certificate, certify
-from udkjax.study.synthesis.dyad_programs import JOINTS, POINTS, UNKNOWNS, newton_and_tangent
-from udkjax.study.synthesis.planar_dyads import Displacements, four_bar_system
+from udkjax.study.synthesis.dyads import JOINTS, POINTS, UNKNOWNS, Displacements, four_bar_system, newton_and_tangent
+from udkjax.study.synthesis.four_bars import certainly_different
 
 CLASSES = 1442
 STARTS = Path(__file__).with_name("nine_points.npz")
@@ -33,6 +33,11 @@ ALIKE = 1e-7  # relative: classes whose pivots differ by less are one; more, whe
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
 REFINED = 1e-8  # a Newton step with residuals in long numbers, beside the unknowns, that shows a regular solution
 REFINEMENTS = 8  # of Newton at most: it doubles the digits
+SAME = 1e-12  # of the extent: places or poses nearer than that are one
+# A coupler curve has degree six and passes three times through both isotropic points at infinity: a line meets it in six
+# points, a circle in 12 - 6 others, unless it is a part of the curve.
+MOST_ON_A_LINE = 6
+ON_IT = 1e-10  # of the extent: off a line or circle
 
 
 class Paths(NamedTuple):
@@ -81,8 +86,32 @@ class RealClasses(NamedTuple):
         return self.ends.kinds.count("unproven")
 
 
+def require_nine_points(points: np.ndarray) -> None:
+    """Raise `ValueError` unless four-bars through nine points may be isolated solutions."""
+    if len(points) != 9:
+        cure = "leave out the last one of a closed curve" if len(points) == 10 else "use `design` for fewer or more"
+        raise ValueError(f"goal: finitely many four-bars go through nine places; there are {len(points)}: {cure}")
+    extent = float(np.max(np.ptp(points, axis=0)))
+    for i, j in combinations(range(9), 2):
+        if np.max(np.abs(points[i] - points[j])) <= SAME * extent:
+            raise ValueError(f"goal: targets {i} and {j} are the same place: eight places leave infinitely many four-bars")
+    z = (points - points.mean(axis=0)) / extent
+    rows = np.column_stack([np.sum(z**2, axis=1), z, np.ones(9)])
+    for columns, what in ((slice(1, 4), "line"), (slice(0, 4), "circle")):
+        size = 2 if what == "line" else 3
+        for chosen in combinations(range(9), size):
+            normal = np.linalg.svd(rows[list(chosen), columns])[2][-1]
+            on_it = np.abs(rows[:, columns] @ normal) <= ON_IT
+            if np.count_nonzero(on_it) > MOST_ON_A_LINE:
+                raise ValueError(
+                    f"goal: {np.count_nonzero(on_it)} of the targets are on one {what}: a four-bar's curve meets a {what} in at "
+                    f"most {MOST_ON_A_LINE} places, or it is a part of the curve, as of infinitely many: use `design`"
+                )
+
+
 def find_real_classes(points: np.ndarray) -> RealClasses:
-    """Return the real classes of four-bars through nine points (9, 2)."""
+    """Return the real classes of four-bars through nine points (9, 2); raise `ValueError` where they may not be isolated."""
+    require_nine_points(points)
     scale = power_of_two_near(points)
     places = np.asarray(points, LONG) / scale
     d = places[1:] - places[0]
