@@ -252,7 +252,7 @@ def _independent_rows(free: np.ndarray) -> list[int]:
     count, every = free.shape[1], np.arange(len(free))
     chosen = every[:0]
     for rows in (every[2::3], every):
-        _, R, order = qr(free[rows].T / np.linalg.norm(free, 2), mode="economic", pivoting=True)
+        R, order = qr(free[rows].T / np.linalg.norm(free, 2), mode="economic", pivoting=True)[-2:]
         chosen, sizes = rows[order[:count]], np.abs(np.diag(R))
         if len(sizes) == count and sizes.min(initial=1.0) >= SMALLEST_READABLE_PART:
             break
