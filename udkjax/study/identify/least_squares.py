@@ -85,7 +85,7 @@ def _minimize(evaluate: Objective, guess: Float[np.ndarray, "K"], steps: int, se
     from scipy.optimize import least_squares
 
     fit = _TrustRegionFit(evaluate, guess, settled, report)
-    # What ends a fit, but for its steps, is said by `Descent`.
+    # `Descent` says when a fit ends, but for its steps.
     choices: dict[str, Any] = {"jac": fit.jacobian, "ftol": None, "gtol": None, "xtol": ROUNDING, "max_nfev": steps}
     with suppress(StopIteration):
         least_squares(fit.residuals, np.zeros(len(guess)), **choices)
@@ -128,7 +128,7 @@ class _TrustRegionFit(Descent):
             self.end, self.refused = self.end._replace(z=z, cost=cost), 0
             return r
         self.refused += 1
-        is_finest = self.size <= FINE_STEP and self.refused >= 2  # what is left is rounding
+        is_finest = self.size <= FINE_STEP and self.refused >= 2  # better by rounding alone
         if not self.end.history or is_finest or self.refused >= MOST_REFUSED_STEPS:
             self.stop(is_finest)
         return r if ok else np.full_like(r, np.inf)

@@ -7,7 +7,7 @@ coordinates and rates of some bodies are added to, as many as the mechanism has 
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -252,7 +252,8 @@ def _independent_rows(free: np.ndarray) -> list[int]:
     count, every = free.shape[1], np.arange(len(free))
     chosen = every[:0]
     for rows in (every[2::3], every):
-        R, order = qr(free[rows].T / np.linalg.norm(free, 2), mode="economic", pivoting=True)[-2:]
+        factors: Any = qr(free[rows].T / np.linalg.norm(free, 2), mode="r", pivoting=True)
+        R, order = factors
         chosen, sizes = rows[order[:count]], np.abs(np.diag(R))
         if len(sizes) == count and sizes.min(initial=1.0) >= SMALLEST_READABLE_PART:
             break
