@@ -239,3 +239,36 @@ def test_the_engine_takes_places_of_pins_and_a_hand_that_nothing_drives(client):
 def test_a_motor_at_rest_has_a_finite_duration(client):
     scene = client.ask("compile", text=SIX_BAR.replace("60 rpm", "0 rpm")).json()["scene"]
     assert 0 < scene["duration"] < 100
+
+
+@pytest.mark.parametrize("document", [[1], "x", 3, True])
+def test_a_document_that_is_none_is_refused(client, document):
+    answer = client.ask("compile", text="", document=document)
+    assert answer.status_code == 400 and "document: must be an object" in answer.text
+
+
+def test_subjects_that_are_none_are_refused(client):
+    text = client.ask("open", template="four_bar").json()["text"]
+    for about in ({"a": 1}, ["structure"], "__class__", 3):
+        assert client.ask("diagnose", text=text, about=about).status_code == 400
+
+
+def test_tables_within_one_another_are_a_mistake(client):
+    answer = client.ask("compile", text=f"[{'.'.join(['a'] * 2000)}]\nx = 1").json()
+    assert answer["problems"] == ["tables lie within one another too deeply"]
+
+
+def test_lengths_that_become_too_large_are_said_to(client):
+    """The radius of gyration of hardly any mass is infinite, and no answer can hold that."""
+    text = client.ask("open", template="parallelogram").json()["text"].replace("mass = 1.0", "mass = 1e-320")
+    answer = client.ask("compile", text=text)
+    assert answer.status_code == 200 and "characteristic length is infinite" in answer.json()["problems"][0]
+
+
+def test_names_are_no_formulas_in_a_table(client):
+    """A spreadsheet computes a cell that begins with an equals sign: with an apostrophe before it, it is a text."""
+    name = "=HYPERLINK(0)"
+    text = f'format = 2\nground = ["A"]\n[pins]\nA = [0, 0]\nB = [1, 0]\n[[link]]\nname = "{name}"\npins = ["A", "B"]\nmass = 1\n'
+    assert client.ask("save", text=text, path="x.csv", export=True).status_code == 200
+    header = (client.folder / "x.csv").read_text().splitlines()[0].split(",")
+    assert header[1] == f"'{name} x (m)" and not any(cell.startswith(("=", "+", "-", "@")) for cell in header)

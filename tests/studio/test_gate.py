@@ -84,9 +84,13 @@ def test_other_methods_are_refused(secret, method):
     is_refused(secret, secret.send(method, "/api/open", json.dumps({"path": "secret.toml"}).encode()), 405)
 
 
-@pytest.mark.parametrize("body", [b"", b"[]", b"null", b"{", b"\xff", b'{"path": ' + b"[" * 100_000, b"NaN"])
-def test_bodies_that_are_no_object_are_refused(secret, body):
-    is_refused(secret, secret.send("POST", "/api/open", body), 400)
+HALF = b'{"path": "secret.toml", "text": "\\ud800"}'  # of a character
+
+
+@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize("body", [b"", b"[]", b"null", b"{", b"\xff", b'{"path": ' + b"[" * 100_000, b"NaN", HALF])
+def test_bodies_that_are_no_object_are_refused(secret, route, body):
+    is_refused(secret, secret.send("POST", f"/api/{route}", body), 400)
 
 
 def test_huge_bodies_are_refused(secret):
@@ -95,7 +99,8 @@ def test_huge_bodies_are_refused(secret):
     parts = [b" " * (MOST_BODY_BYTES // 10)] * 100  # of no declared length
     is_refused(secret, secret.send("POST", "/api/save", parts), 413)
     is_refused(secret, secret.send("POST", "/api/save", b"{}", {"content-length": str(MOST_BODY_BYTES + 1)}), 413)
-    is_refused(secret, secret.send("POST", "/api/save", b"{}", {"content-length": "-1"}), 413)
+    for length in ("-1", b"\xb2", "9" * 5000, "1e3", ""):  # a raised two is a digit of Unicode, and long numbers are no int
+        is_refused(secret, secret.send("POST", "/api/save", b"{}", {"content-length": length}), 413)
 
 
 @pytest.mark.parametrize(

@@ -77,12 +77,14 @@ class Studio:
         """Return a drawing's text and tables, its mistakes, and what the page needs to move it."""
         given = {key: request[key] for key in ("text", "document", "engine") if request.get(key) is not None}
         require_size(given.get("text"))
+        if not isinstance(given.get("document", {}), dict):
+            raise RefusedError(400, "document: must be an object")
         worker = self.compiler if "engine" in given else self.reader
         return worker.call("compile_drawing", given, COMPILE_SECONDS)
 
     def diagnose(self, request: Json) -> Json:
         """Return freedoms, redundant constraints with their fixes, and what else is found about a drawing."""
-        given = {"text": require_size(request.get("text")), "about": request.get("about", "structure")}
+        given = {"text": require_size(request.get("text")), "about": str(request.get("about", "structure"))}
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
 
 
@@ -103,6 +105,9 @@ def _answering(action: Callable[[Json], Json]) -> Callable[[Request], Awaitable[
     async def answer(request: Request) -> Response:
         try:
             given = json.loads(await request.body())
+            json.dumps(
+                given, ensure_ascii=False
+            ).encode()  # raises where a text has half of a character, which no answer can hold
         except (ValueError, RecursionError):
             given = None
         if not isinstance(given, dict):

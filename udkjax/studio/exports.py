@@ -29,6 +29,8 @@ print(sol)
 udk.animate(mech, sol).save("motion.html")
 '''
 
+FORMULA = ("=", "+", "-", "@", "\t")  # with which a cell begins that a spreadsheet computes; behind an apostrophe it is a text
+
 
 def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
     """Return a drawing in the form that an ending names.
@@ -71,6 +73,7 @@ def table(mechanism: Mechanism, run: Solution) -> str:
     units = ("x (m)", "y (m)", "angle (rad)")
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["time (s)", *(f"{body} {unit}" for body in mechanism.bodies for unit in units)])
+    names = [f"'{body}" if body.startswith(FORMULA) else body for body in mechanism.bodies]
+    writer.writerow(["time (s)", *(f"{name} {unit}" for name in names for unit in units)])
     writer.writerows([repr(float(t)), *map(repr, row)] for t, row in zip(np.asarray(run.ts), q.tolist(), strict=True))
     return out.getvalue()

@@ -6,6 +6,7 @@ compared with a list), by requests of its own (so the Origin is, and the body mu
 """
 
 import hmac
+import re
 from collections.abc import Mapping
 
 from starlette.datastructures import Headers
@@ -93,7 +94,7 @@ class Gate:
 async def _read(receive: Receive, headers: Headers) -> bytes:
     """Return the body of a request; raise `RefusedError` as soon as it is too long."""
     declared = headers.get("content-length", "0")
-    if not declared.isdigit() or int(declared) > MOST_BODY_BYTES:
+    if not re.fullmatch(r"[0-9]{1,20}", declared) or int(declared) > MOST_BODY_BYTES:
         raise RefusedError(413, f"the request is longer than {MOST_BODY_BYTES} bytes")
     body = bytearray()
     while True:

@@ -37,6 +37,7 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
     with closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((LOOPBACK, port))
+        listener.listen()  # whoever takes the address at once waits for an answer, and is not refused
         bound = listener.getsockname()[1]
         app = application(Studio(Folder(root), *workers), bound, token)
         address = f"http://{LOOPBACK}:{bound}/#t={token}" + (f"&f={quote(opened)}" if opened else "")

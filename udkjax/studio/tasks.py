@@ -61,7 +61,12 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
         if document is not None:
             text = merge_document(text, document)
         found = read_document(text)
-        mechanism = loads(text)
+        with np.errstate(over="ignore", invalid="ignore"):  # it is said below
+            mechanism = loads(text)
+            if not np.isfinite(analyse(mechanism).length):
+                raise SceneError(
+                    ["the characteristic length is infinite: look at masses that are nearly zero, and places that are not"]
+                )
         if not isinstance(mechanism.drawing, Drawing):
             raise SceneError(["format: the studio draws files of format 2"])
     except SceneError as error:

@@ -21,7 +21,10 @@ HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries get
 
 def read_document(text: object) -> Document:
     """Return the tables of a text as JSON holds them; raise `SceneError`, or `RefusedError` where it is too long."""
-    document = _plain(parse_toml(require_size(text), "", SceneError))
+    try:
+        document = _plain(parse_toml(require_size(text), "", SceneError))
+    except RecursionError:
+        raise SceneError(["tables lie within one another too deeply"]) from None
     require_few(document)
     return document
 
