@@ -172,7 +172,7 @@ class KinematicRows(DenseRows):
         """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
         q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
-        still = np.zeros_like(q)
-        if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, still, psi, 0 * psi, np):
+        at_rest = np.zeros_like(q)
+        if not np.all(np.isfinite(D)) or not is_closed(self.scales, q, at_rest, psi, 0 * psi, np):
             return None
         return DensePosition(t, q, *np.linalg.svd(D))

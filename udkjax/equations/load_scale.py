@@ -30,9 +30,9 @@ class LoadScale(NamedTuple):
 def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n"]) -> LoadScale:
     """Return the scale of forces and of stiffnesses at rest in a position q at time t (s); without derivatives."""
     mechanism, scales, t, q = jax.lax.stop_gradient((mechanism, scales, t, q))
-    still, root, units = jnp.zeros_like(q), jnp.sqrt(loads.mass(mechanism)), scales.coordinates(len(q))
-    change = jnp.abs(jax.jacfwd(lambda q: loads.force(mechanism, t, q, still))(q)) @ units
-    force = jnp.linalg.norm((load_sizes(mechanism, t, q, still) + change) / root)
+    at_rest, root, units = jnp.zeros_like(q), jnp.sqrt(loads.mass(mechanism)), scales.coordinates(len(q))
+    change = jnp.abs(jax.jacfwd(lambda q: loads.force(mechanism, t, q, at_rest))(q)) @ units
+    force = jnp.linalg.norm((load_sizes(mechanism, t, q, at_rest) + change) / root)
     return LoadScale(force, force / jnp.linalg.norm(root * units))
 
 

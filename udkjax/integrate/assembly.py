@@ -274,8 +274,8 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
     for name, distance, angle in zip(mechanism.body_names, distances, angles, strict=True):
         if distance + angle * sizes[name] > WORTH_SAYING * sizes[name]:
             parts = {f"{distance:.2g} m": distance, f"{np.degrees(angle):.2g} deg": angle * sizes[name]}
-            told = " and ".join(text for text, part in parts.items() if part > ROUNDING * sizes[name])
-            yield f"assembly moved {name} by {told}"
+            amount = " and ".join(text for text, part in parts.items() if part > ROUNDING * sizes[name])
+            yield f"assembly moved {name} by {amount}"
 
 
 @cached_by_identity

@@ -79,8 +79,8 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
     ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
     numbers = [*_of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers, DEPENDENT, 0.0]
-    still = xp.zeros(analysis.coordinates)
-    return pack(_operation(mechanism, analysis), numbers, ts, q, still, settings, scales.rows, xp.zeros(0), xp)
+    at_rest = xp.zeros(analysis.coordinates)
+    return pack(_operation(mechanism, analysis), numbers, ts, q, at_rest, settings, scales.rows, xp.zeros(0), xp)
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:

@@ -103,9 +103,9 @@ class SampleRows:
         """Return the mechanism that programs are made of, or the tree of its changes, or, with `marks`, of what is active."""
         found = {}
         for place, given in mechanism.samples.items():
-            there = [leaf for leaf in leaves_and_none(given) if leaf is not None]
-            zeros = np.zeros(row_size(self.samples[place])) if there else None
-            found[place] = with_row(self.samples[place], any(leaf is True for leaf in there) if marks else zeros)
+            present = [leaf for leaf in leaves_and_none(given) if leaf is not None]
+            zeros = np.zeros(row_size(self.samples[place])) if present else None
+            found[place] = with_row(self.samples[place], any(leaf is True for leaf in present) if marks else zeros)
         return mechanism.with_samples(found)
 
     def places(self, mechanism: Mechanism) -> tuple[int, ...]:

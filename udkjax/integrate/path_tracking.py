@@ -123,10 +123,10 @@ class PathTracker:
                 out[:, gone.path], reached[gone.path], taken[gone.path] = gone.z, gone.t, gone.taken
                 status[gone.path] = _ends(gone)
                 points = points.take(~is_over)
-        there = np.flatnonzero(reached >= 1.0)
-        if len(there):
-            out[:, there], converged = self.polish(out[:, there], end)
-            status[there] = np.where(converged, ACCEPTED, status[there])
+        arrived = np.flatnonzero(reached >= 1.0)
+        if len(arrived):
+            out[:, arrived], converged = self.polish(out[:, arrived], end)
+            status[arrived] = np.where(converged, ACCEPTED, status[arrived])
         return TrackedPaths(out, status, reached, taken)
 
     def polish(self, z: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,15 +18,15 @@ def aim(module: Module, f: Function, s: Lane):
         t1 = where(last, s.end, halve(f, s, t1, begin | last))
         s.lands = f.const(0.0, DOUBLE, f.width)
     else:
-        here = s.point3_t
-        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), here
-        next_breakpoint(module, f, s, here)
+        start = s.point3_t
+        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), start
+        next_breakpoint(module, f, s, start)
         end = s.t1
         crossing = s.crossing if module.pieces else f.const(np.inf, DOUBLE, f.width)
         stop = f.min(end, crossing)
-        rest = f.min(stop, s.end) - here
+        rest = f.min(stop, s.end) - start
         parts = f.max(float(POINTS - 1) - s.steps, 1.0)
-        share = here + rest / parts
+        share = start + rest / parts
         several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
         several = several & (s.next < stop - s.smallest)  # for the sake of outputs in between
         if module.pieces:

@@ -163,8 +163,8 @@ class Closing(Module):
         """Do something at the state before a step, which lies in `corrected q`, in place of the one that it led to."""
         p, work = self.places, f.given["work"]
         with f.each(self.n) as i:
-            here, before = f.load(work, i + p[f"state {x}"]), f.load(work, i + p["corrected q"])
-            f.store(here, work, i + p["corrected q"])
+            current, before = f.load(work, i + p[f"state {x}"]), f.load(work, i + p["corrected q"])
+            f.store(current, work, i + p["corrected q"])
             f.store(before, work, i + p[f"state {x}"])
         do()
         with f.each(self.n) as i:

@@ -36,7 +36,7 @@ def write_decide(module: Module):
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
     bad = stepping & ~(error < np.inf)
-    dodge, again, left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
+    dodge, repeats, left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
     if module.falls_back:
         stepping, dodge, left = _retry_or_fall_back(module, f, s, bad)
     else:
@@ -45,14 +45,14 @@ def write_decide(module: Module):
     if module.pieces:
         s.again = where(stepping, yes, 0.0)
         f.call("leave", f.given["work"])
-        again = s.again > 0.5
-    accept = stepping & (error < 1.0) & ~dodge & ~again
+        repeats = s.again > 0.5
+    accept = stepping & (error < 1.0) & ~dodge & ~repeats
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
     factor, rate = _step_factor(module, f, s, accept, step)
     h = where(stepping, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
-    h = where(again, s.h, h)
+    h = where(repeats, s.h, h)
     if module.falls_back:
-        h = where(stepping & ~accept & stepped & ~again, step_around(module, f, s, left, step, h), h)
+        h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, left, step, h), h)
     s.behind = h
     with f.if_(f.any_of(begun)):
         s.behind = where(begun, first_step(module, f, s), s.behind)

@@ -59,7 +59,7 @@ def write_approach(module: WatchMemory):
 def write_land(module: WatchMemory):
     """`land(work)`: what becomes of lanes whose step has ended at its target."""
     f, s = module.function("land")
-    there = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(RUNNING))
+    arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(RUNNING))
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
     setattr(s, "state t", s.point3_t)
     for source, to in (("point3 q", "state q"), ("point3 v", "result v"), ("point3 a", "node a")):
@@ -72,9 +72,9 @@ def write_land(module: WatchMemory):
         rate.where(own, module.condition(f, "rate", c))
     change = -(g.value / f.select(rate.value.is_(0.0), one, rate.value))
     is_small = f.abs(change) * s.omega <= LAST_CHANGE
-    goes_on = there & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
+    goes_on = arrived & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
     s.where(goes_on, landing=float(WANTED), target=s.target + change, landings=s.landings + 1.0)
-    done, change = there & ~goes_on, f.select(is_small, change, zero)
+    done, change = arrived & ~goes_on, f.select(is_small, change, zero)
     ahead = module.broadcast(f, change)
     exact = done & is_small
     s.where(exact, sure_t=s.point3_t + change)

@@ -60,20 +60,20 @@ def write_leave(module: Module):
         module.put(f, "state q", r, module.vector(f, "corrected q", r))
         module.put(f, "state v", r, module.vector(f, "result v", r))
     share, aim, good = s.share, s.aim, s.error < 1.0
-    again = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
+    repeats = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
     exact = f.min(share, yes - share) <= NEAR_END
-    s.where(leaves & ~again, lands=1.0)
+    s.where(leaves & ~repeats, lands=1.0)
     short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
     reached = stepping & good & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
-    across = reached | (again & (share <= EDGE))
+    across = reached | (repeats & (share <= EDGE))
     before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
-    aim = where(again, where(exact, before, beyond), where(short, aim, beyond))
+    aim = where(repeats, where(exact, before, beyond), where(short, aim, beyond))
     expected = f.fma(where(exact, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
-    crossing = where(again, expected, where(short, s.crossing, inf))
+    crossing = where(repeats, expected, where(short, s.crossing, inf))
     crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
-    tries = where(again, s.tries + 1.0, where(good, 0.0, s.tries))
+    tries = where(repeats, s.tries + 1.0, where(good, 0.0, s.tries))
     s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
-    s.again = where(again, yes, 0.0)
+    s.again = where(repeats, yes, 0.0)
 
 
 def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:

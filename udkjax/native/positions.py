@@ -287,9 +287,9 @@ class _Text:
             lost = (self._load(f, "sign") * sign.value <= 0.0) | end.is_not(end)
             self._put(f, "end", f.select(lost, np.nan, end))
             size = most / steps
-            again = f.any_of(lost & (alive >= 0.0)) & (size > limit * SHORTEST) & (rounds.value < MOST_SUBSTEPS)
+            repeats = f.any_of(lost & (alive >= 0.0)) & (size > limit * SHORTEST) & (rounds.value < MOST_SUBSTEPS)
             f.choose(
-                again,
+                repeats,
                 lambda alive=alive, step=step, size=size: restore(alive, step, size),
                 lambda step=step, steps=steps: accept(step, steps),
             )

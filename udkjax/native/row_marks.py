@@ -95,8 +95,8 @@ class RowMarks(Module):
         iterate_newton(self, f, s, everyone, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
         self.invoke(f, "psi")
         closed = largest_violation(self, f) < CLOSED_TOL
-        away = self.largest(f, self._distance(f))
-        closed = closed & ((away > STAYS * STEP) | ~f.like(is_free, BOOL, width))
+        distance = self.largest(f, self._distance(f))
+        closed = closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
         self.invoke(f, "independent_rows")
         with f.each(self.m) as i:
             put("independent", i, f.select(closed, get("independent", i), 1.0))

@@ -60,11 +60,11 @@ def write_attempt(module: Module):
             threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
             with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
         if module.falls_back:
-            again = (s.stepping > 0.5) & (s.fallback > 0.5)
-            with f.if_(f.any_of(again)):
+            repeats = (s.stepping > 0.5) & (s.fallback > 0.5)
+            with f.if_(f.any_of(repeats)):
                 module.invoke(f, "finish_by_fallback")
                 module.accelerate_end(f)
-                s.where(again, ok=1.0)
+                s.where(repeats, ok=1.0)
     _measure_error(module, f, s)
 
 
@@ -72,14 +72,14 @@ def _measure_error(module: Module, f: Function, s: Lane):
     """Compute `error`, the largest of all coordinates over its tolerance: not a number where any of them is none."""
     q0, v0, q1, v1 = "point3 q", "point3 v", "state q", "result v"
     rtol = module.broadcast(f, s.rtol)
-    taken = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
+    weight = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
 
     def relative(r: Value) -> list[Value]:
         found = []
         for d, scale, y0, y1 in (("dq", "scale q", q0, q1), ("dv", "scale v", v0, v1)):
             left = module.vector(f, f"result {d}", r)
-            if taken:
-                left = f.fma(module.vector(f, f"state {d}", r) - left, taken, left)
+            if weight:
+                left = f.fma(module.vector(f, f"state {d}", r) - left, weight, left)
             size = f.max(f.abs(module.vector(f, y0, r)), f.abs(module.vector(f, y1, r)))
             found.append(f.abs(left) / f.fma(rtol, size, module.vector(f, scale, r)))
         return found

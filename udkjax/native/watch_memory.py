@@ -123,13 +123,13 @@ class WatchMemory(Trajectory):
         """Take the node that was looked at for the first of two intervals."""
         self.move_conditions(f, mask, g="g0", rate="rate0")
         fastest = self.largest(f, lambda r: [f.abs(self.vector(f, "result v", r)) * self.vector(f, "inverse unit", r)])
-        here, rest = s.look, s.end - s.look
+        start, rest = s.look, s.end - s.look
         turn = s.turn + TURN
         turn = turn - f.intrinsic("floor", turn)
         span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / PER_TIME) * s.share / f.max(fastest, s.slowest)
         span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))
         inf = f.const(float("inf"), DOUBLE, f.width)
         goes_on = rest > s.smallest * (4 * UNIT)
-        middle = f.select(goes_on, f.fma(span, MIDDLE, here), inf)
-        s.where(mask, first_t=here, sure_t=here, turn=turn, which=float(SECOND), node=middle)
-        s.where(mask, behind_middle=f.select(span < rest, here + span, s.end))
+        middle = f.select(goes_on, f.fma(span, MIDDLE, start), inf)
+        s.where(mask, first_t=start, sure_t=start, turn=turn, which=float(SECOND), node=middle)
+        s.where(mask, behind_middle=f.select(span < rest, start + span, s.end))

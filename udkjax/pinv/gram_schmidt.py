@@ -40,9 +40,9 @@ def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: boo
         a = rest[:, pivot]
         above = r[:, pivot]
         if twice:
-            again = dot(q.T, a)
-            a = a - dot(q, again)
-            above = above + again
+            correction = dot(q.T, a)
+            a = a - dot(q, correction)
+            above = above + correction
         norm = jnp.linalg.norm(a)
         goes_on = (rank == i) & exceeds(norm, threshold)
 

@@ -50,9 +50,9 @@ def _far_points(mechanism: Mechanism) -> Iterator[str]:
             yield f"{number} is {reach:.3g} m from the centre of mass of {quote(owner[number])}{_beside(size)}"
     places, size = np.asarray(mechanism.q0)[:, :2], max(gyration, *reaches.values(), 0.0)
     for number, point in attachments(mechanism, GROUND):
-        away = float(np.min(np.hypot(*(places - np.asarray(point)).T)))
-        if away > FAR_OUT * size:
-            yield f"{number} is {away:.3g} m from the nearest body{_beside(size)}"
+        distance = float(np.min(np.hypot(*(places - np.asarray(point)).T)))
+        if distance > FAR_OUT * size:
+            yield f"{number} is {distance:.3g} m from the nearest body{_beside(size)}"
 
 
 def _beside(size: float) -> str:

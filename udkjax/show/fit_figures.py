@@ -45,9 +45,9 @@ def series(data: "xarray.Dataset") -> list[Series]:
     found = []
     for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
         one = data.isel(record=r, channel=c)
-        there = np.isfinite(one["measured"].values)
-        if there.any():
-            columns = (one[name].values[there] for name in ("time", "measured", "predicted", "residual", "noise"))
+        present = np.isfinite(one["measured"].values)
+        if present.any():
+            columns = (one[name].values[present] for name in ("time", "measured", "predicted", "residual", "noise"))
             found.append(Series(str(one["record"].values), str(one["channel"].values), _unit(one), *columns))
     return found
 

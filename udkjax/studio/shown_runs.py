@@ -70,8 +70,8 @@ def holding_curves(mechanism: Mechanism) -> Json:
     if mobility_of(mechanism) > 0:
         raise SceneError(["motors do not hold all of it still: what they leave free, loads would move"])
     run = shown_run(mechanism)
-    still = {name: replace(driver, motion=Polynomial((driver.motion(0.0),))) for name, driver in mechanism.drivers.items()}
-    held = Mechanism(mechanism.bodies, mechanism.joints, still, mechanism.forces, gravity=mechanism.gravity)
+    halted = {name: replace(driver, motion=Polynomial((driver.motion(0.0),))) for name, driver in mechanism.drivers.items()}
+    held = Mechanism(mechanism.bodies, mechanism.joints, halted, mechanism.forces, gravity=mechanism.gravity)
     rest = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
     curves = [*_efforts(held, rest), *_pin_forces(held, rest)]
     return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}

@@ -59,10 +59,10 @@ def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
     ts = np.asarray(ts)  # of which JAX would compile a program to find the least
     times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
     for element in mechanism.forces.values():
-        seen = [frames[name] for name in mechanism.frames_of(element)]
-        if element.loads(times[0], *seen) is not None:
+        attached = [frames[name] for name in mechanism.frames_of(element)]
+        if element.loads(times[0], *attached) is not None:
             return False
-        if any(jax.grad(lambda t, e=element, s=seen: 1.0 * e.potential(t, *s))(t) for t in times):
+        if any(jax.grad(lambda t, e=element, s=attached: 1.0 * e.potential(t, *s))(t) for t in times):
             return False
     return not any(jax.grad(lambda t, d=driver: 1.0 * d.motion(t))(t) for driver in mechanism.drivers.values() for t in times)
 

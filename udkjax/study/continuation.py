@@ -282,13 +282,13 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
     stores = lands & (state.trials > 0)
     clearance = curve.clearance(X)
     dq, ddq, rank = curve.derivatives(X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
-    here = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
+    current = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
 
     def beside() -> tuple[Crossing, Array]:
         other, is_known = find_crossing(curve, X, tau)
-        return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, here), is_known
+        return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, current), is_known
 
-    found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (here, xp.asarray(False)))
+    found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (current, xp.asarray(False)))
     X, tau, dq, ddq, dddq, spacing = found
     deficient = rank < len(X) - 1
     doubtful = ~is_known & (deficient | (clearance < LOST_RANK))

@@ -221,11 +221,11 @@ def _settle(
             share, j, *_ = state
             X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
-            there = at(new)
+            trial = at(new)
             # Work done on the way, by the trapezoidal rule, or what is left of the loads along free directions.
-            work = 0.5 * (here.loads + there.loads) @ (new - q)
-            better = (work > 0 if stable else False) | (xp.linalg.norm(there.force) < size)
-            return 0.5 * share, j + 1, closed & better, new, there
+            work = 0.5 * (here.loads + trial.loads) @ (new - q)
+            better = (work > 0 if stable else False) | (xp.linalg.norm(trial.force) < size)
+            return 0.5 * share, j + 1, closed & better, new, trial
 
         def worse(state: Trial) -> Bool[Array, ""]:
             return (state[1] < STEP_HALVINGS) & ~state[2]
@@ -269,8 +269,8 @@ def _(primals, tangents):
         closed = ((X - curve.plus(E) @ curve.residual(X)) * curve.units)[:-1]
         if not free:
             return closed
-        here, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)
-        return closed + here.directions @ _towards_rest(here, scale, False, curve)
+        linear, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)
+        return closed + linear.directions @ _towards_rest(linear, scale, False, curve)
 
     given = (curve, t)
     none = jax.tree.map(jnp.zeros_like, eqx.filter(given, eqx.is_inexact_array))

@@ -114,11 +114,11 @@ def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
 def _checks(s: dict[str, np.ndarray]) -> dict[str, float]:
     """Return what must vanish, each relative to the largest number that it is the difference of."""
     inertia, reaction = s["mass"] * s["a"], s["psi_q"].T @ s["multipliers"]
-    asked = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
+    required = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
     D, plus = s["D"], s["D_plus"]
     return {
         "M a + Psi_q^T lambda - F": _relative(inertia + reaction - s["force"], inertia, reaction, s["force"]),
-        "Psi_q a - gamma": _relative(D @ (np.sqrt(s["mass"]) * s["a"]) - asked, asked, s["b"]),
+        "Psi_q a - gamma": _relative(D @ (np.sqrt(s["mass"]) * s["a"]) - required, required, s["b"]),
         "D D^+ D - D": _relative(D @ plus @ D - D, D),
         "D^+ D D^+ - D^+": _relative(plus @ D @ plus - plus, plus),
         "(D D^+)^T - D D^+": _relative((D @ plus).T - D @ plus, np.ones(1)),

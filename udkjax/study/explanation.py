@@ -120,7 +120,7 @@ def _state(e: Explanation, columns: list[str]) -> list[str]:
 
 
 def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> list[str]:
-    there = np.abs(e.psi_q) > SMALLEST_PRINTED * np.abs(e.psi_q).max()
+    shown = np.abs(e.psi_q) > SMALLEST_PRINTED * np.abs(e.psi_q).max()
     return [
         "1. Constraints Psi(t, q) = 0; along a motion Psi_dot = Psi_q v + Psi_t = 0, and Psi_q a = gamma",
         *_table(rows, ["Psi", "Psi_dot", "gamma"], np.stack([e.psi, e.psi_dot, e.gamma], axis=1)),
@@ -128,7 +128,7 @@ def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> list[st
         f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}), which entries are there, and their values:",
         *(
             f"  {name:<{_width(rows)}}  " + " ".join("x" if entry else "." for entry in row)
-            for name, row in zip(rows, there, strict=True)
+            for name, row in zip(rows, shown, strict=True)
         ),
         "",
         *_table(rows, columns, e.psi_q),

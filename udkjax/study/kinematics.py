@@ -243,8 +243,8 @@ def _start(
         return driven, _assemble(driven.mechanism, start, state, driven.analysis)
     q = _assemble(mechanism, 0.0, state, analyse(mechanism))
     if held:
-        still = State(q.reshape(-1, 3), jnp.zeros((len(q) // 3, 3)))
-        q = _assemble(driven.mechanism, driven.value(q), still, driven.analysis)
+        at_rest = State(q.reshape(-1, 3), jnp.zeros((len(q) // 3, 3)))
+        q = _assemble(driven.mechanism, driven.value(q), at_rest, driven.analysis)
     return driven, q
 
 
@@ -270,8 +270,8 @@ def _solve(
         points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=xp.zeros_like(points.status))
     if not is_traced:
         points = follow(curve, s, q, values, points, first)
-        there = Reached.has_position(points.status)[:, None]
-        return points._replace(**{name: np.where(there, getattr(points, name), np.nan) for name in ("q", "dq", "ddq")})
+        has_position = Reached.has_position(points.status)[:, None]
+        return points._replace(**{name: np.where(has_position, getattr(points, name), np.nan) for name in ("q", "dq", "ddq")})
     assert isinstance(curve, Curve)  # as it is of traced numbers
     points = follow(*stop_gradients((curve, s, q, values)), points, first)
     return _with_derivatives(curve, q, values, points)
@@ -293,18 +293,18 @@ def _count_on_branch(
     for k in np.flatnonzero(found.side[:trusted] != before[:trusted]).tolist():
         s, q = (values[k - 1], found.q[k - 1]) if k else (s, q)
         reached = follow(curve, s, q, values[k : k + 1], no_points(1, len(q), np), 0)
-        away = np.abs(reached.q[0] - found.q[k]) / curve.units[:-1]
-        if not (Reached.has_position(reached.status[0]) and np.max(away) <= SAME_POSITION):
+        distance = np.abs(reached.q[0] - found.q[k]) / curve.units[:-1]
+        if not (Reached.has_position(reached.status[0]) and np.max(distance) <= SAME_POSITION):
             return k
     return trusted
 
 
 def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "T"], points: Points) -> Points:
-    there = Reached.has_position(points.status)
-    safe = jnp.where(there[:, None], points.q, jax.lax.stop_gradient(q))
-    regular = ~there | (points.status == Reached.closed)
+    has_position = Reached.has_position(points.status)
+    safe = jnp.where(has_position[:, None], points.q, jax.lax.stop_gradient(q))
+    regular = ~has_position | (points.status == Reached.closed)
     found = with_derivatives(curve, values, points._replace(q=safe), regular)
-    q, dq, ddq = (jnp.where(there[:, None], x, jnp.nan) for x in found)
+    q, dq, ddq = (jnp.where(has_position[:, None], x, jnp.nan) for x in found)
     limited = jnp.isfinite(points.limit)
     X = jnp.where(limited, jnp.append(points.limit_q, points.limit), jax.lax.stop_gradient(jnp.append(safe[0], values[0])))
     limit = jnp.where(limited, with_derivative(curve, X), jnp.inf)

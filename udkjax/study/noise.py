@@ -22,8 +22,8 @@ def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray
 
     Source: T. Gasser, L. Sroka & C. Jennen-Steinmetz, Residual variance and residual pattern in nonlinear regression, 1986.
     """
-    there = np.isfinite(values)
-    t, y = np.asarray(times, float)[there], np.asarray(values, float)[there]
+    present = np.isfinite(values)
+    t, y = np.asarray(times, float)[present], np.asarray(values, float)[present]
     if len(t) < 3:
         return np.nan
     part = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
@@ -93,9 +93,9 @@ def whiteness_of(
 
     Source: Lobato, Nankervis & Savin, International Economic Review 42 (2001) 187.
     """
-    there = np.isfinite(residuals)
-    t, e = np.asarray(times, float)[there], np.asarray(residuals, float)[there]
-    U = np.zeros((len(e), 0)) if projection is None else np.asarray(projection, float)[there]
+    present = np.isfinite(residuals)
+    t, e = np.asarray(times, float)[present], np.asarray(residuals, float)[present]
+    U = np.zeros((len(e), 0)) if projection is None else np.asarray(projection, float)[present]
     left = len(e) - float(np.sum(U**2))
     square = float(e @ e)
     if len(e) < 3 or left <= 0 or square == 0.0:

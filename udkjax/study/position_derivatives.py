@@ -150,9 +150,9 @@ def _apply(operator: _Operator, vector: Array) -> Array:
     matrix, residue = operator.matrix, operator.residue
     if operator.is_transposed:
         out = vector.reshape(matrix.shape[:3])
-        asked = jnp.any(out != 0, (1, 2))
-        parts = jnp.any(asked[:, None] & jnp.any(residue != 0, 2), 0)
-        found = jnp.einsum("kinp,kin->p", jnp.where(asked[:, None, None, None], matrix, 0.0), out)
+        wanted = jnp.any(out != 0, (1, 2))
+        parts = jnp.any(wanted[:, None] & jnp.any(residue != 0, 2), 0)
+        found = jnp.einsum("kinp,kin->p", jnp.where(wanted[:, None, None, None], matrix, 0.0), out)
         return jnp.where(parts, jnp.nan, found)
     moved = jnp.where(vector != 0, matrix, 0.0)
     whole, terms = (jnp.einsum("kpn,p->kn", x, y) for x, y in ((residue, vector), (jnp.abs(residue), jnp.abs(vector))))

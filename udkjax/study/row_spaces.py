@@ -39,6 +39,6 @@ def echelon(rows: Float[np.ndarray, "R K"], tol: float = SMALLEST_COEFFICIENT) -
 
 def connected_columns(relations: Float[np.ndarray, "R K"]) -> list[list[int]]:
     """Return the sets of columns that rows connect; columns of zeros are in none."""
-    there = np.asarray(relations) != 0.0
-    _, label = connected_components(there.T.astype(int) @ there, directed=False)
-    return [np.flatnonzero(label == k).tolist() for k in np.unique(label[there.any(0)])]
+    nonzero = np.asarray(relations) != 0.0
+    _, label = connected_components(nonzero.T.astype(int) @ nonzero, directed=False)
+    return [np.flatnonzero(label == k).tolist() for k in np.unique(label[nonzero.any(0)])]

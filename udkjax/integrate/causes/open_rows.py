@@ -71,13 +71,13 @@ def explain_open(
             "Check the points and lengths of these joints, or bring the initial positions and angles closer to a closed state."
         )
     left = np.asarray(kinematic_rows(mechanism).at(t, closed)[0])  # where the joints are closed, only drivers are open
-    asked = []
+    demands = []
     for name, driver in mechanism.drivers.items():
         off = float(left[list(names).index(name)])
         if abs(off) > CLOSED_TOL * float(scales[list(names).index(name)]):
             value, unit = float(driver.motion(t)), "rad" if driver.coordinate == "angle" else "m"
-            asked.append(f'driver "{name}" asks for {value:.6g} {unit} at {t:.6g} s, and is at {value + off:.6g} {unit}')
-    return f"{cause}Without drivers it closes: {'; '.join(asked)}. Change the drivers' motion, or bring the guess closer to it."
+            demands.append(f'driver "{name}" asks for {value:.6g} {unit} at {t:.6g} s, and is at {value + off:.6g} {unit}')
+    return f"{cause}Without drivers it closes: {'; '.join(demands)}. Change the drivers' motion, or bring the guess closer to it."
 
 
 def _close_without_drivers(mechanism: Mechanism, guess: np.ndarray) -> np.ndarray | None:

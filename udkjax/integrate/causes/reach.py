@@ -46,16 +46,16 @@ def explain_reach(run: FailedRun, until: float) -> str:
     if not names:
         return ""
     opposed = _opposed(mechanism, names)
-    asked = " and ".join(f'driver "{name}" asks for {_value(mechanism.drivers[name], until)}' for name in names)
+    demands = " and ".join(f'driver "{name}" asks for {_value(mechanism.drivers[name], until)}' for name in names)
     where = f"at {until:.6g} s"
     if opposed and len(names) > 1:
         listed = " and ".join(f'"{name}"' for name in names)
-        return f"drivers {listed} contradict each other: {asked} {where}; take one out, or change its motion"
+        return f"drivers {listed} contradict each other: {demands} {where}; take one out, or change its motion"
     if opposed:
-        return f"{asked} {where}, where the joints leave its coordinate no motion; take it out, or free the coordinate"
+        return f"{demands} {where}, where the joints leave its coordinate no motion; take it out, or free the coordinate"
     reached = " and ".join(_value(mechanism.drivers[name], found.t) for name in names)
     point = _dead_point(mechanism, found, names)
-    return f"{asked} {where}; the linkage reaches {reached}, at {found.t:.6g} s ({point})"
+    return f"{demands} {where}; the linkage reaches {reached}, at {found.t:.6g} s ({point})"
 
 
 def _find_reach(run: FailedRun, until: float) -> Reach | None:
@@ -76,21 +76,21 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
 
     high = None
     for at in np.linspace(t, until, REACH_STEPS + 1)[1:]:
-        there = close(float(at))
-        if there is None:
+        closure = close(float(at))
+        if closure is None:
             high = float(at)
             break
-        before, (t, q) = (t, q), (float(at), there)
+        before, (t, q) = (t, q), (float(at), closure)
     if high is None:
         return None
     before = None  # beside a dead point the way behind leads astray
     for _ in range(REACH_HALVINGS):
         middle = 0.5 * (t + high)
-        there = close(middle) if t < middle < high else None
-        if there is None:
+        closure = close(middle) if t < middle < high else None
+        if closure is None:
             high = middle
         else:
-            t, q = middle, there
+            t, q = middle, closure
     return Reach(t, q, _demanding(run, t, q, until))
 
 

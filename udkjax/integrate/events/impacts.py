@@ -187,10 +187,10 @@ def hit_contacts(
     rest = solve_complementarity(rows.W, pull, stays, pressed)
     presses = rest.passive & (rest.x > 0)
     is_held = jnp.where(closed > OPEN, presses & hybrid.rests("hold"), held)
-    still = stays & ~is_held & (jnp.abs(rest.y) <= jnp.maximum(pressed, STILL * jnp.max(jnp.where(stays, jnp.abs(pull), 0.0))))
+    resting = stays & ~is_held & (jnp.abs(rest.y) <= jnp.maximum(pressed, STILL * jnp.max(jnp.where(stays, jnp.abs(pull), 0.0))))
     hits = (closed == TOUCHES) & ~held & (rate < -floor)
     ends = presses & hybrid.rests("stop")
-    return ContactChanges(v, closed, hits, is_held, ends, still & _depends(rows.W, is_held), found.remaining)
+    return ContactChanges(v, closed, hits, is_held, ends, resting & _depends(rows.W, is_held), found.remaining)
 
 
 def _depends(W: Float[Array, "E E"], on: Bool[Array, "E"]) -> Bool[Array, "E"]:

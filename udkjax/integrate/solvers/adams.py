@@ -204,8 +204,8 @@ class Adams(Multistep):
         same, lower, lowest = estimates.errors[jnp.maximum(k - jnp.arange(3), 0)] * size(below)
         error = estimates.gains(k) * size(d[None])[0]
         accept = found & finite & (error <= 1)
-        again = accept & ~displaced & (self.corrector == "pece")
-        value = jax.lax.cond(again, lambda: f(t1, y1), lambda: slope + d)
+        repeats = accept & ~displaced & (self.corrector == "pece")
+        value = jax.lax.cond(repeats, lambda: f(t1, y1), lambda: slope + d)
 
         points = jnp.minimum(state.points + 1, len(row))
         phi = value - jnp.concatenate([jnp.zeros_like(star[:1]), jnp.cumsum(star, axis=0)[:-1]])
@@ -215,8 +215,8 @@ class Adams(Multistep):
         shrink = jnp.where(found & finite, step_factor(error, k), SMALLEST)
 
         ages = jnp.concatenate([jnp.zeros_like(state.ages[:1]), h + state.ages[:-1]])
-        exact = again | (self.corrector == "iteration")
-        new = History(ages, phi, y1, exact, points, control, rate, state.evaluations + calls + again)
+        exact = repeats | (self.corrector == "iteration")
+        new = History(ages, phi, y1, exact, points, control, rate, state.evaluations + calls + repeats)
         dense = {"y0": y0, "ages": state.ages, "terms": jnp.where(row == k + 1, d, used)}
         y1 = unravel(y1)
         y_error = steer_error(self.root_finder, y0, y1, accept, jnp.where(accept, growth, shrink))

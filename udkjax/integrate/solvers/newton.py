@@ -115,10 +115,10 @@ def solve(
         converged = far * jnp.minimum(1.0, rate) <= 1
         hopeless = ~first & ~(far <= DIVERGING * now.size) | (now.count == iterations - 1) | ~jnp.isfinite(far)
         stuck, fresh = ~converged & hopeless, now.fresh | now.renew
-        again = stuck & ~fresh
+        refreshes = stuck & ~fresh
         state = eqx.tree_at(lambda k: k.rate, state, jnp.where(jnp.isfinite(rate) & ~stuck, rate, 1.0))
-        e, far, count = (jnp.where(again, a, b) for a, b in ((0.0, now.e + d), (1.0, far), (0, now.count + 1)))
-        return _Iteration(state, e, far, count, fresh, again, again, converged, stuck & fresh)
+        e, far, count = (jnp.where(refreshes, a, b) for a, b in ((0.0, now.e + d), (1.0, far), (0, now.count + 1)))
+        return _Iteration(state, e, far, count, fresh, refreshes, refreshes, converged, stuck & fresh)
 
     end = jax.lax.while_loop(lambda now: ~(now.converged | now.failed), iterate, start)
     state = eqx.tree_at(

@@ -100,9 +100,9 @@ class GramSchmidtCode(DenseMethod):
             row = d.row("r", k)
             if self.twice:
                 with f.each(k) as j:
-                    again = d.dot(d.row("r", j), row)
-                    above.put(j, again)
-                    d.row("l", k).put(j, d.row("l", k).entry(j) + again)
+                    correction = d.dot(d.row("r", j), row)
+                    above.put(j, correction)
+                    d.row("l", k).put(j, d.row("l", k).entry(j) + correction)
                 with f.each(k) as j:
                     d.axpy(-above.entry(j), d.row("r", j), row)
             square = d.dot(row, row)

@@ -63,8 +63,8 @@ class LUCode(DenseMethod):
         """Write how the sign of det D is found of its factors: that of the pivots, and -1 for each pair of rows out of order."""
         f, order, found = d.f, d.row("order"), d.f.variable(1.0)
         with f.each(d.m) as k:
-            here = order.entry(k)
+            place = order.entry(k)
             found.value = f.select(d.row("inverse").entry(k) < 0.0, -found.value, found.value)
             with f.each(k) as i:
-                found.value = f.select(order.entry(i) > here, -found.value, found.value)
+                found.value = f.select(order.entry(i) > place, -found.value, found.value)
         return found.value

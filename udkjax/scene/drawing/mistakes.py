@@ -138,10 +138,10 @@ def _far_pins(places: Mapping[str, Points]) -> Iterator[str]:
         return
     for name, place in places.items():
         rest = [other for key, other in places.items() if key != name]
-        away, size = min(np.linalg.norm(place - other) for other in rest), extent(rest)
-        if away > FAR_POINT_RATIO * size > 0:
+        distance, size = min(np.linalg.norm(place - other) for other in rest), extent(rest)
+        if distance > FAR_POINT_RATIO * size > 0:
             yield (
-                f"pins.{name}: is {away:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
+                f"pins.{name}: is {distance:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
                 "is its unit the one that is meant?"
             )
 

@@ -90,15 +90,15 @@ def mechanism_of_text(
     gravity = plane.flat(settings.gravity)
     name = root.attributes.get("model", "")
     mechanism = Mechanism(bodies, joints, {}, forces, (gravity.real, gravity.imag), name)
-    said = [
+    messages = [
         f"{loop} is open by {gap:.3g} (m, rad), which assembly closes" for loop, gap in _gaps(mechanism, list(loops), model.size)
     ]
     if "contact" not in settings.disabled and "contacts" not in leave_out and (pairs := contact_pairs(root, tree, plane)):
         more = f" and {len(pairs) - 3} more pairs" * (len(pairs) > 3)
-        said.append(
+        messages.append(
             f"contacts are not taken over, of {'; '.join(pairs[:3])}{more}: `udk.Contact` is an event for each point that hits"
         )
-    for text in said:
+    for text in messages:
         warnings.warn(text, MjcfWarning, stacklevel=stacklevel)
     return mechanism
 

@@ -130,8 +130,8 @@ class _Writer:
             found.append(_TreeJoint(title, {"axis": NORMAL, "pos": _in_space(two.local((pin.x - two.x, pin.y - two.y)))}, rate))
 
         def slide(title: str, direction: Point, pin: Point) -> None:
-            there = [frame.velocity(frame.local((pin.x - frame.x, pin.y - frame.y))) for frame in (one, two)]
-            rate = direction.dot(Point(there[1].x - there[0].x, there[1].y - there[0].y))
+            velocities = [frame.velocity(frame.local((pin.x - frame.x, pin.y - frame.y))) for frame in (one, two)]
+            rate = direction.dot(Point(velocities[1].x - velocities[0].x, velocities[1].y - velocities[0].y))
             found.append(_TreeJoint(title, {"type": "slide", "axis": _in_space(two.local(direction))}, rate))
 
         turning = two.omega - one.omega
@@ -155,12 +155,12 @@ class _Writer:
                 hinge(held, pin, turning)
                 found = found if name == joint.bodies[1] else found[::-1]
         elif isinstance(joint, Distance):
-            here = [two.point(joint.points[joint.bodies.index(name)]), one.point(joint.points[joint.bodies.index(parent)])]
-            rod = Point(here[0].x - here[1].x, here[0].y - here[1].y)
-            ends = [frame.velocity(joint.points[joint.bodies.index(body)]) for frame, body in ((two, name), (one, parent))]
-            spin = (rod.x * (ends[0].y - ends[1].y) - rod.y * (ends[0].x - ends[1].x)) / rod.dot(rod)
-            hinge(f"{held}.rod", here[1], spin - one.omega)
-            hinge(held, here[0], two.omega - spin)
+            ends = [two.point(joint.points[joint.bodies.index(name)]), one.point(joint.points[joint.bodies.index(parent)])]
+            rod = Point(ends[0].x - ends[1].x, ends[0].y - ends[1].y)
+            rates = [frame.velocity(joint.points[joint.bodies.index(body)]) for frame, body in ((two, name), (one, parent))]
+            spin = (rod.x * (rates[0].y - rates[1].y) - rod.y * (rates[0].x - rates[1].x)) / rod.dot(rod)
+            hinge(f"{held}.rod", ends[1], spin - one.omega)
+            hinge(held, ends[0], two.omega - spin)
         elif isinstance(joint, Angle):
             slide(f"{held}.x", Point(1.0, 0.0), Point(two.x, two.y))
             slide(f"{held}.y", Point(0.0, 1.0), Point(two.x, two.y))

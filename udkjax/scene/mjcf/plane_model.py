@@ -45,9 +45,9 @@ class PlaneMotion(NamedTuple):
 
     def turn(self, anchor: complex, angle: float, rate: float) -> "PlaneMotion":
         """Return the motion after a turn about a point of the body (rad, rad/s)."""
-        here, turned = self.point(anchor), self.angle + angle
-        shift = here - np.exp(1j * turned) * anchor
-        return PlaneMotion(turned, shift, self.omega + rate, self.rate - 1j * rate * here)
+        place, turned = self.point(anchor), self.angle + angle
+        shift = place - np.exp(1j * turned) * anchor
+        return PlaneMotion(turned, shift, self.omega + rate, self.rate - 1j * rate * place)
 
     def slide(self, direction: complex, way: float, rate: float) -> "PlaneMotion":
         """Return the motion after a slide along a direction of the body (m, m/s)."""
@@ -78,9 +78,9 @@ def plane_of(joints: Sequence[TreeJoint], gravity: np.ndarray) -> MotionPlane:
     for joint in joints:
         off = np.linalg.norm(np.cross(joint.axis, normal)) if joint.kind == "hinge" else abs(joint.axis @ normal)
         if off > AXES_TOL:
-            there = " ".join(f"{v:.4g}" for v in normal)
+            numbers = " ".join(f"{v:.4g}" for v in normal)
             joint.read.refuse(
-                f"leaves the plane in which the other joints move, whose normal is {there}: the model is not planar"
+                f"leaves the plane in which the other joints move, whose normal is {numbers}: the model is not planar"
             )
     return MotionPlane(x, up, normal)
 

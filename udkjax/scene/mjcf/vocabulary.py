@@ -115,8 +115,8 @@ def unknown_parts(root: XmlElement) -> list[str]:
         if id(parent) in skipped or element.tag in WITHOUT_EFFECT or (parent.tag == "default" and element.tag in SHAPELESS):
             skipped.add(id(element))
             continue
-        told = f"{parent.tag}/{element.tag}"
-        key = told if parent.tag in TOLD_BY_PARENT and element.tag in ("joint", "tendon", "site", "geom") else element.tag
+        path = f"{parent.tag}/{element.tag}"
+        key = path if parent.tag in TOLD_BY_PARENT and element.tag in ("joint", "tendon", "site", "geom") else element.tag
         if key not in _KNOWN:
             skipped.add(id(element))
             found.append(f"{element.where}: not taken over{_cure(element.tag)}")

@@ -182,8 +182,8 @@ def only_driver(mechanism: Mechanism) -> str:
     """Return the name of the only driver; raise `SceneError` where there is none, or more."""
     names = mechanism.driver_names
     if len(names) != 1:
-        there = f"there are {', '.join(names)}" if names else "there is none in the scene"
-        raise SceneError([f"driver: name the driver or a coordinate, such as body.crank.angle: {there}"], mechanism.name)
+        choices = f"there are {', '.join(names)}" if names else "there is none in the scene"
+        raise SceneError([f"driver: name the driver or a coordinate, such as body.crank.angle: {choices}"], mechanism.name)
     return names[0]
 
 

@@ -101,9 +101,9 @@ class CompiledTerm:
         """Return measures (M, K), their derivatives by the unknowns (M, K, P), and whether all positions exist (M,)."""
         s = self._values(x)
         found = self._code(x, s, self._unit, longest=self._longest, threads=threads)
-        there = np.isfinite(found.end).all(1)
-        out = np.where(there[:, None, None], found.out, 0.0)
-        return out[..., self._places.value], out[..., self._places.by_parameters], there
+        finite = np.isfinite(found.end).all(1)
+        out = np.where(finite[:, None, None], found.out, 0.0)
+        return out[..., self._places.value], out[..., self._places.by_parameters], finite
 
     def __call__(self, x: np.ndarray, threads: int | None = None) -> TermResiduals:
         """Return the residuals of trials x (M, P)."""

@@ -63,13 +63,13 @@ def _newton_step(
     longest = np.abs(dz).max(1)
     dz *= np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))[:, None]
     new = _split(problem, z + dz * units, trials)
-    there = problem.evaluate(new, state.margin[active], threads)
+    trial = problem.evaluate(new, state.margin[active], threads)
     ordered = np.all(np.diff(new.s, axis=1) * np.sign(trials.s[:, -1:] - trials.s[:, :1]) > 0, axis=1) | (not problem.local)
-    exists = usable & ordered & there.is_there & np.all(np.sign(there.transmission) == sign[active][:, None], axis=1)
-    merit = np.where(exists, merit_of(there, u, weight), np.inf)
+    exists = usable & ordered & trial.is_there & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
+    merit = np.where(exists, merit_of(trial, u, weight), np.inf)
     better = merit < state.merit[active]
     taken, kept = active[better], active[~better]
-    state.accept(problem, taken, new.take(better), there.take(better), merit[better])
+    state.accept(problem, taken, new.take(better), trial.take(better), merit[better])
     promised = np.abs(np.einsum("mk,mk->m", g, dz))
     small = promised <= CONVERGED * state.merit[active] + ROUNDING * problem.scale**2
     shift[taken] = np.maximum(0.1 * shift[taken], LEAST_SHIFT)

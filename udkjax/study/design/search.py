@@ -126,12 +126,12 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     def worth(r: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < before
 
-    there = problem.evaluate(new, state.margin[active], threads, worth)
-    exists = there.is_there & np.all(np.sign(there.transmission) == sign[active][:, None], axis=1)
-    merits = np.where(exists, merit_of(there, u, weight), np.inf)
+    trial = problem.evaluate(new, state.margin[active], threads, worth)
+    exists = trial.is_there & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
+    merits = np.where(exists, merit_of(trial, u, weight), np.inf)
     better, fall = merits < before, before - merits
     taken, kept = active[better], active[~better]
-    state.accept(problem, taken, new.take(better), there.take(better), merits[better])
+    state.accept(problem, taken, new.take(better), trial.take(better), merits[better])
     slow = fall[better] < PRESSED * before[better]
     settled = fall[better] < SETTLED * before[better]
     settled[slow] |= goes_on(problem, state, taken[slow])
@@ -167,10 +167,10 @@ def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | 
 
 def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
     """Trials that go no farther have settled, unless a limit is still exceeded or pressed on in vain: multipliers change then."""
-    again = done[goes_on(problem, state, done)]
+    restarted = done[goes_on(problem, state, done)]
     state.settled[done] = True
-    harden(problem, state, again)
-    state.damping[again] = np.minimum(state.damping[again], FIRST_DAMPING)
+    harden(problem, state, restarted)
+    state.damping[restarted] = np.minimum(state.damping[restarted], FIRST_DAMPING)
 
 
 def goes_on(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:

@@ -96,10 +96,10 @@ def _verify(
 
 def _what_is_exceeded(problem: DesignProblem, state: SearchState) -> str:
     """Return which limit keeps the trial nearest to all of them away."""
-    there = np.flatnonzero(state.found.is_there)
-    if not len(there):
+    present = np.flatnonzero(state.found.is_there)
+    if not len(present):
         return "no trial has all positions of the goal in one motion: widen the bounds, or give more starts"
-    nearest = there[np.argmin(state.excess(problem, there))]
+    nearest = present[np.argmin(state.excess(problem, present))]
     names = problem.lengths.names
     worst = int(np.argmax(state.found.limits[nearest]))
     what = names[worst] if worst < len(names) else "the least transmission"

@@ -116,7 +116,7 @@ def _root(positions: RankedPositions, path: list, way: np.ndarray, sigma: np.nda
         root = float(np.asarray(brentq(lambda s: float(smooth(s)), low, high, xtol=1e-14)))  # noqa: B023
         q = BarycentricInterpolator(way[near], np.array([c.q for c in path[near]]))(root)
         t = float(BarycentricInterpolator(way[near], np.array([c.t for c in path[near]]))(root))
-        there = positions.at(t, np.asarray(q))
-        if there.rank < rank and np.max(np.abs(positions.rows.residual(t, there.q))) < positions.rank_tol:
-            return RankChange(t, there.q.reshape(-1, 3), there.rank, abs(root), root > 0)
+        position = positions.at(t, np.asarray(q))
+        if position.rank < rank and np.max(np.abs(positions.rows.residual(t, position.q))) < positions.rank_tol:
+            return RankChange(t, position.q.reshape(-1, 3), position.rank, abs(root), root > 0)
     return None

@@ -63,13 +63,13 @@ def diagnose(
     q = np.asarray(closure.state.q, float)
     rows = KinematicRows(mechanism)
     positions = RankedPositions(rows, rank_tol)
-    here = positions.at(float(t), q.ravel())
-    around = positions.around(here)
-    ordinary = max([here.rank, *(c.rank for c in around)])
-    usual = [c for c in [here, *around] if c.rank == ordinary]
+    current = positions.at(float(t), q.ravel())
+    neighbours = positions.around(current)
+    ordinary = max([current.rank, *(c.rank for c in neighbours)])
+    usual = [c for c in [current, *neighbours] if c.rank == ordinary]
     owners = [name for name, _ in rows.names]
-    permanent, momentary = _dependencies(mechanism, here, usual, owners)
-    if not around and here.right.size:  # it moves to first order only, which is what these rows leave undecided
+    permanent, momentary = _dependencies(mechanism, current, usual, owners)
+    if not neighbours and current.right.size:  # it moves to first order only, which is what these rows leave undecided
         permanent, momentary = [], [*permanent, *momentary]
     found = _with_fixes(mechanism, positions, usual if fixes else [], permanent)
     found += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
@@ -80,17 +80,17 @@ def diagnose(
         q=q,
         coordinates=rows.size,
         rows=rows.count,
-        rank=here.rank,
+        rank=current.rank,
         ordinary_rank=ordinary,
-        joint_rank=decompose(here.J[of_joints], rank_tol)[3],
+        joint_rank=decompose(current.J[of_joints], rank_tol)[3],
         joint_rows=len(of_joints),
-        can_move=bool(around),
+        can_move=bool(neighbours),
         redundancies=tuple(found),
         cure=_cure(mechanism, positions, usual, found) if fixes else (),
-        branches=tuple(branches(mechanism, positions, here)),
-        forces=_forces(mechanism, here, owners),
-        singular_values=here.sigma,
-        clearance=clearance(positions, here, ordinary, walk),
+        branches=tuple(branches(mechanism, positions, current)),
+        forces=_forces(mechanism, current, owners),
+        singular_values=current.sigma,
+        clearance=clearance(positions, current, ordinary, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
     )
 
@@ -136,9 +136,9 @@ def _cure(
         done.append(best)
         current = best.mechanism
         rows = KinematicRows(current)
-        here = RankedPositions(rows, positions.rank_tol)
-        at, owners = [here.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
-        sets = _with_fixes(current, here, at, _dependencies(current, at[0], at, owners)[0])
+        ranked = RankedPositions(rows, positions.rank_tol)
+        at, owners = [ranked.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
+        sets = _with_fixes(current, ranked, at, _dependencies(current, at[0], at, owners)[0])
     return tuple(done)
 
 

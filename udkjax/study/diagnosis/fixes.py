@@ -164,12 +164,12 @@ def _effect(
 def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
     """Return True if the changed mechanism is closed in all positions, has the same mobility there, and fewer redundant rows."""
     positions = RankedPositions(KinematicRows(after), rank_tol)
-    seen = [positions.at(position.t, position.q) for position in at]
+    ranked = [positions.at(position.t, position.q) for position in at]
     closed = all(
         np.max(np.abs(positions.rows.residual(c.t, c.q)), initial=0.0) < rank_tol * max(1.0, positions.rows.scales.size(c.q, np))
-        for c in seen
+        for c in ranked
     )
     alike = all(
-        c.rank == position.rank and c.redundancy == position.redundancy - removes for c, position in zip(seen, at, strict=True)
+        c.rank == position.rank and c.redundancy == position.redundancy - removes for c, position in zip(ranked, at, strict=True)
     )
     return closed and alike

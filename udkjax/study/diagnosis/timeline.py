@@ -133,8 +133,8 @@ def _renew(
     later = np.linspace(low, high, 2 * PARTS_OF_INTERVAL + 1)
     times = np.unique(np.append(ts[first], later))
     state = State(solution.q[first], solution.v[first])
-    again = simulate(mechanism, times, state, rtol=RENEWED_TOL, atol=RENEWED_TOL, throw=False)
-    q, v = (np.asarray(x).reshape(len(times), -1) for x in (again.q, again.v))
+    renewed = simulate(mechanism, times, state, rtol=RENEWED_TOL, atol=RENEWED_TOL, throw=False)
+    q, v = (np.asarray(x).reshape(len(times), -1) for x in (renewed.q, renewed.v))
     return _Path(mechanism, analysis, times, q, v) if np.all(np.isfinite(q)) else None
 
 

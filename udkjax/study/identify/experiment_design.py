@@ -173,11 +173,11 @@ def _candidate(given: Candidate | Mapping[str, ArrayLike] | Start | State, k: in
 
 
 def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.ndarray:
-    asked = names if of is None else [of] if isinstance(of, str) else of
-    problems = [f"of: {name} is not among the parameters{suggestion(name, names)}" for name in asked if name not in names]
-    if problems or not asked:
+    wanted = names if of is None else [of] if isinstance(of, str) else of
+    problems = [f"of: {name} is not among the parameters{suggestion(name, names)}" for name in wanted if name not in names]
+    if problems or not wanted:
         raise IdentificationError(problems or ["of: names no parameter"])
-    return np.array([names.index(name) for name in asked])
+    return np.array([names.index(name) for name in wanted])
 
 
 def _information_of_records(problem: FitProblem, tol: Tolerances) -> list[np.ndarray]:

@@ -231,8 +231,8 @@ def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) 
     together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))
     parts = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
     r, code = np.concatenate([part.r for part in parts]), np.concatenate([part.code for part in parts])
-    seen = r[:, :rows] * problem.sigma + problem.y[problem.present]
-    return np.where((code == Result.successful)[:, None], seen, np.nan)
+    values = r[:, :rows] * problem.sigma + problem.y[problem.present]
+    return np.where((code == Result.successful)[:, None], values, np.nan)
 
 
 def _places(
@@ -271,8 +271,8 @@ def _sentence(check: GradientCheck, d: int, s: int) -> str:
         place, times = check.places[d][s], check.ratio[d, s]
         of = f" of {check.labels[s]}" if len(check.series) > 1 else ""
         values = f"the derivative is {place.derivative:.6g}, by differences {place.difference:.6g}"
-        apart = f": {times:.2g} times as far apart as errors of both explain" if np.isfinite(times) else ""
-        return f"at t = {place.time:.6g} s{of} {values}{apart}"
+        remark = f": {times:.2g} times as far apart as errors of both explain" if np.isfinite(times) else ""
+        return f"at t = {place.time:.6g} s{of} {values}{remark}"
     if floor > size:
         return f"the derivative is below {floor:.1g} {check.units[s]}".rstrip() + ", which is all that differences tell of it"
     if floor > USEFUL_PRECISION * size:

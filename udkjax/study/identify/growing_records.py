@@ -118,8 +118,8 @@ def noise_of_records(problem: FitProblem) -> Float[np.ndarray, "R"]:
         k, _, c = problem.index[places[0]]
         if not problem.noise_given[places[0]]:
             scale = problem.channel_scale[c]
-            seen = noise_of_differences(problem.ts[k, problem.index[places, 1]], problem.y[k, problem.index[places, 1], c])
-            found[places] = np.clip(seen, LEAST_USED_NOISE * scale, scale) if np.isfinite(seen) else scale
+            noise = noise_of_differences(problem.ts[k, problem.index[places, 1]], problem.y[k, problem.index[places, 1], c])
+            found[places] = np.clip(noise, LEAST_USED_NOISE * scale, scale) if np.isfinite(noise) else scale
     return found
 
 

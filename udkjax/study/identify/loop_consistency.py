@@ -127,10 +127,10 @@ class RedundantLoops:
 
     def __init__(self, mechanism: Mechanism, changed: Callable[[np.ndarray], Mechanism], x: np.ndarray, steps: np.ndarray):
         self._rows = lambda change: kinematic_rows(changed(change))
-        here = changed(np.zeros(len(x)))
-        self.x, rows = x, kinematic_rows(here)
+        original = changed(np.zeros(len(x)))
+        self.x, rows = x, kinematic_rows(original)
         with np.errstate(all="ignore"):
-            found = sample_positions(rows, np.asarray(here.q0, float).ravel())
+            found = sample_positions(rows, np.asarray(original.q0, float).ravel())
         self.redundant = rows.count - found[0].rank if found else 0
         if not self.redundant:
             return
@@ -138,7 +138,7 @@ class RedundantLoops:
         self._positions = [p for p in found if p.smallest > ORDINARY_TOL] or found
         self._names = [name for name, _ in rows.names]
         self._redundant_rows = list(choose_redundant_rows(rows, found))
-        self._measure(rows, steps, _length(here))
+        self._measure(rows, steps, _length(original))
 
     def _measure(self, rows: PositionRows, steps: np.ndarray, length_scale: float):
         """Differentiate Psi by each parameter, and project on what no motion makes up for."""
@@ -259,8 +259,8 @@ class RedundantLoops:
 
 def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
     """Return how parameters with the values x have to move together, where u are their changes."""
-    there = np.flatnonzero(u).tolist()
-    names, x, u = [names[i] for i in there], x[there], u[there]
+    nonzero = np.flatnonzero(u).tolist()
+    names, x, u = [names[i] for i in nonzero], x[nonzero], u[nonzero]
     same = np.allclose(u, u[0], rtol=SAME_CHANGE)
     if same and np.allclose(x, x[0], rtol=SAME_VALUE):
         return " = ".join(names)

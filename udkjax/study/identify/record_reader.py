@@ -141,10 +141,10 @@ class _TableReader:
         """Note times that are missing or do not increase."""
         missing = np.isnan(times[places])
         self.add_each(time, places[missing], lambda k: "is empty")
-        there = places[~missing]
-        late = np.flatnonzero(np.diff(times[there]) <= 0) + 1
-        before = dict(zip(there[1:], times[there[:-1]], strict=True)) if len(there) else {}
-        self.add_each(time, there[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
+        present = places[~missing]
+        late = np.flatnonzero(np.diff(times[present]) <= 0) + 1
+        before = dict(zip(present[1:], times[present[:-1]], strict=True)) if len(present) else {}
+        self.add_each(time, present[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
 
     def record(
         self, label: str, places: np.ndarray, times: np.ndarray, values: dict[Key, np.ndarray], noise: dict[Key, np.ndarray]

@@ -280,20 +280,20 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
 
 def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
     """Word a direction of z: as a common factor where it is one, else with one percent of the unknown that changes most."""
-    there = np.flatnonzero(coefficients).tolist()
-    x, change = (np.asarray(a, float)[there] for a in (values.x, values.dx_dz))
-    change = change * coefficients[there]
-    names, kinds = [values.names[k] for k in there], [values.kinds[k] for k in there]
+    nonzero = np.flatnonzero(coefficients).tolist()
+    x, change = (np.asarray(a, float)[nonzero] for a in (values.x, values.dx_dz))
+    change = change * coefficients[nonzero]
+    names, kinds = [values.names[k] for k in nonzero], [values.kinds[k] for k in nonzero]
     relative = np.array([kind != "free" and value != 0.0 for kind, value in zip(kinds, x, strict=True)])
     factors = np.where(relative, change / np.where(relative, x, 1.0), 0.0)
-    if len(there) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON_FACTOR_TOL):
+    if len(nonzero) > 1 and relative.all() and np.all(np.abs(factors / factors[0] - 1.0) < COMMON_FACTOR_TOL):
         text = f"{join_names(names)} by a common factor"
     else:
-        reference = factors if relative.any() else coefficients[there]
+        reference = factors if relative.any() else coefficients[nonzero]
         unit = 0.01 / reference[np.argmax(np.abs(reference))]
         parts = [
             f"{name} {100 * unit * f:+.3g} %" if percent else f"{name} {unit * dx:+.3g} {values.units[k]}".rstrip()
-            for name, percent, f, dx, k in zip(names, relative, factors, change, there, strict=True)
+            for name, percent, f, dx, k in zip(names, relative, factors, change, nonzero, strict=True)
         ]
         text = parts[0] + (f" with {join_names(parts[1:])}" if len(parts) > 1 else "")
-    return Direction(tuple(names), coefficients[there] / np.abs(coefficients).max(), text)
+    return Direction(tuple(names), coefficients[nonzero] / np.abs(coefficients).max(), text)

@@ -214,8 +214,8 @@ class _GridReader:
         kind = given.get("type")
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
         if kind not in DESIGNS:
-            there = f"must be one of {', '.join(map(quote, DESIGNS))}"
-            return self.wrong("design.type", f"{there}, is {abbreviate(kind)}{suggestion(kind, DESIGNS)}")
+            cure = f"must be one of {', '.join(map(quote, DESIGNS))}"
+            return self.wrong("design.type", f"{cure}, is {abbreviate(kind)}{suggestion(kind, DESIGNS)}")
         return None if members is None or seed is None else DESIGNS[kind](members, seed)
 
     # --- single values

@@ -67,15 +67,15 @@ def certify(system: System, u: np.ndarray, exact: System | None = None) -> Certi
     F, _ = system(Ball.of(m))
     found = _prove(system, m, inverse, F)
     step = np.max(_product(inverse, F) / np.maximum(np.abs(m).astype(float), 1.0), axis=0)
-    again = np.flatnonzero(~found.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
-    if exact is None or not len(again):
+    uncertain = np.flatnonzero(~found.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
+    if exact is None or not len(uncertain):
         return found
-    m, inverse = m[:, again], inverse[again]
+    m, inverse = m[:, uncertain], inverse[uncertain]
     for _ in range(EXACT_STEPS):
         m = m - np.einsum("mij,jm->im", inverse, _evaluate(exact, m).mid)
     second = _prove(system, m, inverse, _evaluate(exact, m))
     for old, new in zip(found, second, strict=True):
-        old[..., again] = new
+        old[..., uncertain] = new
     return found
 
 

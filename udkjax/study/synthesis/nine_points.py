@@ -146,12 +146,12 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
 
     every = np.arange(start.shape[1])
     z, status = take(every, FIRST, BENDS[0])
-    again = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
-    if len(again):
-        z[:, again], status[again] = take(again, CLOSE, BENDS[0])
+    unsettled = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
+    if len(unsettled):
+        z[:, unsettled], status[unsettled] = take(unsettled, CLOSE, BENDS[0])
     known = _merged(z[:, status == ACCEPTED])
     for bend in BENDS[1:]:
-        if known.shape[1] == CLASSES or not len(again):
+        if known.shape[1] == CLASSES or not len(unsettled):
             break
         more, found = take(every, CLOSE, bend)
         before, known = known.shape[1], _merged(known, more[:, found == ACCEPTED])
