@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from jax import lax
 
+from udkjax.expressions.deferred import deferred
+
 
 @jax.custom_jvp
 def _doubled(x):
@@ -43,6 +45,7 @@ FUNCTIONS = {
     "clip": lambda x, y: jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y) - jnp.minimum(x, 0.0),
     "mean": lambda x, y: jnp.mean(x) + jnp.var(y),
     "nested jit": lambda x, y: jax.jit(lambda a: jax.jit(jnp.sin)(a) * a)(x) + y,
+    "deferred": lambda x, y: deferred(lambda a: deferred(jnp.cos)(a) * a)(x) + y,
     "custom_jvp": lambda x, y: _doubled(x) + jax.nn.relu(y) + jax.nn.silu(x),
     "checkpoint": lambda x, y: jax.checkpoint(lambda a: jnp.sin(a) * y)(x),
     "derivative": lambda x, y: jax.jacfwd(lambda a: jnp.sin(a) * y[0])(x),

@@ -21,7 +21,7 @@ class StudioPage:
         page.on("console", lambda m: self.problems.append(m.text) if m.type in ("error", "warning") else None)
         page.on("request", lambda request: self.requests.append(request.url))
         page.goto(address, timeout=1e3 * PATIENCE)
-        self.until("window.studio !== undefined")
+        self.until("window.studio?.sync !== undefined")  # before, it is the element of that name
         self.settle()
 
     def js(self, code):

@@ -26,6 +26,7 @@ _INLINED = (
     "pjit",
     "closed_call",
     "core_call",
+    "deferred_program",
     "custom_jvp_call",
     "custom_vjp_call",
     "custom_vjp_call_jaxpr",
