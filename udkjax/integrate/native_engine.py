@@ -108,7 +108,7 @@ def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
 
 
 def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Tell which numbers are active."""
+    """Return a mask of the active numbers."""
     return problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
 
 
@@ -222,7 +222,7 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
 
 
 def formulation_settings(equations: AbstractSystem) -> dict[str, Any]:
-    """Return what the machine code of a formulation is told; nothing without one."""
+    """Return the settings of the machine code of a formulation; nothing without one."""
     if not isinstance(equations, FormulatedSystem):
         return {}
     inner: Any = equations.equations

@@ -46,14 +46,14 @@ class Conditions:
     number_count: int = field(compare=False)
 
     def output_count(self, n: int) -> int:
-        """Return how many numbers a run of n coordinates tells of its end."""
+        """Return the count of numbers that a run of n coordinates returns about its end."""
         return HEAD + self.count + 2 * n
 
 
 def watch_inputs(
     xp: ModuleType, numbers: Sequence[Any], sides: Any, watched: Any, floors: Any, directions: Any, rate: Any
 ) -> Any:
-    """Return what a run is given besides.
+    """Return the further inputs of a run.
 
     Args:
         xp: jax.numpy or NumPy.

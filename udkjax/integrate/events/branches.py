@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def branch(index: Int[Array, ""], functions: Sequence[Callable[..., T] | None], *operands: Any) -> T:
-    """Return what one of some functions returns for operands, from which alone it takes what is traced. None: any value.
+    """Return the result of one of some functions, which take traced numbers from the operands alone. None: any value.
 
     It has no derivatives.
     """

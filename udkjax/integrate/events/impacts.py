@@ -126,7 +126,7 @@ def impulses_of_impact(
 def contact_states(
     hybrid: Hybrid, k: Int[Array, ""], held: Bool[Array, "E"], values: ConditionValues, W: Float[Array, "E E"]
 ) -> Int[Array, "E"]:
-    """Tell which contacts take part in event k, and which of them are too slow to rebound.
+    """Return the state of each contact in event k: OPEN where it takes no part, TOUCHES, or SLOW where it is too slow to rebound.
 
     Those take part that are closed, do not separate and, where the event is of a contact, act on it, or on one that does. A
     contact is slow whose g_dot is small while it is pressed on.
@@ -194,7 +194,7 @@ def hit_contacts(
 
 
 def _depends(W: Float[Array, "E E"], on: Bool[Array, "E"]) -> Bool[Array, "E"]:
-    """Tell which rows depend on some of the others, which do not depend on one another."""
+    """Return a mask of the rows that depend on some of the others, which do not depend on one another."""
     both = on & on[:, None]
     parts = jnp.where(on[:, None], W, 0.0)
     rest = jnp.diagonal(W) - jnp.sum(parts * jnp.linalg.solve(jnp.where(both, W, jnp.eye(len(W))), parts), 0)

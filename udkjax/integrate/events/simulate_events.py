@@ -87,7 +87,7 @@ def simulate_events(
 
 
 def _run_at_once(mechanism: Mechanism, analysis: Analysis, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
-    """Return what `_run` does, where machine code alone finds it: of known numbers, and of events that change nothing."""
+    """Return the result of `_run` by machine code alone: of known numbers, and of events that change nothing."""
     if not mechanism.is_concrete or is_traced(given) or is_within_jit() or jax.config.jax_disable_jit:
         return None
     compiled = compile_known(mechanism, analysis, *given.choices.of_mechanism)

@@ -35,7 +35,7 @@ class SweepResult(NamedTuple):
 
 
 def can_sweep(hybrid: Hybrid) -> Bool[np.ndarray, "phases"]:
-    """Tell in which phases there are sweeps."""
+    """Return a mask of the phases with sweeps."""
     free = np.isin(np.arange(len(hybrid.plans)), hybrid.contact_free_phases)
     native = np.array([plan.is_native for plan in hybrid.plans])
     return free & native & (hybrid.watched is not None)

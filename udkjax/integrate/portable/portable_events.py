@@ -43,7 +43,7 @@ class PortableEvents:
         self._programs = programs
 
     def data(self, analysis: Analysis) -> dict[str, Any] | None:
-        """Return what a page knows of the events; None where there are none."""
+        """Return the events as data of a page; None where there are none."""
         if not self._events:
             return None
         return {
