@@ -192,11 +192,11 @@ class PrintsTable(eqx.Module):
     _units: ClassVar[Mapping[str, str]] = units()  # of its fields
 
     def _table(self) -> PrintedTable:
-        """Return the table to print. By default a row for each field."""
+        """Return what is printed. By default a row for each field."""
         return fields_table(self, self._units)
 
     def _shapes(self) -> PrintedTable:
-        """Return the table to print if numbers cannot be read, as while they are traced."""
+        """Return what is printed where numbers cannot be read, as while they are traced."""
         return fields_table(self, self._units)
 
     def __repr__(self) -> str:

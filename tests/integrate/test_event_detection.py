@@ -13,8 +13,8 @@ import pytest
 from scipy.optimize import brentq
 
 import udkjax as udk
-from udkjax.integrate import native_engine
 from udkjax.integrate.events import simulate_events
+from udkjax.integrate.events.phase_code import PhaseCode
 
 POINT = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 0])}, gravity=[0, 0])  # x = t
 
@@ -104,8 +104,8 @@ def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
 
 def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
     """A pendulum that logs where it passes and where it turns: machine code runs once for each event, and nothing else."""
-    runs, watch = [], native_engine.watch_known
-    monkeypatch.setattr(native_engine, "watch_known", lambda *given: runs.append(0) or watch(*given))
+    runs, run = [], PhaseCode.run
+    monkeypatch.setattr(PhaseCode, "run", lambda *given: runs.append(0) or run(*given))
     monkeypatch.setattr(simulate_events, "_deferred_run", None)
     pendulum = udk.Mechanism(
         {"link": udk.Body(1.0, 0.1, position=(0.5, 0.0))}, {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])}

@@ -18,13 +18,13 @@ def say(text: str) -> None:
 
 
 def refuse(problem: object) -> NoReturn:
-    """Name the mistake in the input, and exit."""
+    """Say what is wrong with the input, and exit."""
     say(str(problem))
     sys.exit(BAD_INPUT)
 
 
 def fail(problem: object) -> NoReturn:
-    """Name the cause of a failed run, and exit."""
+    """Say why a run failed, and exit."""
     say(str(problem))
     sys.exit(BAD_RUN)
 

@@ -26,7 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 WRITTEN_OUT_OPERATIONS = 2800
 
 # The arrays that programs return; all others are scratch.
-RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent".split())
+RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent multipliers".split())
 
 
 class ScenePrograms:
@@ -119,6 +119,11 @@ class ScenePrograms:
         solver = self._solver
         solve = [*solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0), solver.safe]
         return program(solver.acceleration_system, solve)
+
+    @cached_property
+    def multipliers(self) -> LoopProgram:
+        """lambda as multipliers, of all rows; a; safe."""
+        return program(self.accelerations.parts, self._terms.multipliers(0))
 
     @cached_property
     def newton_q(self) -> LoopProgram:

@@ -268,6 +268,17 @@ class SceneTerms:
             key, write, fixed, to=to, **{"start": start} if start else {}, **{"change": added} if added else {}
         )
 
+    def multipliers(self, solution: int) -> Parts:
+        """multipliers: lambda = -x of a linear system, by rows of Psi; zero of those that are left out."""
+        yield Reset("multipliers", 0, self.layout.row_count)
+        for group in self.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                for i, row in enumerate(group.rows):
+                    w.write(-w.read("x", RIGHT, i), "multipliers", ROW, row)
+
+            yield KernelLoop(self.kernel(("multipliers", group.rows), write), group.table, {"x": f"x{solution}"})
+
     # --- derivatives of a linear system, by the implicit rule
 
     def residuals(self, output: str, v: str = "v") -> Parts:

@@ -190,7 +190,7 @@ class NumpyLoops:
 
     @staticmethod
     def _output(part: KernelLoop, address: Address) -> tuple[str, np.ndarray, str]:
-        """Return the places of the results of a loop and their updates: those that share a place are added one by one."""
+        """Return where the results of a loop go, and what they do there: those that share a place are added one by one."""
         places, update = _places(address, part.table), address.update
         return part.array(address.array), places, ADD_ONE_BY_ONE if update == ADD and len(set(places)) < len(places) else update
 

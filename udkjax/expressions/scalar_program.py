@@ -230,7 +230,7 @@ def _evaluate(node: Node, values: list[Value]) -> Value:
 
 
 def _function_of_floats(node: Node) -> Callable:
-    """Return the function that computes a node of Python's floats: chosen once, since many programs run thousands of times."""
+    """Return what computes a node of Python's floats: chosen once, since many programs run thousands of times."""
     if node.kind in _OPERATORS:
         return _OPERATORS[node.kind][0]
     if node.kind == "sqrt":
@@ -245,7 +245,7 @@ def _function_of_floats(node: Node) -> Callable:
 
 
 def _function_of_arrays(node: Node) -> Callable:
-    """Return the function that computes a node of NumPy's arrays, or of floats, as constants are."""
+    """Return what computes a node of NumPy's arrays, or of floats, as constants are."""
     if node.kind in _OPERATORS:
         return _OPERATORS[node.kind][0]
     if node.kind == "sqrt":

@@ -17,10 +17,8 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.native.conditions import HEAD, Conditions
 from udkjax.native.formulations import formulation_tol
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
 from udkjax.native.operations import MarkRows, RunStates
@@ -36,7 +34,7 @@ def packed(problem: Problem) -> tuple[RunStates, list[np.ndarray]]:
     """Return the operation of a problem whose numbers are all known, and its inputs."""
     operation = problem.compiled.plan.operation
     assert operation is not None  # checked by the caller
-    return operation, _inputs(problem, operation, np)
+    return operation, run_inputs(problem, operation, np)
 
 
 def integrate_known(problem: Problem) -> IntegratorOutput:
@@ -48,50 +46,15 @@ def integrate_known(problem: Problem) -> IntegratorOutput:
 def integrate(problem: Problem) -> IntegratorOutput:
     """Integrate one problem; under vmap, as many as there are, in lanes."""
     operation = _operation(problem)
-    return _output(native_p.bind(*_inputs(problem, operation), operation=operation, times=len(problem.ts)))
+    return _output(native_p.bind(*run_inputs(problem, operation), operation=operation, times=len(problem.ts)))
 
 
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, Array]:
     """Integrate a problem by the code that `vjp` takes: no other is compiled. Return the record that it walks back from, too."""
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
     none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
-    found = native_p.bind(*_inputs(problem, operation), *none, operation=operation, times=times)
+    found = native_p.bind(*run_inputs(problem, operation), *none, operation=operation, times=times)
     return _output(found[: len(OUTPUTS)]), found[-1][0]
-
-
-class WatchedRun(NamedTuple):
-    """A run up to the first crossing of conditions, or to where one cannot be ruled out."""
-
-    output: IntegratorOutput
-    event: Any  # the condition that crosses; -1: none
-    t: Any  # the time up to which it is certain that nothing else happens (s)
-    q: Any  # the state there
-    v: Any
-    violation: Any  # the largest on the way
-    sides: Any  # of zero: of what crosses that before
-
-
-def watch(problem: Problem, conditions: Conditions, given: Any) -> WatchedRun:
-    """Integrate a problem up to the first crossing of conditions; `given` is what `watch_inputs` returns."""
-    operation = _operation(problem).watching(conditions)
-    inputs = [*_inputs(problem, operation), stop_gradients(given)[None]]
-    *found, crossing = native_p.bind(*inputs, operation=operation, times=len(problem.ts))
-    return _watched(found, crossing[0], conditions, len(problem.q))
-
-
-def watch_known(problem: Problem, conditions: Conditions, given: np.ndarray) -> WatchedRun:
-    """Do the same with numbers that are all known, without tracing anything."""
-    operation = _operation(problem).watching(conditions)
-    inputs = [*_inputs(problem, operation, np), given[None]]
-    *found, crossing = call_known(operation, inputs, len(problem.ts))
-    return _watched(found, crossing[0], conditions, len(problem.q))
-
-
-def _watched(found: Sequence[Any], crossing: Any, conditions: Conditions, n: int) -> WatchedRun:
-    event, t, violation = (crossing[k] for k in range(HEAD))
-    sides = crossing[HEAD : HEAD + conditions.count].astype(int)
-    q, v = crossing[-2 * n : -n], crossing[-n:]
-    return WatchedRun(_output(found), event.astype(int), t, q, v, violation, sides)
 
 
 def serves_derivatives(active: Problem) -> bool:
@@ -108,7 +71,7 @@ def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
 
 
 def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Return a mask of the active numbers."""
+    """Tell which numbers are active."""
     return problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
 
 
@@ -134,7 +97,7 @@ def _integrate_along(
         directions += [tangents, *(np.zeros(n) if dx is None else dx for dx in (change.q, change.v))]
         samples += [problem.compiled.samples.changes(change.textbook.mechanism)] if operation.sampled else []
     *found, dys, dend = native_p.bind(
-        *_inputs(problem, operation),
+        *run_inputs(problem, operation),
         *(x[None, None] for x in (*samples, *directions)),
         operation=operation,
         times=len(problem.ts),
@@ -150,7 +113,7 @@ def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: A
     operation, (states, record) = _operation(problem, active, reverse=True), run
     states = states or [np.zeros((len(problem.ts), len(problem.q)))] * 2
     given = [x[None] for x in (record, *states, ys, end)]
-    found = native_p.bind(*_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
+    found = native_p.bind(*run_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
     numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
     mechanism, baumgarte, _ = cotangent_tree(numbersbar[0], _numbers_of(problem), _active_of(problem, active))
@@ -174,7 +137,7 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
     return run.with_cotangents(which, problem.points or STORED + PER_BREAKPOINT * (0 if breaks is None else len(breaks)))
 
 
-def _inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
+def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
     """Return the arrays that machine code takes, for one member."""
     compiled = problem.compiled
     scene = _known_scene_inputs(compiled) if xp is np else _scene_inputs(compiled, operation.code.policy)
@@ -222,7 +185,7 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
 
 
 def formulation_settings(equations: AbstractSystem) -> dict[str, Any]:
-    """Return the settings of the machine code of a formulation; nothing without one."""
+    """Return what the machine code of a formulation is told; nothing without one."""
     if not isinstance(equations, FormulatedSystem):
         return {}
     inner: Any = equations.equations

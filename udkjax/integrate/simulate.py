@@ -1,7 +1,6 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
 import warnings
-from collections import Counter
 from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,6 +28,7 @@ from udkjax.integrate.outcome import FinishedRun, counts, outcome
 from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, prepare_run
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
+from udkjax.integrate.put import put_arrays
 from udkjax.integrate.solution import SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
@@ -161,7 +161,7 @@ def simulate(
         from udkjax.integrate.events.simulate_events import simulate_events  # a dozen modules that other runs do without
 
         assert analysis is not None  # a mechanism has one
-        solution = simulate_events(mechanism, events, analysis, number(ts), state, closure, choices.arrays(), max_events)
+        solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
         if not _has_failed(solution) or not is_known or int(solution.stats["events"]):
             return _required(solution, throw)  # events may have changed what moved
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
@@ -239,7 +239,7 @@ _compiled, _deferred = eqx.filter_jit(_simulate), deferred(_simulate)
 def _finish(
     run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
 ) -> tuple[Solution, Any, Any]:
-    """Return the result of `_run`, from that of the integrator."""
+    """Return what `_run` does, from what the integrator found."""
     problem, ts = run.problem, run.ts
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, problem.q), xp.where(later, raw.v, problem.v)
@@ -249,7 +249,7 @@ def _finish(
     stats = counts(raw, problem.compiled.plan.projected, len(ts), xp)
     rtol, atol = xp.asarray(choices.rtol, float), xp.asarray(choices.atol, float)
     if xp is np:
-        ts, q, v, code, time, stats, rtol, atol = _put((ts, q, v, code, time, stats, rtol, atol))
+        ts, q, v, code, time, stats, rtol, atol = put_arrays((ts, q, v, code, time, stats, rtol, atol))
     names = choices.settings(problem.compiled.plan.why_not_native)
     solution = make_module(
         Solution,
@@ -267,20 +267,6 @@ def _finish(
         found_cause=None,
     )
     return solution, run.has_missed_rows, (raw.t, raw.y)
-
-
-_put_together = jax.jit(lambda *arrays: arrays)
-_WORTH_A_PROGRAM = 60  # calls: putting arrays one by one takes 0.3 ms longer than by a program, which takes 15 ms to compile
-_calls: Counter[tuple[int, ...]] = Counter()  # by shape of the positions
-
-
-def _put(arrays: Any) -> Any:
-    """Return arrays of NumPy, and numbers, as those of JAX."""
-    leaves, tree = jax.tree.flatten(arrays)
-    _calls[shape := np.shape(arrays[1])] += 1
-    if _calls[shape] <= _WORTH_A_PROGRAM:
-        return jax.device_put(arrays)
-    return jax.tree.unflatten(tree, _put_together(*leaves))
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:

@@ -1,9 +1,9 @@
 """Conditions that a run watches (watching.py): their program, what a run is given besides, and how finely it looks at them."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass, field
-from types import ModuleType
-from typing import Any
+
+import numpy as np
 
 from udkjax.expressions import ScalarProgram
 
@@ -33,36 +33,49 @@ LEAST_STEP = 10  # times the smallest, to a crossing: the next may be a fifth as
 WANTED, UNDER_WAY = 1, 2  # the states of a landing: from the point before the crossing a step is to be taken, or is being taken
 SHORTEST_SPAN = 100  # times the smallest step: shorter ones are not told from one another
 VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is not resolved, or not a number
+FORCE_STEP = 1e-7  # T: over which the rate of a contact force is its difference
 HEAD = 3  # numbers of what is told of a run before its sides: the event, or -1; the time; the largest violation at a node
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """The program of all conditions: g and their rates, of t, q, v, a and numbers of their own. Equal where `key` is."""
+    """Conditions g(t, q, v), and contact forces, that a run watches; equal where `key` and `rows` are.
+
+    Attributes:
+        key: texts of the programs.
+        program: g and their rates, of t, q, v, a and numbers of their own.
+        at_state: g, rates, second rates, and the derivatives of all g by t, by q and by v, of the same.
+        number_count: of numbers of their own.
+        by_velocity: mask of the conditions that depend on velocities; they have no second rates.
+        rows: of Psi, whose multipliers, with the other sign, are watched behind the conditions.
+    """
 
     key: Hashable
     program: ScalarProgram = field(compare=False)
-    count: int = field(compare=False)
+    at_state: ScalarProgram = field(compare=False)
     number_count: int = field(compare=False)
+    by_velocity: tuple[bool, ...] = field(compare=False)
+    rows: tuple[int, ...] = ()
+
+    @property
+    def own_count(self) -> int:
+        """The number of conditions that are programs."""
+        return len(self.program.outputs) // 2
+
+    @property
+    def count(self) -> int:
+        """The number of all that is watched."""
+        return self.own_count + len(self.rows)
+
+    @property
+    def slopes(self) -> ScalarProgram:
+        """The program of each condition, with its derivatives by t, q and v behind it, of t, q, v and numbers of their own."""
+        program, E = self.at_state, self.own_count
+        n = (len(program.inputs) - 1 - self.number_count) // 3
+        g, _, by_t, by_q, by_v = np.split(np.array(program.outputs, object), np.cumsum([E, 2 * E, E, E * n]))
+        outputs = np.concatenate([g[:, None], by_t[:, None], by_q.reshape(E, n), by_v.reshape(E, n)], axis=1)
+        return ScalarProgram(program.graph, [*program.inputs[: 1 + 2 * n], *program.inputs[1 + 3 * n :]], list(outputs.flat))
 
     def output_count(self, n: int) -> int:
-        """Return the count of numbers that a run of n coordinates returns about its end."""
+        """Return how many numbers a run of n coordinates tells of its end."""
         return HEAD + self.count + 2 * n
-
-
-def watch_inputs(
-    xp: ModuleType, numbers: Sequence[Any], sides: Any, watched: Any, floors: Any, directions: Any, rate: Any
-) -> Any:
-    """Return the further inputs of a run.
-
-    Args:
-        xp: jax.numpy or NumPy.
-        numbers: numbers of the conditions.
-        sides: of zero, 0 where it is not known.
-        watched: whether each condition counts.
-        floors: below which each is zero.
-        directions: directions in which zeros count, 0 for either.
-        rate: rate of the scene (1/s).
-    """
-    parts = (*numbers, sides, watched, floors, directions, xp.reshape(rate, (1,)))
-    return xp.concatenate([xp.ravel(xp.asarray(x, float)) for x in parts])

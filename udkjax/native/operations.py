@@ -16,6 +16,7 @@ from udkjax.native.backpropagation import Reverse
 from udkjax.native.closing import Closing
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
 from udkjax.native.conditions import Conditions
+from udkjax.native.event_states import EventStates
 from udkjax.native.formulations import FormulationCode
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, Plan
 from udkjax.native.marching import Marching
@@ -107,7 +108,7 @@ class RunStates(Operation):
         return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
 
     def plan(self, width: int, vector: int) -> Plan:
-        """Return the choices that the module's code depends on."""
+        """Return what the module's code depends on."""
         return Plan(
             code=self.code,
             method=self.method.method,
@@ -311,6 +312,24 @@ class FindTangentPart(StateOperation):
     """Find the part of small changes of states within the constraint manifold."""
 
     function = StateTangentPart
+
+
+@dataclass(frozen=True)
+class EvaluateEvents(StateOperation):
+    """Find accelerations, conditions and directions of impulses at states."""
+
+    conditions: Conditions | None = None
+    impacts: tuple[int, ...] = ()  # of the conditions: those with directions of impulses
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        assert self.conditions is not None
+        plan = self.pseudoinverse, self.formulation, width, vector
+        return EventStates(self.code, self.conditions, self.impacts, *plan)
+
+    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+        assert self.conditions is not None
+        directions = len(self.impacts) * self.coordinates
+        return [(members, self.coordinates + len(self.conditions.at_state.outputs) + directions)]
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def generate(operation: Operation, width: int, beside: int) -> Module:
 
 @lru_cache(maxsize=256)
 def unsupported(code: ScenePrograms) -> str:
-    """Return the operations of a scene that machine code has no instruction for; empty where there are none.
+    """Return what a scene takes that machine code has no instruction for; empty where there is nothing.
 
     The kernels of its elements are written once each, as loops take them: which operation needs them, in which form, may come to
     be something else than what is compiled, and is much longer.
@@ -156,10 +156,11 @@ def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
-    return jax.device_put(_evaluate(*map(np.asarray, inputs), operation=operation, times=times))
+    return jax.device_put(call_members(*map(np.asarray, inputs), operation=operation, times=times))
 
 
-def _evaluate(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
+def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
+    """Run an operation on numbers that are known, of as many members as there are."""
     return _select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
 
 
@@ -216,4 +217,4 @@ native_p.def_impl(_call)
 native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
 mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
-evaluate_as(native_p, _evaluate)
+evaluate_as(native_p, call_members)

@@ -82,7 +82,7 @@ class Recorded(Differentiated):
         f.line(f"call void @free(ptr {record.name})")
 
     def free_record(self, f: Function, k: Value):
-        """Free the memory of lane k's record."""
+        """Free what lane k took for its record."""
         with f.if_(self._lane(f, "given", k) < 0.5):
             f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
 

@@ -58,13 +58,17 @@ class StateFunction(Trajectory):
                 f.store(state, f.given["work"], i * f.width + self.start(f"state {x}", "work"), f.width)
         setattr(s, "state t", s.start)
         self._evaluate(f, s)
+        self.write_found(f, s)
+        write_run(self)
+        return self.module_text()
+
+    def write_found(self, f: Function, s: Lane):
+        """Write what was found of the members in all lanes to the output."""
         to = f.load(f.given["call"], self.call_fields.index("found"), base=POINTER)
         with f.each(f.width) as k, f.if_(f.lane(s.active, k) > 0.5):
             member = self.to_int(f, f.lane(s.member, k)) * (self.n * len(self.found))
             for j, name in enumerate(self.found):
                 self.copy_lane(f, f.at(to, member), j * self.n, name, k)
-        write_run(self)
-        return self.module_text()
 
     @abstractmethod
     def _evaluate(self, f: Function, s: Lane):
@@ -136,5 +140,5 @@ class StateTangentPart(StateFunction):
         with f.if_(f.any_of(near)):
             s.wanted = f.select(near, f.const(1.0, DOUBLE, f.width), 0.0)
             self.invoke(f, "fallback_tangent_part")
-            for x in self.inputs:
+            for x in ("dq", "dv"):
                 self.copy(f, f"fallback {x}", f"result {x}", near)

@@ -38,9 +38,9 @@ class WatchMemory(Trajectory):
     outputs = ("crossing",)
 
     def __init__(self, plan: Plan, conditions: Conditions):
+        self.conditions = conditions
         super().__init__(plan)
         self.inputs = (*self.inputs, "watch")
-        self.conditions = conditions
         for name in LANE_NUMBERS:
             self.places.add(name)
         self.places.add("condition numbers", conditions.number_count)
@@ -48,7 +48,9 @@ class WatchMemory(Trajectory):
             self.places.add(f"condition {name}", conditions.count)
         for name in ("hit1", "hit2"):
             self.places.add(f"condition {name}", conditions.count)
-        for name in ("sure q", "sure v", "middle q", "middle v", "node a", "before q", "before v", "before a"):
+        if conditions.rows:
+            self.places.add("multipliers", self.m)
+        for name in ("force q", "sure q", "sure v", "middle q", "middle v", "node a", "before q", "before v", "before a"):
             self.places.add(name, self.n)
 
     # --- what goes in and comes out
@@ -127,6 +129,8 @@ class WatchMemory(Trajectory):
         turn = s.turn + TURN
         turn = turn - f.intrinsic("floor", turn)
         span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / PER_TIME) * s.share / f.max(fastest, s.slowest)
+        # No farther than the next step: whoever looks closer at them later needs the points that the first node lies between.
+        span = f.min(span, s.h)
         span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))
         inf = f.const(float("inf"), DOUBLE, f.width)
         goes_on = rest > s.smallest * (4 * UNIT)

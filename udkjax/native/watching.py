@@ -10,8 +10,8 @@ still vary then have a jump or a kink. Where there is one after another, or no n
 """
 
 from udkjax.native.condition_intervals import write_judge
-from udkjax.native.conditions import FIRST, SECOND, THIRD, WANTED
-from udkjax.native.ir import DOUBLE, Function, Value
+from udkjax.native.conditions import FIRST, FORCE_STEP, SECOND, THIRD, WANTED
+from udkjax.native.ir import DOUBLE, INT, Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.locating import write_approach, write_land, write_locate
 from udkjax.native.manifold import project_output
@@ -24,6 +24,7 @@ class Watching(WatchMemory):
     """The code of a trajectory that watches conditions."""
 
     def write_derivatives(self):
+        self._write_conditions()
         self._write_look()
         write_judge(self)
         write_locate(self)
@@ -43,20 +44,56 @@ class Watching(WatchMemory):
     def record_step(self, f: Function, s: Lane, accept: Value):
         s.where(accept & (s.begin > 0.5), fresh=s.t1)
 
-    def _write_look(self):
-        """`look(work)`: the state at the time `look`, projected in lanes that are `due`, and the conditions there."""
+    def program_names(self) -> list[str]:
+        return [*super().program_names(), *(["multipliers"] if self.conditions.rows else [])]
+
+    @property
+    def arrays(self):
+        return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.rows else {})
+
+    def _write_conditions(self):
+        """`conditions(work)`: all that is watched, and its rates, at `state t`, `state q`, `result v` and `node a`."""
         n, conditions, p = self.n, self.conditions, self.places
         inputs = [("work", p["state t"])]
         for name in ("state q", "result v", "node a"):
             inputs += [("work", p[name] + i) for i in range(n)]
         inputs += [("work", p["condition numbers"] + i) for i in range(conditions.number_count)]
-        outputs = [("work", p[f"condition {name}"] + c) for name in ("g", "rate") for c in range(conditions.count)]
-        self.functions.append(write(conditions.program, "conditions", self.plan.width, ("work",), inputs, outputs))
+        outputs = [("work", p[f"condition {name}"] + c) for name in ("g", "rate") for c in range(conditions.own_count)]
+        self.functions.append(write(conditions.program, "own_conditions", self.plan.width, ("work",), inputs, outputs))
+        f, s = self.function("conditions")
+        f.call("own_conditions", f.given["work"])
+        if conditions.rows:
+            self._write_forces(f, s)
+
+    def _write_forces(self, f: Function, s: Lane):
+        """The forces of contacts at rest, no numbers where a pivot is not to be trusted, and their rates, by differences."""
+        self.copy(f, "state q", "force q")
+        self.copy(f, "result v", "state v")
+        step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
+        ahead, nan = self.broadcast(f, step), f.const(float("nan"), DOUBLE, f.width)
+        for name in ("g", "rate"):
+            self.invoke(f, "multipliers")
+            for k, row in enumerate(self.conditions.rows):
+                place, c = f.like(row, INT, 1) + self.places["multipliers"], f.like(self.conditions.own_count + k, INT, 1)
+                force = f.select(s.safe > 0.5, -f.load(f.given["work"], place * f.width, f.width), nan)
+                self.put_condition(f, name, c, force if name == "g" else (force - self.condition(f, "g", c)) / step)
+            if name == "g":
+                setattr(s, "state t", before + step)
+                with f.each(self.rowcount) as r:
+                    q, v, a = (self.vector(f, x, r) for x in ("state q", "state v", "result a"))
+                    self.put(f, "state q", r, f.fma(f.fma(a, ahead * 0.5, v), ahead, q))
+                    self.put(f, "state v", r, f.fma(a, ahead, v))
+        setattr(s, "state t", before)
+        self.copy(f, "force q", "state q")
+
+    def _write_look(self):
+        """`look(work)`: the state at the time `look`, projected in lanes that are `due`, and the conditions there."""
+        program = self.conditions.program
         f, s = self.function("look")
         work, following = f.given["work"], s.next
         s.next = s.look
         f.call("between", work)
-        if any(conditions.program.uses(x) for x in conditions.program.inputs[1 + 2 * n : 1 + 3 * n]):
+        if any(program.uses(x) for x in program.inputs[1 + 2 * self.n : 1 + 3 * self.n]):
             self._accelerate_between(f, s)
         s.next = following
         project_output(self, f, s, "due")

@@ -2,14 +2,17 @@
 
 These are the conditions of the least of x W x / 2 + b x over x >= 0. Lawson and Hanson's active-set method (Solving Least Squares
 Problems, 1974, chapter 23) finds which x are positive, the passive set, in few steps, and never takes rows into it that depend on
-one another; then x is the solution of linear equations, which is what derivatives are those of.
+one another; then x is the solution of linear equations, which is what derivatives are those of. Arrays are of JAX, or of NumPy,
+with any dimensions in front.
 """
 
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Bool, Float
 
 from udkjax.integrate.gradients import stop_gradients
 
@@ -22,20 +25,24 @@ STEPS_PER_ROW = 6  # Lawson and Hanson found half a step for each row; rounding 
 class Complementary(NamedTuple):
     """The solution of a linear complementarity problem."""
 
-    x: Float[Array, "E"]
-    y: Float[Array, "E"]  # W x + b
-    passive: Bool[Array, "E"]  # where x may be positive
+    x: Float[Any, "*m E"]
+    y: Float[Any, "*m E"]  # W x + b
+    passive: Bool[Any, "*m E"]  # where x may be positive
 
 
 class _ActiveSet(NamedTuple):
-    x: Float[Array, "E"]
-    passive: Bool[Array, "E"]
-    steps: Int[Array, ""]
-    done: Bool[Array, ""]
+    x: Any
+    passive: Any
+    steps: Any
+    done: Any
 
 
 def solve_complementarity(
-    W: Float[Array, "E E"], b: Float[Array, "E"], allowed: Bool[Array, "E"], floor: Float[Array, "E"]
+    W: Float[Any, "*m E E"],
+    b: Float[Any, "*m E"],
+    allowed: Bool[Any, "*m E"],
+    floor: Float[Any, "*m E"],
+    xp: ModuleType = jnp,
 ) -> Complementary:
     """Solve 0 <= x, W x + b >= 0, x (W x + b) = 0 by Lawson and Hanson's active-set method.
 
@@ -44,43 +51,63 @@ def solve_complementarity(
         b: y where x is zero.
         allowed: mask of the x that may be positive at all; the others are zero, whatever their y.
         floor: a y above minus that is not negative.
+        xp: jax.numpy, or NumPy.
 
     Returns:
         x and y, with derivatives at the passive set that it has.
     """
-    size = jnp.sqrt(jnp.where(allowed, jnp.diagonal(W), 1.0))
-    unit, known = W / size / size[:, None], b / size
-    passive = _passive_set(*stop_gradients((unit, known, allowed, floor / size)))
-    x = _solve_passive(unit, known, passive) / size
-    return Complementary(x, W @ x + b, passive)
+    size = xp.sqrt(xp.where(allowed, diagonal(W, xp), 1.0))
+    unit, known = W / size[..., None, :] / size[..., :, None], b / size
+    given = unit, known, allowed, floor / size
+    passive = _passive_set(*(given if xp is np else stop_gradients(given)), xp)
+    x = _solve_passive(unit, known, passive, xp) / size
+    return Complementary(x, times(W, x) + b, passive)
 
 
-def _solve_passive(W: Float[Array, "E E"], b: Float[Array, "E"], passive: Bool[Array, "E"]) -> Float[Array, "E"]:
+def diagonal(W: Any, xp: ModuleType) -> Any:
+    """Return the diagonals of matrices."""
+    return xp.diagonal(W, axis1=-2, axis2=-1)
+
+
+def times(W: Any, x: Any) -> Any:
+    """Return W x, of any dimensions in front."""
+    return (W @ x[..., None])[..., 0]
+
+
+def _solve_passive(W: Any, b: Any, passive: Any, xp: ModuleType) -> Any:
     """Return x with (W x + b) = 0 in the passive set, and x = 0 elsewhere."""
-    both = passive & passive[:, None]
-    return jnp.linalg.solve(jnp.where(both, W, jnp.eye(len(b))), jnp.where(passive, -b, 0.0))
+    both = passive[..., None, :] & passive[..., :, None]
+    matrix = xp.where(both, W, xp.eye(W.shape[-1]))
+    return xp.linalg.solve(matrix, xp.where(passive, -b, 0.0)[..., None])[..., 0]
 
 
-def _passive_set(
-    W: Float[Array, "E E"], b: Float[Array, "E"], allowed: Bool[Array, "E"], floor: Float[Array, "E"]
-) -> Bool[Array, "E"]:
-    floor = jnp.maximum(floor, TIGHT * jnp.max(jnp.where(allowed, jnp.abs(b), 0.0)))
+def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, xp: ModuleType) -> Any:
+    most = xp.max(xp.where(allowed, xp.abs(b), 0.0), axis=-1, keepdims=True)
+    floor = xp.maximum(floor, TIGHT * most)
+    if xp is np and allowed.sum(-1).max(initial=0) <= 1:
+        return allowed & (b + floor < 0)
 
-    def step(at: _ActiveSet) -> _ActiveSet:
-        z = _solve_passive(W, b, at.passive)
+    def step(at: _ActiveSet) -> _ActiveSet:  # it changes nothing more where it is done
+        z = _solve_passive(W, b, at.passive, xp)
         leaves = at.passive & (z <= 0)
         # Go towards z as far as all x stay positive; entries that are zero there leave the passive set.
         way = at.x - z
-        part = jnp.where(leaves, jnp.where(way > 0, at.x / jnp.where(way > 0, way, 1.0), 0.0), jnp.inf)
-        least = jnp.min(part)
-        partial = at.x + jnp.where(jnp.isfinite(least), least, 0.0) * (z - at.x)
-        y = jnp.where(allowed & ~at.passive, W @ z + b + floor, jnp.inf)
-        enters = jnp.arange(len(b)) == jnp.argmin(y)
-        any_leaves, any_enters = jnp.any(leaves), jnp.min(y) < 0
-        passive = jnp.where(any_leaves, at.passive & ~(leaves & (part <= least)), at.passive | (enters & any_enters))
-        x = jnp.where(passive, jnp.where(any_leaves, partial, z), 0.0)
-        return _ActiveSet(x, passive, at.steps + 1, ~any_leaves & ~any_enters)
+        part = xp.where(leaves, xp.where(way > 0, at.x / xp.where(way > 0, way, 1.0), 0.0), xp.inf)
+        least = xp.min(part, axis=-1, keepdims=True)
+        partial = at.x + xp.where(xp.isfinite(least), least, 0.0) * (z - at.x)
+        y = xp.where(allowed & ~at.passive, times(W, z) + b + floor, xp.inf)
+        enters = np.arange(b.shape[-1]) == xp.argmin(y, axis=-1)[..., None]
+        any_leaves, any_enters = xp.any(leaves, -1, keepdims=True), xp.min(y, axis=-1, keepdims=True) < 0
+        passive = xp.where(any_leaves, at.passive & ~(leaves & (part <= least)), at.passive | (enters & any_enters))
+        x = xp.where(passive, xp.where(any_leaves, partial, z), 0.0)
+        return _ActiveSet(x, passive, at.steps + 1, ~xp.any(any_leaves | any_enters))
 
-    first = _ActiveSet(jnp.zeros_like(b), jnp.zeros_like(allowed), jnp.array(0), jnp.array(False))
-    goes_on = lambda at: ~at.done & (at.steps < STEPS_PER_ROW * len(b) + 2)  # noqa: E731
-    return jax.lax.while_loop(goes_on, step, first).passive
+    def goes_on(at: _ActiveSet) -> Any:
+        return ~at.done & (at.steps < STEPS_PER_ROW * b.shape[-1] + 2)
+
+    at = _ActiveSet(xp.zeros_like(b), xp.zeros_like(allowed), xp.asarray(0), xp.asarray(False))
+    if xp is not np:
+        return jax.lax.while_loop(goes_on, step, at).passive
+    while goes_on(at):
+        at = step(at)
+    return at.passive

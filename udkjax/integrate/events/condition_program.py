@@ -1,7 +1,6 @@
 """Conditions of events as programs of scalars, for machine code."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -10,19 +9,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.expressions import Graph, ScalarProgram, read_jaxpr
+from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
 from udkjax.integrate.events.conditions import frames_of
-from udkjax.integrate.events.event import Event
+from udkjax.integrate.events.event import Event, sees_velocity
 from udkjax.native.conditions import Conditions
 from udkjax.native.program import UnsupportedError, consecutive, write
 from udkjax.scene.identity_cache import cached_by_identity
-
-
-class ConditionPrograms(NamedTuple):
-    """The programs of the conditions of some events."""
-
-    watched: Conditions  # and their rates, for machine code
-    derivatives: ScalarProgram  # each condition, then its derivatives by t, q and v, of t, q, v and the numbers of the events
+from udkjax.scene.mechanism import Mechanism
 
 
 def condition_numbers(events: Sequence[Event]) -> list[Array]:
@@ -30,51 +23,59 @@ def condition_numbers(events: Sequence[Event]) -> list[Array]:
     return jax.tree.leaves(eqx.filter(tuple(events), eqx.is_inexact_array))
 
 
-def condition_programs(events: Sequence[Event], names: Sequence[str]) -> ConditionPrograms | None:
-    """Return the programs of the conditions of events of bodies; None where machine code has no instruction for one."""
+def watched_conditions(events: Sequence[Event], mechanism: Mechanism) -> Conditions | None:
+    """Return the conditions of the events of a mechanism as programs; None where machine code has no instruction for one."""
     known = not any(isinstance(x, Tracer) for x in condition_numbers(events))
-    return _known_programs(tuple(names), *events) if known else _programs(tuple(names), *events)
+    return _known_conditions(mechanism, *events) if known and mechanism.is_concrete else _conditions(mechanism, *events)
 
 
-def _programs(names: tuple[str, ...], *events: Event) -> ConditionPrograms | None:
+def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
+    names, by_velocity = mechanism.body_names, tuple(sees_velocity(e, mechanism) for e in events)
     arrays, rest = eqx.partition(events, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
-    n = 3 * len(names)
+    n, graph = 3 * len(names), Graph()
 
-    def of(numbers: Sequence[Array]) -> Callable[..., Array]:
-        given = eqx.combine(jax.tree.unflatten(tree, numbers), rest)
-        return lambda t, q, v: conditions_of(given, names, t, q, v)
+    def evaluate(t: Array, q: Array, v: Array, *numbers: Array) -> Array:
+        return conditions_of(eqx.combine(jax.tree.unflatten(tree, numbers), rest), names, t, q, v)
 
-    def with_rates(t: Array, q: Array, v: Array, a: Array, *numbers: Array) -> Array:
-        return jnp.stack(jax.jvp(of(numbers), (t, q, v), (jnp.ones(()), v, a)))
-
-    def with_derivatives(t: Array, q: Array, v: Array, *numbers: Array) -> Array:
-        along = lambda d: jax.jvp(of(numbers), (t, q, v), (d[0], d[1 : n + 1], d[n + 1 :]))[1]  # noqa: E731
-        return jnp.concatenate([of(numbers)(t, q, v)[:, None], jax.vmap(along)(np.eye(1 + 2 * n)).T], axis=1)
-
-    state, shapes = [(), (n,), (n,)], [np.shape(x) for x in leaves]
-    watched = _scalar_program(with_rates, [*state, (n,), *shapes])
-    places = consecutive("in", len(watched.inputs)), consecutive("out", len(watched.outputs))
+    shapes = [(), (n,), (n,), *(np.shape(x) for x in leaves)]
+    arguments = [_inputs(graph, k, shape) for k, shape in enumerate(shapes)]
+    closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+    g = list(read_jaxpr(graph, closed, arguments)[0].flat)
+    (t,), q, v = (list(x.flat) for x in arguments[:3])
+    a, numbers = list(_inputs(graph, -1, (n,)).flat), [x for array in arguments[3:] for x in array.flat]
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+    along = {t: one, **dict(zip((*q, *v), (*v, *a), strict=True))}
+    rates = tangents(graph, g, along)
+    second = [zero if no else x for no, x in zip(by_velocity, tangents(graph, rates, along), strict=True)]
+    by_state = np.array([cotangents(graph, [x], [one], [t, *q, *v]) for x in g], object)
+    parts = g, rates, second, by_state[:, 0], by_state[:, 1 : n + 1].flat, by_state[:, n + 1 :].flat
+    inputs = [t, *q, *v, *a, *numbers]
+    watched, at_state = (
+        ScalarProgram(graph, inputs, [*g, *rates]),
+        ScalarProgram(graph, inputs, [x for part in parts for x in part]),
+    )
     try:
-        text = write(watched, "conditions", 1, ("in", "out"), *places).text()
+        text = "".join(_text(program) for program in (watched, at_state))
     except UnsupportedError:
         return None
-    count = len(watched.inputs) - 1 - 3 * n
-    return ConditionPrograms(Conditions(text, watched, len(events), count), _scalar_program(with_derivatives, [*state, *shapes]))
+    return Conditions(text, watched, at_state, len(numbers), by_velocity)
 
 
-_known_programs = cached_by_identity(_programs)
+_known_conditions = cached_by_identity(_conditions)
 
 
-def _scalar_program(function: Callable[..., Array], shapes: Sequence[tuple[int, ...]]) -> ScalarProgram:
-    """Return a function of arrays of some shapes as a program of all their entries, one after another."""
-    closed, graph, inputs = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes)), Graph(), []
-    for k, shape in enumerate(shapes):
-        array = np.empty(shape, object)
-        for place in np.ndindex(*shape):
-            array[place] = graph.input((k, place), "condition")
-        inputs.append(array)
-    return ScalarProgram(graph, [x for array in inputs for x in array.flat], list(read_jaxpr(graph, closed, inputs)[0].flat))
+def _inputs(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array of inputs of a graph, the k-th of all."""
+    array = np.empty(shape, object)
+    for place in np.ndindex(*shape):
+        array[place] = graph.input((k, place), "condition")
+    return array
+
+
+def _text(program: ScalarProgram) -> str:
+    places = consecutive("in", len(program.inputs)), consecutive("out", len(program.outputs))
+    return write(program, "conditions", 1, ("in", "out"), *places).text()
 
 
 def conditions_of(events: Sequence[Event], names: Sequence[str], t: Array, q: Array, v: Array) -> Float[Array, "E"]:

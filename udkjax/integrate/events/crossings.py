@@ -1,11 +1,12 @@
 """Crossings of zero: the side of zero of each condition, the events that happen, and the roots of Hermite's cubics."""
 
+from types import ModuleType
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-
-from udkjax.integrate.events.hybrid import ConditionValues, Hybrid
 
 # Of a condition's scale, that is what a displacement of L or a turn of one radian changes in it: below it the condition is zero,
 # and so are its first and second rate, per T and T^2. Rounding errors of a state are some 1e-15 of it.
@@ -16,38 +17,53 @@ NO_EVENT = -1  # no index of an event
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1
 
 
-def side_of_zero(values: ConditionValues, rate: Float[Array, ""]) -> Int[Array, "2E"]:
+class ConditionValues(NamedTuple):
+    """The conditions of events and their rates in a state; behind those of all E may be the contact forces of all."""
+
+    h: Float[Any, "*m C"]
+    rate: Float[Any, "*m C"]  # 0 of forces
+    rate_2: Float[Any, "*m C"]  # 0 of forces, and of conditions that depend on velocities
+    a: Float[Any, "*m n"]
+    scale: Float[Any, "*m C"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
+
+
+def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType = jnp) -> Int[Any, "*m C"]:
     """Return the side of zero of each condition, -1 or 1; at zero the side that it is about to enter, 0 where that is unknown.
 
     Args:
         values: the conditions and their rates.
         rate: rate of the system (1/s).
+        xp: jax.numpy, or NumPy.
     """
-    h, dh, ddh, scale = values.h, values.rate, values.rate_2, values.scale
-    by_second_rate = jnp.where(jnp.abs(ddh) > ZERO_RATE_2 * scale * rate**2, jnp.sign(ddh), 0.0)
-    by_rate = jnp.where(jnp.abs(dh) > ZERO_RATE * scale * rate, jnp.sign(dh), by_second_rate)
-    return jnp.where(jnp.abs(h) > ZERO * scale, jnp.sign(h), by_rate).astype(int)
+    h, dh, ddh, _, scale = values
+    unit = scale * rate[..., None]
+    by_second_rate = xp.where(xp.abs(ddh) > ZERO_RATE_2 * unit * rate[..., None], xp.sign(ddh), 0.0)
+    by_rate = xp.where(xp.abs(dh) > ZERO_RATE * unit, xp.sign(dh), by_second_rate)
+    return xp.where(xp.abs(h) > ZERO * scale, xp.sign(h), by_rate).astype(int)
 
 
 def first_crossing(
-    hybrid: Hybrid, phase: Int[Array, ""], carried: Bool[Array, "E"], before: Int[Array, "2E"], after: Int[Array, "2E"]
-) -> Int[Array, ""]:
+    direction: Int[np.ndarray, "C"],
+    watched: Bool[Any, "*m C"],
+    before: Int[Any, "*m C"],
+    after: Int[Any, "*m C"],
+    xp: ModuleType = jnp,
+) -> Int[Any, "*m"]:
     """Return the first event that happens as conditions change their sides of zero; `NO_EVENT` where none does.
 
     Args:
-        hybrid: the system.
-        phase: the phase.
-        carried: the contacts that others hold at zero.
+        direction: in which the zero of each counts.
+        watched: mask of the conditions that count.
         before: the sides of zero before.
         after: the sides of zero now.
+        xp: jax.numpy, or NumPy.
     """
-    held = hybrid.is_held(phase)
-    happens = crosses(hybrid.directions, before, after) & jnp.append(~held & ~carried, held)
-    return jnp.where(jnp.any(happens), jnp.argmax(happens), NO_EVENT)
+    happens = crosses(direction, before, after) & watched
+    return xp.where(xp.any(happens, -1), xp.argmax(happens, -1), NO_EVENT)
 
 
 def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: Int[Array, "*G C"]) -> Bool[Array, "*G C"]:
-    """Return a mask of the conditions that cross zero in the direction that counts, 0 for either."""
+    """Tell which conditions cross zero in the direction that counts, 0 for either."""
     return (before != 0) & (after == -before) & ((direction == 0) | (after == direction))
 
 
@@ -70,7 +86,7 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 
 def cubic_extremum(cubic: Cubic, side: Array) -> Array:
-    """Return the extremum of a cubic on `side` of zero, nearest to it or beyond it, if it approaches at 0 and leaves at 1."""
+    """Return where a cubic on `side` of zero is nearest to it, or farthest beyond, if it approaches at 0 and leaves at 1."""
     a, da, b, db = cubic
     # The slope c + 2 h x + k x^2 is below zero at 0 and above it at 1: so the root is real, and the larger one.
     c, h, k = side * da, side * (3 * (b - a) - 2 * da - db), side * 3 * (2 * (a - b) + da + db)
@@ -80,7 +96,7 @@ def cubic_extremum(cubic: Cubic, side: Array) -> Array:
 
 
 def cubic_root(cubic: Cubic, side: Array) -> Array:
-    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1."""
+    """Return where a cubic that is on `side` of zero at 0, and beyond it at 1, crosses zero."""
     low, width, places = jnp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
     for _ in range(DIVISIONS):
         width /= PARTS

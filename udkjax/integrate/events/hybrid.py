@@ -1,7 +1,6 @@
 """A mechanism with events as a hybrid system: a flow in each phase, and conditions along it. `jumps` leads between phases."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import reduce
 from typing import NamedTuple, TypeVar
 
@@ -22,11 +21,12 @@ from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.events.actions import Action, Impact, Log, Stop
 from udkjax.integrate.events.condition_program import conditions_of
 from udkjax.integrate.events.conditions import Gap, WithinLimit
+from udkjax.integrate.events.crossings import ConditionValues
 from udkjax.integrate.events.event import Event, sees_velocity
+from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.native.conditions import Conditions
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.joints import Joint
 
@@ -45,16 +45,6 @@ class RunState(NamedTuple):
     added: Added
 
 
-class ConditionValues(NamedTuple):
-    """The conditions of all E events, then the contact force of each contact at rest, and their rates, in one state."""
-
-    h: Float[Array, "2E"]
-    rate: Float[Array, "2E"]  # 0 of forces
-    rate_2: Float[Array, "2E"]  # 0 of forces, and of conditions that depend on velocities
-    a: Float[Array, "n"]
-    scale: Float[Array, "2E"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
-
-
 class Hybrid(eqx.Module):
     """All numbers and choices of a run with events, but its initial state and output times."""
 
@@ -71,7 +61,6 @@ class Hybrid(eqx.Module):
     formulation: Formulation | None
     max_steps: int = eqx.field(static=True)
     plans: tuple[RunPlan, ...] = eqx.field(static=True)  # of each phase
-    watched: Conditions | None = eqx.field(static=True)  # by machine code; None: it cannot
 
     # --- what is known of the events
 
@@ -115,7 +104,7 @@ class Hybrid(eqx.Module):
         return reduce(jnp.logical_and, (limits[f"{n}.lower"] <= limits.get(f"{n}.upper", jnp.inf) for n in both), found)
 
     def mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
-        """Return a mask of the events with an action of these kinds."""
+        """Tell which events have an action of these kinds."""
         return np.array([isinstance(e.action, actions) for e in self.events])
 
     @property
@@ -124,8 +113,14 @@ class Hybrid(eqx.Module):
         return self.mask(Impact)
 
     def rests(self, at_rest: str) -> Bool[np.ndarray, "E"]:
-        """Return a mask of the events that are impacts with this choice for contacts at rest."""
+        """Tell which events are impacts with this choice of what happens at rest."""
         return np.array([isinstance(e.action, Impact) and e.action.at_rest == at_rest for e in self.events])
+
+    @property
+    def contacts(self) -> Contacts:
+        """The contacts among the events."""
+        e = [e.action.restitution if isinstance(e.action, Impact) else jnp.zeros(()) for e in self.events]
+        return Contacts(self.impacts, self.rests("hold"), self.rests("stop"), jnp.stack(e), self.rate)
 
     @property
     def by_velocity(self) -> Bool[np.ndarray, "E"]:
@@ -146,7 +141,7 @@ class Hybrid(eqx.Module):
         return jnp.array(getattr(self.phases.tables, name))
 
     def is_held(self, phase: Int[Array, ""]) -> Bool[Array, "E"]:
-        """Return a mask of the contacts at rest in a phase."""
+        """Tell which contacts are at rest in a phase."""
         return self.table("held")[phase] >= 0
 
     def without_contacts(self, phase: Int[Array, ""]) -> Int[Array, ""]:
@@ -166,7 +161,7 @@ class Hybrid(eqx.Module):
     # --- the flow
 
     def problem(self, phase: int, ts: Array, q: Array, v: Array, added: Added) -> Problem:
-        """Return the system to integrate in a phase."""
+        """Return what to integrate in a phase."""
         mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
         compiled = CompiledMechanism(equations, mechanism.breakpoints, self.plans[phase])
@@ -185,17 +180,14 @@ class Hybrid(eqx.Module):
             marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate),
         )
 
-    def flow(
-        self, ts: Float[Array, "T"], state: RunState, derivatives: bool, runs: Bool[Array, ""] | None = None
-    ) -> IntegratorOutput:
-        """Integrate from a state over the times `ts`, from its own on; a member of a batch only where it `runs`."""
+    def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
+        """Integrate from a state over the times `ts`, from its own on."""
 
         def of_phase(phase: int, ts: Array, q: Array, v: Array, added: Added) -> IntegratorOutput:
             problem = self.problem(phase, ts, q, v, added)
             if derivatives or not self.plans[phase].is_native:
                 return differentiable(problem)
-            most = self.max_steps if runs is None else jnp.where(runs, self.max_steps, 0)
-            return native_engine.integrate(replace(problem, max_steps=most))
+            return native_engine.integrate(problem)
 
         return self.in_phase(state.phase, of_phase, ts, state.q, state.v, state.added)
 

@@ -24,9 +24,13 @@ law treats what happens at one instant as one impact: the first of three equal b
 
 Contacts whose g_dot stays zero are in complementarity in accelerations: 0 <= lambda, g_ddot = g_ddot(lambda = 0) + W lambda >= 0,
 one of them zero. Those with lambda > 0 are held, as constraints.
+
+Arrays are of JAX, of one state, or of NumPy, of some states (*m).
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,10 +39,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.events.actions import Impact
-from udkjax.integrate.events.complementarity import solve_complementarity
-from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2
-from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
+from udkjax.integrate.events.complementarity import diagonal, solve_complementarity, times
+from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
 from udkjax.integrate.gradients import stop_gradients
 
 # (u . u) / (n M^(-1) n): the square of the sine between a contact's row and those of the constraints, in the metric of M. At a
@@ -61,32 +63,42 @@ COUPLED = 1e-12
 OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
 
 
+class Contacts(NamedTuple):
+    """The contacts among E events, whatever the state is."""
+
+    impacts: Bool[np.ndarray, "E"]  # events that are contacts
+    hold: Bool[np.ndarray, "E"]  # contacts that are held at rest
+    stop: Bool[np.ndarray, "E"]  # contacts that end the run there
+    restitution: Float[Any, "*m E"]
+    rate: Float[Any, "*m"]  # of the system and the run (1/s)
+
+
 class ContactRows(NamedTuple):
     """The rows of all conditions, as far as constraints leave them."""
 
-    W: Float[Array, "E E"]
-    directions: Float[Array, "E n"]  # M^(-1/2) u: the velocities that unit impulses give
-    free: Bool[Array, "E"]  # whether the constraints leave a condition any motion
+    W: Float[Any, "*m E E"]
+    directions: Float[Any, "*m E n"]  # M^(-1/2) u: the velocities that unit impulses give
+    free: Bool[Any, "*m E"]  # whether the constraints leave a condition any motion
 
 
 class Impulses(NamedTuple):
     """The results of an impact."""
 
-    impulse: Float[Array, "E"]  # in the unit of M v over that of the condition's derivative by q: N s of a gap
-    rate: Float[Array, "E"]  # g_dot+
-    remaining: Bool[Array, ""]  # whether a contact is still penetrated: the constraints drive it
+    impulse: Float[Any, "*m E"]  # in the unit of M v over that of the condition's derivative by q: N s of a gap
+    rate: Float[Any, "*m E"]  # g_dot+
+    remaining: Bool[Any, "*m"]  # whether a contact is still penetrated: the constraints drive it
 
 
 class ContactChanges(NamedTuple):
     """The contacts at an event, and what becomes of them."""
 
-    v: Float[Array, "n"]  # after it
-    closed: Int[Array, "E"]  # OPEN, TOUCHES or SLOW
-    hits: Bool[Array, "E"]
-    held: Bool[Array, "E"]  # after it
-    ends: Bool[Array, "E"]  # events that come to rest, and end the run by that
-    carried: Bool[Array, "E"]  # held at zero by others that are held
-    blocked: Bool[Array, ""]  # the constraints leave a contact that approaches no motion
+    v: Float[Any, "*m n"]  # after it
+    closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
+    hits: Bool[Any, "*m E"]
+    held: Bool[Any, "*m E"]  # after it
+    ends: Bool[Any, "*m E"]  # events that come to rest, and end the run by that
+    carried: Bool[Any, "*m E"]  # held at zero by others that are held
+    blocked: Bool[Any, "*m"]  # the constraints leave a contact that approaches no motion
 
 
 def contact_rows(
@@ -97,16 +109,30 @@ def contact_rows(
     root, D = uk.inverse_sqrt_mass(mechanism), uk.D(mechanism, t, q, w)
     plus, given = uk.pseudoinverse(equations.method, D), root * normals
     u = jax.vmap(lambda u: u - plus @ (D @ u))(given)
-    free = jnp.sum(u**2, 1) > BLOCKED * jnp.sum(given**2, 1)
-    return ContactRows(u @ u.T, root * u, free)
+    return ContactRows(u @ u.T, root * u, _leaves_motion(jnp.sum(u**2, 1), jnp.sum(given**2, 1)))
+
+
+def rows_of_directions(
+    normals: Float[np.ndarray, "*m E n"], directions: Float[np.ndarray, "*m E n"], inverse_mass: Float[np.ndarray, "*m n"]
+) -> ContactRows:
+    """Return the rows of contacts whose directions of impulses are known, by NumPy."""
+    mobility = inverse_mass[..., None, :]
+    W = directions / mobility @ directions.swapaxes(-1, -2)
+    return ContactRows(W, directions, _leaves_motion(diagonal(W, np), np.sum(normals**2 * mobility, -1)))
+
+
+def _leaves_motion(left: Any, given: Any) -> Any:
+    """Tell of which rows constraints leave something, by the squares of their sizes."""
+    return left > BLOCKED * given
 
 
 def impulses_of_impact(
     rows: ContactRows,
-    rate: Float[Array, "E"],
-    restitution: Float[Array, "E"],
-    closed: Bool[Array, "E"],
-    floor: Float[Array, "E"],
+    rate: Float[Any, "*m E"],
+    restitution: Float[Any, "*m E"],
+    closed: Bool[Any, "*m E"],
+    floor: Float[Any, "*m E"],
+    xp: ModuleType = jnp,
 ) -> Impulses:
     """Return the impulses of an impact by Newton's law with complementarity.
 
@@ -116,90 +142,104 @@ def impulses_of_impact(
         restitution: e of each contact, from 0 to 1.
         closed: mask of the contacts that take part; they do not separate.
         floor: a rate above minus that is not negative.
+        xp: jax.numpy, or NumPy.
     """
-    found = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor)
-    after = rate + rows.W @ found.x
-    limit = floor + STILL * jnp.max(jnp.where(closed, jnp.abs(rate), 0.0))
-    return Impulses(found.x, after, jnp.any(closed & (after < -limit)))
+    found = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor, xp)
+    after = rate + times(rows.W, found.x)
+    limit = floor + STILL * _largest(rate, closed, xp)
+    return Impulses(found.x, after, xp.any(closed & (after < -limit), -1))
+
+
+def _largest(x: Any, some: Any, xp: ModuleType) -> Any:
+    return xp.max(xp.where(some, xp.abs(x), 0.0), axis=-1, keepdims=True)
 
 
 def contact_states(
-    hybrid: Hybrid, k: Int[Array, ""], held: Bool[Array, "E"], values: ConditionValues, W: Float[Array, "E E"]
-) -> Int[Array, "E"]:
-    """Return the state of each contact in event k: OPEN where it takes no part, TOUCHES, or SLOW where it is too slow to rebound.
+    contacts: Contacts,
+    k: Int[Any, "*m"],
+    held: Bool[Any, "*m E"],
+    before: ConditionValues,
+    W: Float[Any, "*m E E"],
+    xp: ModuleType,
+) -> Int[Any, "*m E"]:
+    """Tell which contacts take part in event k, and which of them are too slow to rebound.
 
     Those take part that are closed, do not separate and, where the event is of a contact, act on it, or on one that does. A
     contact is slow whose g_dot is small while it is pressed on.
     """
-    E = hybrid.count
-    h, rate, rate_2, scale = (x[:E] for x in (values.h, values.rate, values.rate_2, values.scale))
-    unit, impacts, own = scale * hybrid.rate, jnp.array(hybrid.impacts), jnp.arange(E) == k % E
-    closed = impacts & (held | ((jnp.abs(h) <= CLOSED * scale) & (rate <= ZERO_RATE * unit)) | own)
-    size = jnp.sqrt(jnp.diagonal(W))
-    acts = (jnp.abs(W) > COUPLED * size * size[:, None]) & closed & closed[:, None]
-    joined = own | ((k < E) & ~impacts[k % E])
-    for _ in range(int(np.sum(hybrid.impacts)) - 1):
-        joined = joined | jnp.any(acts & joined, axis=1)
+    h, rate, rate_2, _, scale = before
+    E, system = h.shape[-1], contacts.rate[..., None]
+    unit, impacts, own = scale * system, contacts.impacts, np.arange(E) == (k % E)[..., None]
+    closed = impacts & (held | ((xp.abs(h) <= CLOSED * scale) & (rate <= ZERO_RATE * unit)) | own)
+    size = xp.sqrt(diagonal(W, xp))
+    acts = (xp.abs(W) > COUPLED * size[..., None, :] * size[..., :, None]) & closed[..., None, :] & closed[..., :, None]
+    joined = own | ((k < E) & ~xp.asarray(impacts)[k % E])[..., None]
+    for _ in range(int(np.sum(impacts)) - 1):
+        joined = joined | xp.any(acts & joined[..., None, :], axis=-1)
     closed = closed & joined
-    slow = jnp.abs(rate) < REST * unit
-    pressed = rate_2 < -ZERO_RATE_2 * unit * hybrid.rate
-    return jnp.where(closed, jnp.where(slow & pressed & ~held, SLOW, TOUCHES), OPEN)
+    slow = xp.abs(rate) < REST * unit
+    pressed = rate_2 < -ZERO_RATE_2 * unit * system
+    return xp.where(closed, xp.where(slow & pressed & ~held, SLOW, TOUCHES), OPEN)
 
 
 def hit_contacts(
-    hybrid: Hybrid,
-    k: Int[Array, ""],
-    state: RunState,
-    held: Bool[Array, "E"],
-    values: ConditionValues,
-    closed: Int[Array, "E"] | None,
+    contacts: Contacts,
+    k: Int[Any, "*m"],
+    v: Float[Any, "*m n"],
+    held: Bool[Any, "*m E"],
+    before: ConditionValues,
+    rows: ContactRows,
+    rate: Float[Any, "*m E"],
+    second_rates: Callable[[Any], Any],
+    closed: Int[Any, "*m E"] | None,
+    xp: ModuleType = jnp,
 ) -> ContactChanges:
     """Apply an impact to all contacts that are closed, and find those that then rest.
 
     Args:
-        hybrid: the system.
-        k: the number of the event; from `hybrid.count` on, of the contact that lets go.
-        state: the state before, in the phase that is to follow but for contacts.
+        contacts: properties that no state changes.
+        k: the number of the event; from E on, of the contact that lets go.
+        v: the velocities, in the phase that is to follow but for contacts.
         held: mask of the contacts that were held before.
-        values: the conditions before the event; their scales are used.
+        before: the conditions before the event.
+        rows: of the phase that is to follow, without contacts.
+        rate: the first rates of all conditions, of v.
+        second_rates: of velocities: the second rates of all conditions in that phase.
         closed: the contacts, as in `ContactChanges`; None where they are to be found.
+        xp: jax.numpy, or NumPy.
     """
-    E = hybrid.count
-    t, q, v, phase, added = state
-    free_phase = hybrid.without_contacts(phase)
-    scale = stop_gradients(values.scale[:E])
-    floor = ZERO_RATE * scale * hybrid.rate
-    rate, normals = hybrid.conditions_and_rates(t, q, v)[1], jax.jacfwd(hybrid.conditions, 1)(t, q, v)
-    of_phase = lambda p, t, q, normals, added: contact_rows(hybrid.textbook(p, added), t, q, normals)  # noqa: E731
-    rows = hybrid.in_phase(free_phase, of_phase, t, q, normals, added, among=hybrid.contact_free_phases)
-    closed = contact_states(hybrid, k, held, values, rows.W) if closed is None else closed
-    restitution = jnp.where(closed == SLOW, 0.0, _restitutions(hybrid))
-    found = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor)
-    v = v + found.impulse @ rows.directions
+    stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
+    scale, system = stop(before.scale), contacts.rate[..., None]
+    floor = ZERO_RATE * scale * system
+    closed = closed if closed is not None else contact_states(contacts, k, held, before, rows.W, xp)
+    assert closed is not None
+    restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
+    found = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
+    v = v + (found.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
     # Without derivatives from here on: which contacts are held is a choice.
-    rows, rate, after = stop_gradients((rows, rate, RunState(t, q, v, free_phase, added)))
-    fastest = jnp.max(jnp.where(closed > OPEN, jnp.abs(rate), 0.0))
-    stays = (closed > OPEN) & rows.free & (found.rate <= jnp.maximum(floor, STILL * fastest))
-    stays = stays & (jnp.arange(E) + E != k)
-    pull = hybrid.second_rates(t, q, after.v, hybrid.accelerations(after, among=hybrid.contact_free_phases))
-    pressed = ZERO_RATE_2 * scale * hybrid.rate**2
-    rest = solve_complementarity(rows.W, pull, stays, pressed)
-    presses = rest.passive & (rest.x > 0)
-    is_held = jnp.where(closed > OPEN, presses & hybrid.rests("hold"), held)
-    resting = stays & ~is_held & (jnp.abs(rest.y) <= jnp.maximum(pressed, STILL * jnp.max(jnp.where(stays, jnp.abs(pull), 0.0))))
+    rows, rate, found = stop((rows, rate, found))
+    fastest = _largest(rate, closed > OPEN, xp)
+    stays = (closed > OPEN) & rows.free & (found.rate <= xp.maximum(floor, STILL * fastest))
+    # A contact that has fallen to zero and rises all the same, slow and pressed on, rises by less than can be told.
+    stays = stays | ((np.arange(rate.shape[-1]) == k[..., None]) & (closed == SLOW) & (rate > 0))
+    stays = stays & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
+    is_held, ends, carried = xp.where(closed > OPEN, False, held), xp.zeros_like(stays), xp.zeros_like(stays)
+    if xp is not np or stays.any():
+        pull, pressed = second_rates(stop(v)), ZERO_RATE_2 * scale * system**2
+        rest = solve_complementarity(rows.W, pull, stays, pressed, xp)
+        presses = rest.passive & (rest.x > 0)
+        is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
+        resting = stays & ~is_held & (xp.abs(rest.y) <= xp.maximum(pressed, STILL * _largest(pull, stays, xp)))
+        ends, carried = presses & contacts.stop, resting & _depends(rows.W, is_held, xp)
     hits = (closed == TOUCHES) & ~held & (rate < -floor)
-    ends = presses & hybrid.rests("stop")
-    return ContactChanges(v, closed, hits, is_held, ends, resting & _depends(rows.W, is_held), found.remaining)
+    return ContactChanges(v, closed, hits, is_held, ends, carried, found.remaining)
 
 
-def _depends(W: Float[Array, "E E"], on: Bool[Array, "E"]) -> Bool[Array, "E"]:
-    """Return a mask of the rows that depend on some of the others, which do not depend on one another."""
-    both = on & on[:, None]
-    parts = jnp.where(on[:, None], W, 0.0)
-    rest = jnp.diagonal(W) - jnp.sum(parts * jnp.linalg.solve(jnp.where(both, W, jnp.eye(len(W))), parts), 0)
-    return ~on & (rest <= CARRIED * jnp.diagonal(W))
-
-
-def _restitutions(hybrid: Hybrid) -> Float[Array, "E"]:
-    return jnp.stack([e.action.restitution if isinstance(e.action, Impact) else jnp.zeros(()) for e in hybrid.events])
+def _depends(W: Float[Any, "*m E E"], on: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m E"]:
+    """Tell which rows depend on some of the others, which do not depend on one another."""
+    parts = xp.where(on[..., :, None], W, 0.0)
+    both = on[..., None, :] & on[..., :, None]
+    solved = xp.linalg.solve(xp.where(both, W, xp.eye(W.shape[-1])), parts)
+    rest = diagonal(W, xp) - xp.sum(parts * solved, -2)
+    return ~on & (rest <= CARRIED * diagonal(W, xp))

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
-from udkjax.integrate.events.impacts import OPEN, ContactChanges, hit_contacts
+from udkjax.integrate.events.crossings import ConditionValues
+from udkjax.integrate.events.hybrid import Hybrid, RunState
+from udkjax.integrate.events.impacts import OPEN, ContactChanges, contact_rows, hit_contacts
 from udkjax.integrate.gradients import stop_gradients
 
 ATTACHABLE = 1e-6  # of L, or rad: a joint that is attached must be closed up to that
@@ -64,7 +65,7 @@ def apply_event(
     after = RunState(t, q, v, after, added)
     if not hybrid.impacts.any():
         return JumpResult(after, None, blocked)
-    found = hit_contacts(hybrid, k, after, held, values, closed)
+    found = _hit_contacts(hybrid, k, after, held, values, closed)
     acts = hybrid.changes_motion(k)
     found = found._replace(
         closed=jnp.where(acts, found.closed, OPEN),
@@ -75,3 +76,27 @@ def apply_event(
     phase = hybrid.with_contacts(hybrid.without_contacts(after.phase), found.held)
     after = after._replace(v=jnp.where(acts, found.v, v), phase=phase)
     return JumpResult(after, found, blocked | (acts & found.blocked))
+
+
+def _hit_contacts(
+    hybrid: Hybrid,
+    k: Int[Array, ""],
+    state: RunState,
+    held: Bool[Array, "E"],
+    values: ConditionValues,
+    closed: Int[Array, "E"] | None,
+) -> ContactChanges:
+    """Hit the contacts that are closed at an event; `state` is that before, in the phase that is to follow but for contacts."""
+    E = hybrid.count
+    t, q, v, phase, added = state
+    free_phase = hybrid.without_contacts(phase)
+    rate, normals = hybrid.conditions_and_rates(t, q, v)[1], jax.jacfwd(hybrid.conditions, 1)(t, q, v)
+    of_phase = lambda p, t, q, normals, added: contact_rows(hybrid.textbook(p, added), t, q, normals)  # noqa: E731
+    rows = hybrid.in_phase(free_phase, of_phase, t, q, normals, added, among=hybrid.contact_free_phases)
+
+    def second_rates(v: Array) -> Array:
+        after = stop_gradients(RunState(t, q, v, free_phase, added))
+        return hybrid.second_rates(after.t, after.q, v, hybrid.accelerations(after, among=hybrid.contact_free_phases))
+
+    before = ConditionValues(values.h[:E], values.rate[:E], values.rate_2[:E], values.a, values.scale[:E])
+    return hit_contacts(hybrid.contacts, k, v, held, before, rows, rate, second_rates, closed)

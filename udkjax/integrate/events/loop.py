@@ -12,12 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.integrate.events.actions import Stop
-from udkjax.integrate.events.branches import branch
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO, first_crossing, side_of_zero
-from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, first_crossing, side_of_zero
+from udkjax.integrate.events.hybrid import Hybrid, RunState
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
-from udkjax.integrate.events.sweep import SweepResult, can_sweep, sweep
 from udkjax.integrate.events.window import (
     Search,
     WindowResult,
@@ -57,7 +55,6 @@ class LoopState(NamedTuple):
     pending: Int[Array, ""]  # the event that happens now; or NO_EVENT, or BEGIN
     search: Search
     reach: Float[Array, ""]  # length of the next window (s)
-    sweeps: Bool[Array, ""]  # whether machine code is to run as far as it can first
     quiet: Float[Array, "2E"]  # the time up to which each condition has no crossings in pairs
     unresolved: Float[Array, "2E"]  # the time from which on a condition varies too quickly to be sure of its crossings, or inf
     undefined: Bool[Array, "E"]  # the conditions that are not a number where the run ends by that
@@ -89,29 +86,17 @@ def run_loop(
         max_events: most events that may happen.
     """
     first = _first_loop_state(hybrid, ts, state, code, max_events)
-    sweepable, fixed = can_sweep(hybrid), (hybrid, ts, drift_tol)
+
+    def jump(loop: LoopState) -> LoopState:
+        applied = jax.lax.cond(loop.pending >= 0, lambda loop: _apply_pending(hybrid, loop, max_events), lambda loop: loop, loop)
+        return _after_event(hybrid, loop, applied, _values(hybrid, loop, applied.state))
+
+    def go_on(loop: LoopState) -> LoopState:
+        result = _integrate(hybrid, ts, drift_tol, loop)
+        return _after_window(hybrid, loop, result, _values(hybrid, loop, result.end))
 
     def body(loop: LoopState) -> LoopState:
-        happens = loop.pending != NO_EVENT
-        sweeps = loop.sweeps & ~happens & (loop.search.event < 0) & (ts[-1] - loop.state.t > 2 * hybrid.smallest)
-        sweeps = sweeps & jnp.array(sweepable)[loop.state.phase]
-        apply = lambda hybrid, loop: _apply_pending(hybrid, loop, max_events)  # noqa: E731
-        jumped = branch((loop.pending >= 0).astype(int), [lambda _, loop: loop, apply], hybrid, loop)
-        result = branch((happens | sweeps).astype(int), [_integrate, None], fixed, loop, ~happens & ~sweeps)
-        at, swept = choose(happens, jumped.state, result.end), None
-        if sweepable.any():
-            swept = branch(sweeps.astype(int), [None, _sweep], fixed, loop, sweeps)
-            at = choose(sweeps, swept.state, at)
-        values = hybrid.values(at)
-        scale = jnp.where(jnp.isfinite(values.scale), values.scale, 0.0)  # beyond where a condition is a number it has no scale
-        values = values._replace(scale=jnp.maximum(scale, loop.values.scale))
-        after = [
-            lambda hybrid, loop, result, jumped, swept, values: _after_window(hybrid, loop, result, values),
-            lambda hybrid, loop, result, jumped, swept, values: _after_event(hybrid, loop, jumped, values),
-            lambda hybrid, loop, result, jumped, swept, values: _after_sweep(hybrid, loop, swept, values),
-        ]
-        which = jnp.where(happens, 1, jnp.where(sweeps, 2, 0))
-        loop = branch(which, after if swept is not None else after[:2], hybrid, loop, result, jumped, swept, values)
+        loop = jax.lax.cond(loop.pending != NO_EVENT, jump, go_on, loop)
         more = (loop.state.t < ts[-1]) | (loop.pending >= 0)
         too_long = (loop.totals[0] >= hybrid.max_steps) & loop.running & more
         code = jnp.where(too_long, Result.step_limit, loop.code)
@@ -120,26 +105,23 @@ def run_loop(
     return _fill_end(jax.lax.while_loop(lambda loop: loop.running, body, first), ts)
 
 
-Fixed = tuple[Hybrid, Float[Array, "T"], Float[Array, ""]]  # the system, the output times, the violation that ends a run
+def _values(hybrid: Hybrid, loop: LoopState, state: RunState) -> ConditionValues:
+    """Return the conditions in a state, whose scales do not become smaller than they were."""
+    values = hybrid.values(state)
+    scale = jnp.where(jnp.isfinite(values.scale), values.scale, 0.0)  # beyond where a condition is a number it has no scale
+    return values._replace(scale=jnp.maximum(scale, loop.values.scale))
 
 
 def _watched(hybrid: Hybrid, loop: LoopState) -> Bool[Array, "2E"]:
-    """Return a mask of the conditions and contact forces that count."""
+    """Tell which conditions and contact forces count."""
     held = hybrid.is_held(loop.state.phase)
     return jnp.append(~held & ~loop.carried, held)
 
 
-def _integrate(fixed: Fixed, loop: LoopState, runs: Bool[Array, ""]) -> WindowResult:
-    hybrid, ts, drift_tol = fixed
+def _integrate(hybrid: Hybrid, ts: Float[Array, "T"], drift_tol: Float[Array, ""], loop: LoopState) -> WindowResult:
     window = plan_window(hybrid, ts, loop.state, loop.search, loop.reach, loop.quiet, loop.written)
     looked_at = loop.sides, loop.values.scale, _watched(hybrid, loop), loop.search, loop.quiet, jnp.isfinite(loop.unresolved)
-    return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol, runs)
-
-
-def _sweep(fixed: Fixed, loop: LoopState, runs: Bool[Array, ""]) -> SweepResult:
-    hybrid, ts, drift_tol = fixed
-    looked_at = loop.sides, loop.values.scale, _watched(hybrid, loop)
-    return sweep(hybrid, ts, loop.state, *looked_at, loop.written, drift_tol, runs)
+    return integrate_window(hybrid, window, loop.state, *looked_at, drift_tol)
 
 
 def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, code: Int[Array, ""], max_events: int) -> LoopState:
@@ -156,7 +138,6 @@ def _first_loop_state(hybrid: Hybrid, ts: Float[Array, "T"], state: RunState, co
         pending=jnp.array(BEGIN),
         search=no_search(ts[0]),
         reach=ts[-1] - ts[0],
-        sweeps=jnp.array(True),
         quiet=jnp.full(2 * E, ts[0]),
         unresolved=jnp.full(2 * E, jnp.inf),
         undefined=jnp.zeros(E, bool),
@@ -176,7 +157,7 @@ def _after_event(hybrid: Hybrid, loop: LoopState, jumped: LoopState, values: Con
     # The contacts that were closed are settled: their next event takes time.
     settled = (loop.pending >= 0) & (new.record.closed[jnp.maximum(new.record.count - 1, 0)] > OPEN)
     now = jnp.where(jnp.append(settled, jnp.zeros_like(settled)), new.sides, side_of_zero(values, hybrid.rate))
-    pending = first_crossing(hybrid, new.state.phase, new.carried, new.sides, now)
+    pending = first_crossing(hybrid.directions, _watched(hybrid, new), new.sides, now)
     return new._replace(values=values, pending=jnp.where(new.running, pending, NO_EVENT))
 
 
@@ -193,24 +174,6 @@ def _begin(hybrid: Hybrid, loop: LoopState, values: ConditionValues) -> LoopStat
     return loop._replace(sides=sides, undefined=undefined, code=code, running=loop.running & (code == Result.successful))
 
 
-def _after_sweep(hybrid: Hybrid, loop: LoopState, swept: SweepResult, values: ConditionValues) -> LoopState:
-    """Return the loop after a sweep: an event is pending, the run is over, or windows go on."""
-    now, k = side_of_zero(values, hybrid.rate), swept.event
-    others = (np.arange(2 * hybrid.count) != k) & (jnp.abs(values.h) > ZERO * values.scale)
-    at_end = first_crossing(hybrid, swept.state.phase, loop.carried, swept.sides, now)
-    return loop._replace(
-        state=swept.state,
-        values=values,
-        sides=jnp.where((k >= 0) & others, now, swept.sides),
-        pending=jnp.where(swept.ends, at_end, k),
-        sweeps=k >= 0,
-        q=loop.q.at[swept.rows].set(swept.q, mode="drop"),
-        v=loop.v.at[swept.rows].set(swept.v, mode="drop"),
-        written=loop.written + jnp.sum(swept.rows < len(loop.q)),
-        totals=loop.totals + swept.totals,
-    )
-
-
 def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values: ConditionValues) -> LoopState:
     """Return the loop after a run of the integrator: it goes on, searches on, or an event is pending."""
     E, end = hybrid.count, result.end
@@ -223,8 +186,9 @@ def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values:
     # At the end of the run every condition that is not zero tells its side; what is located tells it by happening.
     others = (np.arange(2 * E) != jnp.where(step.is_found, k, -1)) & (jnp.abs(values.h) > ZERO * values.scale)
     sides = jnp.where(step.continues, loop.sides, result.sides)
+    goes_on = (search.event < 0) & ~result.is_coarse  # else the end of the window lies beyond the motion
     is_over = (search.event < 0) & ~step.is_lost & ~result.fails & ~result.is_coarse
-    pending = jnp.where(is_over, first_crossing(hybrid, end.phase, loop.carried, sides, now), NO_EVENT)
+    pending = jnp.where(is_over, first_crossing(hybrid.directions, _watched(hybrid, loop), sides, now), NO_EVENT)
     pending = jnp.where(step.is_found, k, pending)
     sides = jnp.where(step.is_found & others, now, sides)
     sides = sides.at[k].set(jnp.where(step.is_found, result.search.side, sides[k]))
@@ -234,13 +198,12 @@ def _after_window(hybrid: Hybrid, loop: LoopState, result: WindowResult, values:
     reach = jnp.where(result.is_coarse, length / FINER, jnp.where(search.event >= 0, loop.reach, 2 * loop.reach))
     return loop._replace(
         state=state,
-        values=values._replace(rate=values.rate + h * values.rate_2),
+        values=values._replace(rate=values.rate + h * values.rate_2, scale=jnp.where(goes_on, values.scale, loop.values.scale)),
         sides=sides,
         carried=loop.carried & (jnp.abs(values.h[:E]) <= CLOSED * values.scale[:E]),
         pending=jnp.where(result.fails, NO_EVENT, pending),
         search=search,
         reach=reach,
-        sweeps=is_over & (length >= result.window.full / 2),
         quiet=loop.quiet.at[k].set(jnp.where(step.is_lost, result.search.until, loop.quiet[k])),
         unresolved=jnp.where(result.unresolved & jnp.isinf(loop.unresolved), state.t, loop.unresolved),
         undefined=result.undefined,

@@ -7,54 +7,33 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.integrate.events.crossings import ZERO_RATE
+from udkjax.integrate.events.event_run import EventRun, RunInput, run_plain
 from udkjax.integrate.events.hybrid import Hybrid, RunState
 from udkjax.integrate.events.jumps import apply_event
-from udkjax.integrate.events.loop import run_loop
+from udkjax.integrate.events.known_run import run_by_machine_code
 from udkjax.integrate.gradients import TreeDef, stop_gradients
 from udkjax.integrate.solution import Result
 from udkjax.integrate.traced_numbers import replaced, select
+from udkjax.native.conditions import Conditions
 
 OUTPUTS = 32  # of one piece
 
 
-class EventRun(NamedTuple):
-    """The outputs and events of a run, infinite where it did not get. In derivatives a field is None that has none."""
+def run_events(hybrid: Hybrid, given: RunInput, conditions: Conditions | None, max_events: int) -> EventRun:
+    """Run a system with events. What is smooth in the result has first derivatives, forward and reverse.
 
-    q: Float[Array, "T n"]
-    v: Float[Array, "T n"]
-    time: Float[Array, ""]  # the end of the run
-    event_time: Float[Array, "K"]
-    event_q: Float[Array, "K 2 n"]  # before and after
-    event_v: Float[Array, "K 2 n"]
-    event_index: Int[Array, "K"]
-    event_phase: Int[Array, "K"]
-    together: Bool[Array, "K"]
-    closed: Int[Array, "K E"]
-    count: Int[Array, ""]
-    unresolved: Float[Array, "E"]
-    undefined: Bool[Array, "E"]
-    code: Int[Array, ""]
-    totals: Int[Array, "4"]
-
-
-class RunInput(NamedTuple):
-    """The initial state of a run with events, and its output times."""
-
-    ts: Float[Array, "T"]
-    q: Float[Array, "n"]
-    v: Float[Array, "n"]
-    code: Int[Array, ""]  # a `Result` that is known before
-    drift_tol: Float[Array, ""]
-
-
-def run_events(hybrid: Hybrid, given: RunInput, max_events: int) -> EventRun:
-    """Run a system with events. The smooth parts of the result have first derivatives, forward and reverse."""
+    Args:
+        hybrid: the system.
+        given: the initial state, and the output times.
+        conditions: conditions of all events, for machine code; None: it cannot serve the run.
+        max_events: most events that may happen.
+    """
     arrays, rest = eqx.partition((hybrid, given), eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
-    return _run(FixedPart(rest, tree, max_events), xs)
+    return _run(FixedPart(rest, tree, conditions, max_events), xs)
 
 
 class FixedPart(eqx.Module):
@@ -62,6 +41,7 @@ class FixedPart(eqx.Module):
 
     rest: PyTree
     tree: TreeDef = eqx.field(static=True)
+    conditions: Conditions | None = eqx.field(static=True)
     max_events: int = eqx.field(static=True)
 
     def combine(self, xs: Sequence[Array]) -> tuple[Hybrid, RunInput]:
@@ -72,13 +52,9 @@ class FixedPart(eqx.Module):
 @eqx.filter_custom_jvp
 def _run(fixed: FixedPart, xs: list[Array]) -> EventRun:
     hybrid, given = fixed.combine(xs)
-    state = RunState(given.ts[0], given.q, given.v, jnp.array(0), hybrid.phases.first_added())
-    loop = run_loop(hybrid, given.ts, state, given.code, given.drift_tol, fixed.max_events)
-    record, smooth = loop.record, (loop.q, loop.v, loop.state.t)
-    events = record.t, record.q, record.v, record.index, record.phase, record.together, record.closed, record.count
-    # Before it is no number, a condition may vary quickly: that is told by how the run ended.
-    faults = jnp.where(loop.undefined, jnp.inf, loop.unresolved[: hybrid.count]), loop.undefined
-    return EventRun(*smooth, *events, *faults, loop.code, loop.totals)
+    if fixed.conditions is None:
+        return run_plain(hybrid, given, fixed.max_events)
+    return run_by_machine_code(hybrid, given, fixed.conditions, fixed.max_events)
 
 
 @_run.def_jvp
@@ -146,7 +122,7 @@ class PieceOutput(NamedTuple):
 
 
 def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...]:
-    """Return the smooth parts of a known run as a function with its first derivatives: the first fields of `EventRun`."""
+    """Return what is smooth in a run that is known, as a function with its first derivatives: the first fields of `EventRun`."""
     ts, T, K, n = stop_gradients(given.ts), len(given.ts), len(found.event_time), len(given.q)
     width = min(OUTPUTS, T)
     pieces = K + -(-T // (width - 1)) + 2

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,18 +17,21 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import Closure, State
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
-from udkjax.integrate.events.at_once import run_at_once
-from udkjax.integrate.events.condition_program import condition_programs
+from udkjax.integrate.events.condition_program import watched_conditions
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events
+from udkjax.integrate.events.event_run import EventRun, RunInput
 from udkjax.integrate.events.hybrid import Hybrid
+from udkjax.integrate.events.known_run import KnownRun, event_arrays, known_event_plan
 from udkjax.integrate.events.phases import Phases, phases_of
-from udkjax.integrate.events.replay import EventRun, RunInput, run_events
+from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import violation
+from udkjax.integrate.put import put_arrays
 from udkjax.integrate.solution import Result, Solution
+from udkjax.native.conditions import Conditions
 from udkjax.scene.checks import quote
-from udkjax.scene.fields import is_traced, is_within_jit
+from udkjax.scene.fields import is_traced, is_within_jit, number
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -44,13 +48,14 @@ class Given(NamedTuple):
     closure: Closure | None  # in place of the state
     choices: Choices
     max_events: int
+    conditions: Conditions | None  # of all events, for machine code; None: it cannot serve the run
 
 
 def simulate_events(
     mechanism: Mechanism,
     events: ExpandsToEvents | Sequence[ExpandsToEvents],
     analysis: Analysis,
-    ts: Float[Array, "T"],
+    ts: Any,
     state: State | None,
     closure: Closure | None,
     choices: Choices,
@@ -72,30 +77,44 @@ def simulate_events(
         ValueError: the events do not fit the mechanism, or machine code was asked for and cannot run it.
     """
     listed, phases = _prepare(mechanism, events, analysis)
-    given = Given(phases, listed, ts, state, closure, choices, max_events)
-    run = _run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run
-    found, reasons = _run_at_once(mechanism, analysis, given) or run(given)
+    has_code = not phases.added and not choices.take_diffrax and jax.default_backend() == "cpu"
+    conditions = watched_conditions(listed, phases.mechanisms[0]) if has_code else None
+    ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
+    given = Given(phases, listed, ts, state, closure, choices, max_events, conditions)
+    found = _run_at_once(mechanism, given)
+    if found is None:
+        given = given._replace(ts=number(ts), choices=choices.arrays())
+        found = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
+    found, reasons = found
     names = tuple(e.name for e in listed)
-    if is_traced(given):
+    if is_within_jit() or is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
         return solution(mechanism, names, given, found, reasons, None)
     found = jax.tree.map(np.asarray, found)  # of which each operation of JAX would be a program to compile
     if np.isfinite(found.unresolved).any():
         fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
-    return jax.device_put(_solution(mechanism, names, given, found, reasons, int(found.count)))
+    return put_arrays(_solution(mechanism, names, given, found, reasons, int(found.count)))
 
 
-def _run_at_once(mechanism: Mechanism, analysis: Analysis, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
-    """Return the result of `_run` by machine code alone: of known numbers, and of events that change nothing."""
-    if not mechanism.is_concrete or is_traced(given) or is_within_jit() or jax.config.jax_disable_jit:
+def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
+    """Return what `_run` does, where machine code alone finds it, of known numbers."""
+    is_known = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
+    if given.conditions is None or not is_known or jax.config.jax_disable_jit:
         return None
-    compiled = compile_known(mechanism, analysis, *given.choices.of_mechanism)
-    if not compiled.plan.is_native:
+    phases, choices = given.phases, given.choices
+    compiled = [compile_known(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
+    if not all(x.plan.is_native for x in compiled):
         return None
-    run = prepare_run(compiled, analysis, np.asarray(given.ts), given.state, given.closure, given.choices, np)
-    found = run_at_once(run, given.events, mechanism.body_names, float(given.choices.drift_tol), given.max_events)
-    return None if found is None else (found, (compiled.plan.why_not_native,))
+    run = prepare_run(compiled[0], phases.analyses[0], given.ts, given.state, given.closure, choices, np)
+    code = Result.successful if run.is_closed else Result.could_not_assemble
+    code = Result.invalid_argument if not run.is_usable else Result.drift if run.has_missed_rows else code
+    problems = [replace(run.problem, compiled=x) for x in compiled]
+    settings = choices.max_steps, given.max_events
+    plan = known_event_plan(phases, given.conditions, *settings, *given.events, *compiled)
+    arrays = event_arrays(plan, given.events, problems, np.asarray(code.value), choices.drift_tol, np)
+    found = EventRun(*(x[0] for x in KnownRun(plan, len(run.ts), len(run.problem.q))(*arrays)))
+    return None if found.code < 0 else (found, tuple(x.plan.why_not_native for x in compiled))
 
 
 Prepared = tuple[tuple[Event, ...], Phases]
@@ -122,12 +141,10 @@ def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents], analysis: A
 
 def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     """Run, and return with the result why machine code does not serve each phase."""
-    phases, events, ts, state, closure, choices, max_events = given
+    phases, events, ts, state, closure, choices, max_events, conditions = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)
-    problem, stabilization, programs = run.problem, choices.stabilization, None
-    if any(x.plan.is_native for x in compiled):
-        programs = condition_programs(events, phases.mechanisms[0].body_names)
+    problem, stabilization = run.problem, choices.stabilization
     hybrid = Hybrid(
         phases=phases,
         events=events,
@@ -142,7 +159,6 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
         formulation=choices.formulation,
         max_steps=choices.max_steps,
         plans=tuple(x.plan for x in compiled),
-        watched=None if programs is None else programs.watched,
     )
     code = jnp.where(run.is_closed, Result.successful, Result.could_not_assemble)
     if closure is None:
@@ -152,7 +168,9 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     code = jnp.where(run.has_missed_rows, Result.drift, code)
     code = jnp.where(run.is_usable & stop_gradients(hybrid.has_usable_numbers), code, Result.invalid_argument)
     start = RunInput(problem.ts, problem.q, problem.v, code, choices.drift_tol)
-    return run_events(hybrid, start, max_events), tuple(x.plan.why_not_native for x in compiled)
+    if not all(x.plan.is_native for x in compiled):
+        conditions = None
+    return run_events(hybrid, start, conditions, max_events), tuple(x.plan.why_not_native for x in compiled)
 
 
 _compiled_run, _deferred_run = eqx.filter_jit(_run), deferred(_run)

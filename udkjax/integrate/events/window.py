@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ZERO_RATE, ZERO_RATE_2
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ZERO_RATE, ZERO_RATE_2, ConditionValues
 from udkjax.integrate.events.detection import INTERVALS, NODES, ROOT, SECOND_OF_TWO, Nodes, detect
-from udkjax.integrate.events.hybrid import ConditionValues, Hybrid, RunState
+from udkjax.integrate.events.hybrid import Hybrid, RunState
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
 from udkjax.native.conditions import FINEST, PER_TIME, SHORT
@@ -122,7 +122,6 @@ def integrate_window(
     quiet: Float[Array, "2E"],
     unresolved: Bool[Array, "2E"],
     drift_tol: Float[Array, ""],
-    runs: Bool[Array, ""],
 ) -> WindowResult:
     """Integrate a window, and look for the first crossing in it.
 
@@ -137,14 +136,13 @@ def integrate_window(
         quiet: the time up to which each condition has no crossings in pairs.
         unresolved: the conditions that are known to be too fast.
         drift_tol: the violation of the constraints that ends a run.
-        runs: whether it is to be done at all, as that of a member of a batch.
     """
     times, nodes, due, E = window.times, window.nodes, window.due, hybrid.count
     first, length = times[0], times[-1] - times[0]
     # Too short to integrate, or of no length, as of a member of a batch that something else happens to.
     short = length <= 2 * hybrid.smallest
     clear = jnp.where(short, first + 100 * hybrid.smallest * np.arange(len(times)), times)
-    raw = hybrid.flow(clear, state, derivatives=False, runs=runs)
+    raw = hybrid.flow(clear, state, derivatives=False)
     own = (short | (np.arange(len(times)) == 0))[:, None]
     q = jnp.where(own, state.q + (times - first)[:, None] * state.v, raw.q)
     v = jnp.where(own, state.v, raw.v)

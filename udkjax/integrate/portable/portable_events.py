@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events.actions import Log, Stop
-from udkjax.integrate.events.condition_program import condition_numbers, condition_programs
+from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions
 from udkjax.integrate.events.crossings import ZERO
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.native.conditions import HEAD
@@ -37,13 +37,12 @@ class PortableEvents:
             if not isinstance(event.action, Log | Stop):
                 kind = type(event.action).__name__
                 raise ArgumentError(f"live: a page knows Log and Stop, and event {quote(event.name)} has {kind}: leave out live")
-        programs = condition_programs(self._events, mechanism.body_names) if events else None
-        if programs is None and events:
+        self._conditions = watched_conditions(self._events, mechanism) if events else None
+        if self._conditions is None and events:
             raise UnsupportedError("the condition of an event")
-        self._programs = programs
 
     def data(self, analysis: Analysis) -> dict[str, Any] | None:
-        """Return the events as data of a page; None where there are none."""
+        """Return what a page knows of the events; None where there are none."""
         if not self._events:
             return None
         return {
@@ -62,12 +61,12 @@ class PortableEvents:
 
     def watched_by(self, operation: RunStates) -> RunStates:
         """Return the run that ends where a condition crosses zero."""
-        return operation if self._programs is None else operation.watching(self._programs.watched)
+        return operation if self._conditions is None else operation.watching(self._conditions)
 
     def functions(self) -> list[Function]:
         """Return `conditions(in, out)`: of t, q, v and their numbers each condition, and its derivatives by t, q and v."""
-        if self._programs is None:
+        if self._conditions is None:
             return []
-        program = self._programs.derivatives
+        program = self._conditions.slopes
         places = consecutive("in", len(program.inputs)), consecutive("out", len(program.outputs))
         return [write(program, "conditions", 1, ("in", "out"), *places)]

@@ -120,7 +120,7 @@ def _points(places, length) -> dict[str, Numbers]:
 
 
 def _spot(placed, local):
-    """Return the place of a point of a body."""
+    """Return where a point of a body is."""
     return as_array(Frame.at(*placed).point(local))
 
 

@@ -53,7 +53,7 @@ class Fit(NamedTuple):
 
     @classmethod
     def of(cls, ends: Sequence[End]) -> "Fit":
-        """Return the ends of some fits as one."""
+        """Return where some fits ended as one."""
         z, cost, settled, _ = zip(*ends, strict=True)
         return cls(np.array(z), np.array(cost), np.array(settled), min(ends, key=lambda end: end.cost).history)
 

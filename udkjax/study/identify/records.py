@@ -190,7 +190,7 @@ def tabulate(records: Sequence[Record], keys: Sequence[Key]) -> tuple[np.ndarray
 
 
 def label_prefixes(records: Sequence[Record]) -> list[str]:
-    """Return the beginning of names of channels in messages: the name of their record, if there are several."""
+    """Return what names of channels begin with in messages: the name of their record, if there are several."""
     return [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
 
 
@@ -201,7 +201,7 @@ def dataset_of_fit(
     residuals: Sequence[Mapping[str, np.ndarray]],
     noise: Sequence[Mapping[str, np.ndarray]],
 ) -> "xarray.Dataset":
-    """Return measurements and predictions of a fit, along record, sample and channel; nan where nothing was measured."""
+    """Return what was measured and what a fit shows of it, along record, sample and channel; nan where nothing was measured."""
     with OptionalImport():
         import xarray
     shape = len(records), max(len(record.times) for record in records), len(channels)

@@ -103,7 +103,7 @@ def search(
 
 
 def _count_agreeing(fit: Fit) -> int:
-    """Return the number of fits at the best minimum."""
+    """Return how many fits are at the best minimum."""
     best = int(np.argmin(fit.cost))
     agreeing = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM_DISTANCE * (1.0 + np.abs(fit.z[best]).max())
     return int((agreeing & np.isfinite(fit.cost)).sum())

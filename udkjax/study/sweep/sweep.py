@@ -103,7 +103,7 @@ def sweep(
 
 
 def _engine(engine: str, client: "distributed.Client | None") -> Compute:
-    """Return the engine that computes chunks: a client that is given is there to be used."""
+    """Return what computes chunks: a client that is given is there to be used."""
     return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices
 
 
@@ -181,7 +181,7 @@ class Watch:
         self.show(self.state)
 
     def _left(self, now: float) -> float | None:
-        """Estimate the remaining time (s), by the pace since its work is known."""
+        """Estimate how long the rest takes (s), by the pace since its work is known."""
         return (now - self.since) / self.work_done * (self.work - self.work_done) if self.work_done > 0 else None
 
 
@@ -214,7 +214,7 @@ def _find_slowest(before: tuple[int, T] | None, who: ArrayLike, values: ArrayLik
 
 
 def duration(seconds: float) -> str:
-    """Return a time (s) as text."""
+    """Say how long something takes."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -1,0 +1,152 @@
+"""Runs with events by machine code, of members together, against their plain form and the textbook equations."""
+
+# pyright: reportOptionalMemberAccess=false
+# All of these runs have events.
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.integrate.event_scenes import BALL, PENDULUM
+from udkjax.equations.analysis import analyse
+from udkjax.equations.textbook import prepare
+from udkjax.integrate.compiled_mechanism import compile_known
+from udkjax.integrate.events import simulate_events
+from udkjax.integrate.events.condition_program import watched_conditions
+from udkjax.integrate.events.conditions import frames_of
+from udkjax.integrate.events.event import expand_events
+from udkjax.integrate.events.impacts import contact_rows, rows_of_directions
+from udkjax.integrate.events.known_run import event_arrays, known_event_plan
+from udkjax.integrate.events.phase_code import PhaseCode
+from udkjax.integrate.events.phases import phases_of
+from udkjax.integrate.prepare import Choices, prepare_run
+from udkjax.integrate.projection import Projection
+from udkjax.pinv import SVD
+
+BOX = udk.Mechanism({"box": udk.Body(1.0, 0.1, position=(0.1, 0.6), angle=0.2)})
+FEET = [udk.Contact("box", point=[x, -0.2], restitution=0.3, name=f"foot{x}") for x in (-0.5, 0.5)]
+LIMITS = [
+    udk.JointLimit("A", lower=-2.5, restitution=0.6, name="limit"),
+    udk.Event(lambda t, at: at["link"].omega, udk.Log(), name="turn"),
+    udk.Event(lambda t, at: at["link"].x - 0.2, udk.Log(), 1, name="passes"),
+]
+CUT = [
+    udk.Event(lambda t, at: at["link"].angle + 1.0, udk.Release("A"), name="cut"),
+    udk.Contact("link", point=[0.5, 0], through=[0, -2.0], restitution=0.5, name="floor"),
+]
+FIVE_BAR = udk.library.parallelogram()
+STOPS = [udk.JointLimit(next(iter(FIVE_BAR.joints)), lower=-2.0, restitution=0.6)]
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "events", "end"),
+    [(PENDULUM, LIMITS, 2.0), (PENDULUM, CUT, 0.945), (FIVE_BAR, STOPS, 3.0), (BOX, FEET, 0.41)],
+    ids=["limits", "cut", "redundant", "box"],
+)
+def test_machine_code_does_what_the_plain_form_does(mechanism, events, end, monkeypatch):
+    ts = np.linspace(0.0, end, 9)
+    fast = udk.simulate(mechanism, ts, events=events, rtol=1e-10, atol=1e-10, max_events=60)
+    monkeypatch.setattr(simulate_events, "watched_conditions", lambda *given: None)
+    plain = udk.simulate(mechanism, ts, events=events, rtol=1e-10, atol=1e-10, max_events=60)
+    assert fast.events.count == plain.events.count > 1 and (fast.events.index == plain.events.index).all()
+    assert np.abs(fast.events.time - plain.events.time).max() < 1e-8
+    assert np.abs(fast.events.v_after - plain.events.v_after).max() < 1e-6
+    assert fast.result == plain.result and np.abs(fast.q - plain.q).max() < 1e-7
+
+
+def test_members_of_a_batch_run_as_they_do_alone():
+    """Of balls that rest after some bounces, and others that do not; and one above no floor, which starts beyond it."""
+    ts, given = np.linspace(0, 2.0, 9), np.array([[0.2, 1.0], [0.9, 1.0], [0.5, 0.3], [0.5, -1.0], [1.2, 1.0]])
+
+    def run(x):
+        ball = BALL.with_parameters({"body.ball.position": jnp.stack([jnp.zeros(()), x[1]])})
+        return udk.simulate(ball, ts, events=udk.Contact("ball", restitution=x[0]), throw=False, max_events=20)
+
+    together = jax.jit(jax.vmap(run))(given)
+    codes = [udk.Result.successful] * 3 + [udk.Result.beyond_contact, udk.Result.invalid_argument]
+    assert (np.asarray(together.code) == codes).all()
+    for k, x in enumerate(given[:4]):
+        alone = jax.jit(run)(x)
+        assert together.events.count[k] == alone.events.count and (together.events.index[k] == alone.events.index).all()
+        for one, other in (
+            (together.q[k], alone.q),
+            (together.events.time[k], alone.events.time),
+            (together.time[k], alone.time),
+        ):
+            np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def phase_codes(mechanism, events):
+    """The machine code of all phases of a mechanism with events, and one over the masses."""
+    with jax.ensure_compile_time_eval():
+        listed = expand_events(events, mechanism)
+        phases, choices = (
+            phases_of(mechanism, listed, analyse(mechanism)),
+            Choices(1e-8, 1e-8, 1e-6, None, udk.Auto(), Projection()),
+        )
+        compiled = [compile_known(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
+        state = udk.State(mechanism.q0, mechanism.v0)
+        run = prepare_run(compiled[0], phases.analyses[0], np.array([0.0, 1.0]), state, None, choices, np)
+        conditions = watched_conditions(listed, mechanism)
+        assert conditions is not None
+        plan = known_event_plan(phases, conditions, 1000, 10, *listed, *compiled)
+        problems = [replace(run.problem, compiled=x) for x in compiled]
+        arrays = event_arrays(plan, listed, problems, np.zeros(()), np.asarray(1e-6), np)
+    numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[8:], []
+    for of_phase in plan.phases:
+        codes.append(PhaseCode(of_phase, rest[: of_phase.count], numbers, inverse_mass, 3))
+        rest = rest[of_phase.count :]
+    return codes, inverse_mass
+
+
+def test_machine_code_knows_of_states_what_the_textbook_does():
+    """Accelerations, conditions with both rates and their derivatives, and what impulses do, of several states."""
+    mechanism, events = FIVE_BAR, [*STOPS, udk.Event(lambda t, at: at[FIVE_BAR.body_names[1]].omega * t, udk.Log(), name="turn")]
+    (code, *_), inverse_mass = phase_codes(mechanism, events)
+    listed, names = expand_events(events, mechanism), mechanism.body_names
+    start = udk.assemble(mechanism)
+    moved = udk.simulate(mechanism, [0.0, 0.3, 0.7, 1.1], start)
+    t, q, v = np.array([0.3, 0.7, 1.1]), np.asarray(moved.q)[1:].reshape(3, -1), np.asarray(moved.v)[1:].reshape(3, -1)
+    found = code.at(np.arange(3), t, q, v)
+    textbook = prepare(mechanism, SVD(), None, analyse(mechanism))
+
+    def conditions(t, q, v):
+        frames = frames_of(names, q, v)
+        return jnp.stack([jnp.asarray(e.condition(t, frames), float) for e in listed])
+
+    def along(f, t, q, v, a):
+        return jax.jvp(f, (t, q, v), (1.0, v, a))[1]
+
+    def rates(t, q, v):
+        return along(conditions, t, q, v, jnp.zeros_like(v))
+
+    for k in range(3):
+        a = textbook.accelerations(t[k], q[k], v[k])
+        assert np.abs(found.a[k] - a).max() < 1e-10
+        assert np.abs(found.g[k] - conditions(t[k], q[k], v[k])).max() < 1e-13
+        assert np.abs(found.rate[k] - along(conditions, t[k], q[k], v[k], a)).max() < 1e-9
+        second = along(rates, t[k], q[k], v[k], a)
+        assert abs(found.rate_2[k, 0] - second[0]) < 1e-9 and found.rate_2[k, 1] == 0
+        slopes = jax.jacfwd(conditions, (0, 1, 2))(t[k], q[k], v[k])
+        for one, other in zip((found.by_t, found.by_q, found.by_v), slopes, strict=True):
+            assert np.abs(one[k] - other).max() < 1e-12
+        rows = rows_of_directions(found.by_q[k], found.directions[k], inverse_mass[0])
+        expected = contact_rows(textbook, t[k], q[k], slopes[1])
+        assert abs(rows.W[0, 0] - expected.W[0, 0]) < 1e-12 * expected.W[0, 0] and rows.free[0]
+        assert np.abs(rows.directions[0] - expected.directions[0]).max() < 1e-12
+
+
+def test_the_force_of_a_contact_at_rest_ends_its_rest():
+    """A point on a dome, at rest at its top but for a push, leaves it where it would be pulled: where g cos = v^2 / r."""
+    radius, push = 1.2, 0.3
+    ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, radius), velocity=(push, 0.0))})
+    dome = udk.Event(lambda t, at: jnp.hypot(at["ball"].x, at["ball"].y) - radius, udk.Impact(0.0), name="dome")
+    sol = udk.simulate(ball, np.linspace(0, 1.5, 4), events=dome, rtol=1e-11, atol=1e-11)
+    assert sol.settings["engine"] == "native" and [int(k) for k in sol.events.index] == [2, 1]  # it rests, and lets go
+    x, y = np.asarray(sol.events.q_before)[1, 0, :2]
+    speed = np.asarray(sol.events.v_before)[1, 0, :2]
+    assert abs(np.hypot(x, y) - radius) < 1e-10 and abs(9.81 * y - speed @ speed) < 1e-7
+    assert abs(y / radius - (2 / 3 + push**2 / (3 * 9.81 * radius))) < 1e-8

@@ -1,0 +1,91 @@
+"""Machine code of what an event needs to know of single states: accelerations, conditions, and what impulses do.
+
+Of a state (t, q, v) it returns, one behind another:
+
+    a                        the accelerations (n,)
+    g, g_dot, g_ddot         conditions with first and second rates along the motion (E,) each
+    g_t, g_q, g_v            their derivatives (E,), (E, n), (E, n)
+    d                        directions of impulses along g_q (E, n), of impacts alone
+
+A direction d = P M^(-1) g_q^T is the velocity that a unit impulse along g_q gives, with P the part that the constraints leave, so
+that W_ij = g_q,i d_j.
+"""
+
+from udkjax.native.conditions import Conditions
+from udkjax.native.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.layout import Lane
+from udkjax.native.program import write
+from udkjax.native.state_functions import StateAccelerations, StateTangentPart
+
+
+class EventStates(StateTangentPart, StateAccelerations):
+    """The text of a module that evaluates conditions and directions of impulses at states.
+
+    Its further input holds the numbers of the conditions, and one over the mass of each coordinate.
+    """
+
+    inputs = ("event_numbers",)
+    found = ()
+
+    def __init__(
+        self, code, conditions: Conditions, impacts: tuple[int, ...], pseudoinverse, formulation, width: int, vector: int
+    ):
+        self.conditions, self.impacts = conditions, impacts
+        super().__init__(code, pseudoinverse, formulation, width, vector)
+        self.places.add("event numbers", conditions.number_count)
+        self.places.add("event values", len(conditions.at_state.outputs))
+        self.places.add("inverse mass", self.n)
+        self.places.add("directions", len(impacts) * self.n)
+
+    @property
+    def solving(self) -> list[str]:
+        return ["accelerations", "tangent_part"]
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        given = self.member_address(f, self.call_record(f), "event_numbers", member)
+        for name, start, count in (
+            ("event numbers", 0, self.conditions.number_count),
+            ("inverse mass", self.conditions.number_count, self.n),
+        ):
+            with f.each(count) as i:
+                f.store(f.load(given, i + start), f.given["work"], (i + self.places[name]) * f.width + lane)
+
+    def write_programs(self):
+        super().write_programs()
+        n, p, program = self.n, self.places, self.conditions.at_state
+        inputs = [("work", p["state t"])]
+        for name in ("state q", "state v", "result a"):
+            inputs += [("work", p[name] + i) for i in range(n)]
+        inputs += [("work", p["event numbers"] + i) for i in range(self.conditions.number_count)]
+        outputs = [("work", p["event values"] + k) for k in range(len(program.outputs))]
+        self.functions.append(write(program, "conditions", self.plan.width, ("work",), inputs, outputs))
+
+    def _evaluate(self, f: Function, s: Lane):
+        StateAccelerations._evaluate(self, f, s)
+        f.call("conditions", f.given["work"])
+        count = self.conditions.own_count
+        for k, event in enumerate(self.impacts):
+            with f.each(self.n) as i:
+                normal = f.load(
+                    f.given["work"], (i + (self.places["event values"] + 4 * count + event * self.n)) * f.width, f.width
+                )
+                mobility = f.load(f.given["work"], (i + self.places["inverse mass"]) * f.width, f.width)
+                f.store(normal * mobility, f.given["work"], (i + self.places["state dq"]) * f.width, f.width)
+                f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], (i + self.places["state dv"]) * f.width, f.width)
+            StateTangentPart._evaluate(self, f, s)
+            with f.each(self.n) as i:
+                found = f.load(f.given["work"], (i + self.places["result dq"]) * f.width, f.width)
+                f.store(found, f.given["work"], (i + (self.places["directions"] + k * self.n)) * f.width, f.width)
+
+    def write_found(self, f: Function, s: Lane):
+        counts = {
+            "result a": self.n,
+            "event values": len(self.conditions.at_state.outputs),
+            "directions": len(self.impacts) * self.n,
+        }
+        to, size = f.load(f.given["call"], self.call_fields.index("found"), base=POINTER), sum(counts.values())
+        with f.each(f.width) as k, f.if_(f.lane(s.active, k) > 0.5):
+            member, start = self.to_int(f, f.lane(s.member, k)) * size, 0
+            for name, count in counts.items():
+                self.copy_lane(f, f.at(to, member), start, name, k, count=count)
+                start += count
