@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.expressions.deferred import deferred_p
+from udkjax.native import primitive
 
 ROOT = Path(udk.__file__).parent
 TS = np.linspace(0.0, 0.2, 5)
@@ -45,7 +46,8 @@ def pendulums(count: int) -> udk.Mechanism:
     return udk.Mechanism(bodies, joints)
 
 
-def test_few_functions_stand_between_a_call_and_machine_code():
+def test_few_functions_stand_between_a_call_and_machine_code(monkeypatch):
+    monkeypatch.setattr(primitive, "QUICK_MEMBERS", 0)  # by code that serves for good
     mechanism = udk.library.parallelogram()
     udk.simulate(mechanism, TS)
     seen = called(lambda: udk.simulate(mechanism, TS))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from udkjax.native.values import BOOL, DOUBLE, INT, POINTER, Operand, Value, literal, llvm_type
+from udkjax.native.values import BOOL, DOUBLE, INT, POINTER, Operand, Product, Value, literal, llvm_type
 
 _COMPARE = {
     "lt": ("olt", "slt"),
@@ -111,15 +111,32 @@ class Function:
         return self.op(f"shufflevector {kind} {one.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
 
     def both(self, a: Operand, b: Operand) -> tuple[Value, Value]:
+        if isinstance(a, Value) and isinstance(b, Value) and a.base == b.base and a.width == b.width:
+            return a, b
         width = max(x.width for x in (a, b) if isinstance(x, Value))
         bases = [x.base for x in (a, b) if isinstance(x, Value)]
         base = DOUBLE if DOUBLE in bases else bases[0]
         return self.like(a, base, width), self.like(b, base, width)
 
     def arithmetic(self, kind: str, a: Operand, b: Operand) -> Value:
+        """Add, subtract, multiply or divide.
+
+        A product that is added to something is not rounded before that. It is said here, and not left to LLVM, whose levels of
+        optimization would round in different places.
+        """
         x, y = self.both(a, b)
-        name = f"f{kind} contract" if x.base == DOUBLE else {"div": "sdiv"}.get(kind, kind)
-        return self.op(f"{name} {x.type} {x.name}, {y.name}", x.base, x.width)
+        if x.base != DOUBLE:
+            return self.op(f"{'sdiv' if kind == 'div' else kind} {x.type} {x.name}, {y.name}", x.base, x.width)
+        if kind == "sub" and (x.product or y.product):
+            kind, y = "add", -y
+        if kind == "add":
+            for product, other in ((x.product, y), (y.product, x)):
+                if product:
+                    return self.fma(-product.a if product.is_negative else product.a, product.b, other)
+        found = self.op(f"f{kind} {x.type} {x.name}, {y.name}", DOUBLE, x.width)
+        if kind == "mul":
+            found.product = Product(x, y)
+        return found
 
     def compare(self, kind: str, a: Operand, b: Operand) -> Value:
         x, y = self.both(a, b)

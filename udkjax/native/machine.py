@@ -17,6 +17,7 @@ from typing import Any
 from udkjax.native import code_cache
 
 LEVEL = 1  # of code generation: 2 takes a fifth longer, and runs take as long
+QUICK = 0  # for first calls: a quarter of the time of level 1; a run takes twice as long, five times in lanes, and rounds alike
 # Optimizations of the text before that. Programs come without common subexpressions and dead code: all that LLVM's own selection
 # of level 1 adds is two percent of a run's time, for half of the time of compiling.
 PASSES = ("sroa", "simplify_cfg")
@@ -33,11 +34,11 @@ def _llvm() -> Any:
     return llvm
 
 
-def _target_machine() -> Any:
+def _target_machine(level: int) -> Any:
     """A compiler for the processor that runs this."""
     llvm = _llvm()
     return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=_features(), opt=LEVEL, reloc="pic", codemodel="small", jit=True
+        cpu=llvm.get_host_cpu_name(), features=_features(), opt=level, reloc="pic", codemodel="small", jit=True
     )
 
 
@@ -55,13 +56,18 @@ def lanes() -> int:
     return 4 if features.get("avx2") and features.get("fma") else 2
 
 
-def digest(text: str) -> str:
+def digest(text: str, level: int = LEVEL) -> str:
     """Return the key of a program, on this processor, with this compiler."""
+    return hashlib.sha256("\0".join((text, _compiler(), str(level), *PASSES)).encode()).hexdigest()[:32]
+
+
+@cache
+def _compiler() -> str:
+    """The processor and the compiler."""
     import llvmlite
 
     llvm = _llvm()
-    parts = [text, llvm.get_host_cpu_name(), _features(), llvm.get_default_triple(), llvmlite.__version__, str(LEVEL), *PASSES]
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+    return "\0".join((llvm.get_host_cpu_name(), _features(), llvm.get_default_triple(), llvmlite.__version__))
 
 
 @cache
@@ -77,7 +83,8 @@ class Library:
 
     _numbers = itertools.count()
 
-    def __init__(self, parts: Sequence[bytes], names: Sequence[str]):
+    def __init__(self, parts: Sequence[bytes], names: Sequence[str], is_optimized: bool = True):
+        self.is_optimized = is_optimized
         builder = _llvm().JITLibraryBuilder().add_current_process()
         for code in parts:
             builder.add_object_img(code)
@@ -89,25 +96,30 @@ class Library:
         return self._tracker[name]
 
 
-def library(text: str, names: Sequence[str]) -> Library:
+def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
     """The code of a module, with the functions of these names: from disk, or compiled and put there."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return Library(list(pool.map(_stored_code, split_module(text))), names)
+        codes, levels = zip(*pool.map(lambda part: _stored_code(part, level), split_module(text)), strict=True)
+    return Library(codes, names, is_optimized=min(levels) == LEVEL)
 
 
-def _stored_code(text: str) -> bytes:
-    name = digest(text)
-    code = code_cache.read(name)
-    if code is None:
-        code = compile_module(text)
-        code_cache.write(name, code)
-    return code
+def _stored_code(text: str, level: int) -> tuple[bytes, int]:
+    """Return the code of a level, or better code that is on disk, and its level."""
+    for some in range(LEVEL, level - 1, -1):
+        code = code_cache.read(digest(text, some))
+        if code is not None:
+            return code, some
+    code = compile_module(text, level)
+    code_cache.write(digest(text, level), code)
+    return code, level
 
 
 def split_module(text: str) -> list[str]:
     """Split a module into modules that can be compiled at once, the largest first, each with the declarations that it needs."""
-    bodies = {match[1]: match[0] for match in re.finditer(r"^define [^@\n]*@(\w+)\(.*?^}\n", text, re.DOTALL | re.MULTILINE)}
-    heads = {match[1]: match[0] for match in re.finditer(r"^(?:declare [^@\n]*)?@([\w.]+)[ (].*\n?", text, re.MULTILINE)}
+    text = f"\n{text}"  # by which lines are found several times as fast as by the anchor of a line
+    found = (text[match.end() : text.index("\n}\n", match.end()) + 3] for match in re.finditer(r"\n(?=define )", text))
+    bodies = {body[body.index("@") + 1 : body.index("(", body.index("@"))]: body for body in found}
+    heads = {match[2]: f"{match[1]}\n" for match in re.finditer(r"\n((?:declare [^@\n]*)?@([\w.]+)[ (].*)", text)}
     lines = {name: body.count("\n") for name, body in bodies.items()}
     groups, size = [[name] for name in bodies if lines[name] >= PART_LINES], GROUP_LINES
     for name in bodies:
@@ -123,23 +135,23 @@ def split_module(text: str) -> list[str]:
     for members in groups:
         part = "".join(bodies[name] for name in members)
         used = sorted(set(re.findall(r"@([\w.]+)", part)) - {*members})
-        parts.append("".join(heads[name] if heads[name].endswith("\n") else heads[name] + "\n" for name in used) + part)
+        parts.append("".join(heads[name] for name in used) + part)
     return parts
 
 
-def compile_module(text: str) -> bytes:
+def compile_module(text: str, level: int = LEVEL) -> bytes:
     """Object code of a module."""
-    return object_code(text, _target_machine(), _llvm().get_default_triple())
+    return object_code(text, _target_machine(level), _llvm().get_default_triple(), () if level == QUICK else PASSES)
 
 
-def object_code(text: str, machine: Any, triple: str) -> bytes:
+def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[str] = PASSES) -> bytes:
     """Object code of a module by a compiler of its own, as is the context: several threads compile at once."""
     llvm = _llvm()
     with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
         module.triple = triple
         module.data_layout = str(machine.target_data)
         passes = llvm.create_new_module_pass_manager()
-        for name in PASSES:
+        for name in optimizations:
             getattr(passes, f"add_{name}_pass")()
         passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
         return _emit(machine, module)

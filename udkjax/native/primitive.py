@@ -3,10 +3,11 @@
 import ctypes
 import math
 import os
+import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -22,12 +23,16 @@ from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.expressions.numpy_program import evaluate_as
 from udkjax.native import machine
 from udkjax.native.ffi import handler
-from udkjax.native.layout import INPUTS, OUTPUTS
+from udkjax.native.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.loops import LoopWriter
 from udkjax.native.module import Module
 from udkjax.native.operations import Operation
 from udkjax.native.program import UnsupportedError
+from udkjax.native.steps import STEP_LIMIT
 
+QUICK_MEMBERS = 16  # of a call by code that is compiled quickly
+QUICK_STEPS = 4_000  # of all its members: some 20 ms
+QUICK_SECONDS_OF_LINE = 2e-6  # of such calls, in all: a tenth of what it takes to compile a line
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
 
 
@@ -61,19 +66,62 @@ def unsupported(code: ScenePrograms) -> str:
 
 
 class LoadedCode:
-    """The machine code of one operation, in so many lanes."""
+    """The machine code of one operation, in so many lanes.
+
+    First calls are of code that is compiled quickly, until they have taken a tenth of the time that optimized code would; and
+    those of few members and steps alone, since it runs slowly. Both round alike.
+    """
 
     def __init__(self, operation: Operation, width: int, beside: int):
         self._module, self._in_passes = generate(operation, width, beside), operation.is_reverse
-        self.name, self._run = load(self._module.written_text)
         self._fields = self._module.call_fields
+        settings = operation.all_settings
+        self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
+        self._seconds = QUICK_SECONDS_OF_LINE * self._module.written_text.count("\n") if operation.code.is_small else 0.0
+
+    @property
+    def name(self) -> str:
+        """The name that XLA knows it by."""
+        return self._optimized.name
+
+    @cached_property
+    def _optimized(self) -> "Code":
+        self._seconds = 0.0
+        return load(self._module.written_text)
+
+    @cached_property
+    def _quick(self) -> "Code":
+        return load(self._module.written_text, machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Outputs of these shapes, on as many threads as there are cores."""
+        if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and not self._quick.library.is_optimized:
+            found = self._call_quickly(inputs, shapes)
+            if found is not None:
+                return found
         return self.prepare(inputs, shapes)()
 
-    def prepare(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> "PreparedCall":
+    def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
+        """Return the outputs; None if there are more steps than this should take."""
+        inputs, most, place = [*inputs], QUICK_STEPS / shapes[0][0], self._step_limit
+        if place is not None:
+            k = INPUTS.index("settings")
+            settings = inputs[k] = np.array(inputs[k], np.float64)
+            is_limited = settings[:, place] > most
+            settings[is_limited, place] = most
+        start = time.perf_counter()
+        found = self.prepare(inputs, shapes, self._quick)()
+        self._seconds -= time.perf_counter() - start
+        if place is not None and np.any(is_limited & (found[OUTPUTS.index("info")][:, INFO.index("code")] == STEP_LIMIT)):
+            self._seconds = 0.0
+            return None
+        return found
+
+    def prepare(
+        self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: "Code | None" = None
+    ) -> "PreparedCall":
         """Return a call, which may be repeated with other numbers in its inputs: those given, where they are float64."""
+        code = code or self._optimized
         names, fields = self._module, {}
         inputs = [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Of the two passes of reverse mode each leaves out what the other finds: zeros, since NaN would alarm jax.debug_nans.
@@ -90,7 +138,7 @@ class LoadedCode:
         fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
         call = (ctypes.c_int64 * len(self._fields))(*[fields[name] for name in self._fields])
         threads = min(members, os.cpu_count() or 1) if members > 1 else 1
-        return PreparedCall(self._run, call, following, threads, inputs, found)
+        return PreparedCall(code.run, call, following, threads, inputs, found)
 
 
 class PreparedCall(NamedTuple):
@@ -114,24 +162,35 @@ class PreparedCall(NamedTuple):
         return self.outputs
 
 
-_LOADED: dict[str, tuple[machine.Library, Any]] = {}
+class Code(NamedTuple):
+    """Machine code in memory: the name that XLA knows it by if it is optimized, and its function `run`."""
+
+    name: str
+    run: Callable[[int], Any]
+    library: machine.Library
+
+
+_LOADED: dict[str, Code] = {}
 _LOADING = Lock()
 
 
-def load(text: str) -> tuple[str, Any]:
-    """Load the code of a module; return the name that XLA knows it by, and `run`.
+def load(text: str, level: int = machine.LEVEL) -> Code:
+    """Load the code of a module: that of this level, or optimized code where there is some.
 
     XLA takes one address for a name, and programs that it has compiled call that whenever they run: code that was loaded once
     stays, and serves every caller with the same text.
     """
     name = f"udkjax_{machine.digest(text)}"
     with _LOADING:
-        if name not in _LOADED:
-            library = machine.library(text, ("run", "call_frame"))
+        if name in _LOADED:
+            return _LOADED[name]
+        library = machine.library(text, ("run", "call_frame"), level)
+        code = Code(name, machine.function(library["run"], ctypes.c_void_p), library)
+        if library.is_optimized:
             capsule = jax.ffi.pycapsule(ctypes.c_void_p(library["call_frame"]))
             jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-            _LOADED[name] = library, machine.function(library["run"], ctypes.c_void_p)
-        return name, _LOADED[name][1]
+            _LOADED[name] = code
+        return code
 
 
 @lru_cache(maxsize=256)

@@ -1,7 +1,7 @@
 """Values of functions in LLVM's text (ir.py): numbers and vectors of W lanes, with operators that write instructions."""
 
 import struct
-from typing import Any, Union
+from typing import Any, NamedTuple, Union
 
 DOUBLE, INT, BOOL, POINTER = "double", "i64", "i1", "ptr"
 Operand = Union["Value", float, int, bool]
@@ -14,13 +14,22 @@ def literal(number: Any, base: str) -> str:
     return str(int(number)) if base != BOOL else str(bool(number)).lower()
 
 
+class Product(NamedTuple):
+    """A product of two values, or its negative."""
+
+    a: "Value"
+    b: "Value"
+    is_negative: bool = False
+
+
 class Value:
     """One value of a function: its name there, and what it is a vector of."""
 
-    __slots__ = ("base", "f", "name", "width")
+    __slots__ = ("base", "f", "name", "product", "width")
 
     def __init__(self, f: Any, name: str, base: str, width: int = 1):
         self.f, self.name, self.base, self.width = f, name, base, width
+        self.product: Product | None = None  # set for a product of two values
 
     @property
     def type(self) -> str:
@@ -51,7 +60,10 @@ class Value:
         return self.f.arithmetic("div", other, self)
 
     def __neg__(self):
-        return self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
+        found = self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
+        if self.product:
+            found.product = self.product._replace(is_negative=not self.product.is_negative)
+        return found
 
     def __lt__(self, other):
         return self.f.compare("lt", self, other)
