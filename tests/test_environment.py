@@ -1,4 +1,4 @@
-"""What importing the package sets up: float64, and nothing else."""
+"""What importing the package sets up: float64, an end without a search for garbage, and nothing else."""
 
 from pathlib import Path
 
@@ -48,6 +48,19 @@ def test_nothing_of_python_is_changed(tmp_path):
     code = "import sys, gc; before = sys.meta_path[:], gc.isenabled(), gc.get_threshold(); import udkjax as udk; udk.simulate"
     code += "; assert before == (sys.meta_path, gc.isenabled(), gc.get_threshold()); print('as it was')"
     assert python(code, HOME=tmp_path) == "as it was"
+
+
+def test_python_ends_without_looking_for_garbage(tmp_path):
+    """Functions that were registered before are called later; files that are open are written all the same."""
+    code = """
+import atexit, gc, os
+atexit.register(lambda: print(gc.get_freeze_count() > 0))
+import udkjax
+file = open(os.environ["HOME"] + "/file", "w")
+file.write("whole")
+"""
+    assert python(code, HOME=tmp_path) == "True"
+    assert (tmp_path / "file").read_text() == "whole"
 
 
 def test_jax_is_missed_as_ever_where_it_is_not_installed(tmp_path):

@@ -3,7 +3,6 @@
 Only the standard library and tyro are imported before a command is known, so that help comes at once.
 """
 
-import atexit
 import gc
 import os
 import sys
@@ -38,8 +37,6 @@ PROGRAM_CACHE_BYTES = 200_000_000  # bytes of programs of JAX; those that were u
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command; exit with one of the codes of `udkjax.cli.exits`."""
-    # At its end Python would look for garbage among all that JAX has made, for a third of a second.
-    atexit.register(gc.freeze)
     gc.set_threshold(GARBAGE_EVERY)
     if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
         print(f"udkjax {version('udkjax')}")
