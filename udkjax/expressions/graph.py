@@ -109,7 +109,7 @@ class Graph:
         """Add a known value."""
         dtype = np.dtype(dtype or self.dtype)
         value = dtype.type(value).item()
-        if np.issubdtype(dtype, np.floating) and math.copysign(1.0, value) < 0:
+        if dtype.kind == "f" and math.copysign(1.0, value) < 0:
             return Scalar(self, self._node("constant", (), -value, dtype, frozenset()), -1 if value != 0 else 1)
         return Scalar(self, self._node("constant", (), value, dtype, frozenset()))
 
@@ -125,12 +125,13 @@ class Graph:
 
     def add(self, a: Scalar, b: Scalar) -> Scalar:
         """A + b."""
-        if a.is_zero:
+        x, y = a.constant, b.constant
+        if x == 0.0:
             return b
-        if b.is_zero:
+        if y == 0.0:
             return a
-        if a.constant is not None and b.constant is not None:
-            return self.constant(a.constant + b.constant, a.node.dtype)
+        if x is not None and y is not None:
+            return self.constant(x + y, a.node.dtype)
         if a.index == b.index:
             return self.constant(0.0, a.node.dtype) if a.sign != b.sign else a * self.constant(2.0, a.node.dtype)
         if b.index < a.index:
@@ -140,13 +141,14 @@ class Graph:
 
     def multiply(self, a: Scalar, b: Scalar) -> Scalar:
         """A * b."""
-        if a.constant is not None and b.constant is not None:
-            return self.constant(a.constant * b.constant, a.node.dtype)
-        for one, other in ((a, b), (b, a)):
-            if one.is_zero:
+        x, y = a.constant, b.constant
+        if x is not None and y is not None:
+            return self.constant(x * y, a.node.dtype)
+        for one, other, factor in ((a, b, x), (b, a, y)):
+            if factor == 0.0:
                 return one
-            if one.constant in (1.0, -1.0):
-                return other if one.constant > 0 else -other
+            if factor in (1.0, -1.0):
+                return other if factor > 0 else -other
         if b.index < a.index:
             a, b = b, a
         return Scalar(self, self._operation("mul", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
@@ -205,14 +207,17 @@ class Graph:
             arrays.append(array)
         return arrays
 
-    def dependencies(self, wanted: Iterable[int], given: Collection[int] = ()) -> list[int]:
-        """Return the nodes on which some nodes depend, in an order of evaluation, but not `given` and its dependencies."""
-        found, stack = set(), list(wanted)
+    def dependencies(self, wanted: Iterable[int], given: Collection[int] = (), group: str | None = None) -> list[int]:
+        """Return the nodes on which some nodes depend, in an order of evaluation, but not `given` and its dependencies.
+
+        With a `group` of inputs: of those alone that depend on it.
+        """
+        nodes, found, stack = self.nodes, set(), list(wanted)
         while stack:
             index = stack.pop()
-            if index not in found and index not in given:
+            if index not in found and index not in given and (group is None or group in nodes[index].depends):
                 found.add(index)
-                stack.extend(a.index for a in self.nodes[index].arguments)
+                stack += [a.index for a in nodes[index].arguments]
         return sorted(found)
 
     def copy(self, program: "Expressions", known: Mapping[int, Scalar]) -> list[Scalar]:
@@ -245,11 +250,11 @@ class Graph:
         return [here(s) for s in program.outputs]
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
-        depends = frozenset().union(*(a.node.depends for a in arguments)) if arguments else frozenset()
+        depends = frozenset().union(*[self.nodes[a.index].depends for a in arguments])
         return self._node(kind, arguments, detail, dtype or arguments[0].node.dtype, depends)
 
     def _node(self, kind, arguments, detail, dtype, depends) -> int:
-        key = (kind, tuple((a.index, a.sign) for a in arguments), detail, dtype)
+        key = (kind, tuple([(a.index, a.sign) for a in arguments]), detail, dtype)
         index = self._known.get(key)
         if index is None:
             index = self._known[key] = len(self.nodes)

@@ -105,9 +105,9 @@ def collect(s: Scalar, group: str, atoms: Collection[int]) -> Scalar:
     def form(a: Scalar, factor: Scalar) -> tuple[Row, Scalar]:
         return forms.get(a.index, {a.index: one}), factor if a.sign > 0 else -factor
 
-    for index in graph.dependencies([s.index], atoms):
+    for index in graph.dependencies([s.index], atoms, group):
         node, total = graph.nodes[index], {}
-        if group not in node.depends or node.kind not in ("add", "sub", "mul"):
+        if node.kind not in ("add", "sub", "mul"):
             continue
         a, b = node.arguments
         if node.kind != "mul":
