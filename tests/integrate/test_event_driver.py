@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from tests.integrate.event_scenes import BALL, PENDULUM
+from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM
 from udkjax.equations.analysis import analyse
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.compiled_mechanism import compile_known
@@ -37,14 +37,26 @@ CUT = [
     udk.Event(lambda t, at: at["link"].angle + 1.0, udk.Release("A"), name="cut"),
     udk.Contact("link", point=[0.5, 0], through=[0, -2.0], restitution=0.5, name="floor"),
 ]
+LOCKS = [
+    udk.Event(lambda t, at: at["link"].angle + 1.0, udk.Lock("A"), -1, name="lock"),
+    udk.Event(lambda t, at: t - 0.9, udk.Release("A.lock"), name="free"),
+    udk.Contact("link", point=[0.5, 0], through=[0, -0.9], restitution=0.5, name="floor"),
+]
 FIVE_BAR = udk.library.parallelogram()
 STOPS = [udk.JointLimit(next(iter(FIVE_BAR.joints)), lower=-2.0, restitution=0.6)]
 
 
 @pytest.mark.parametrize(
     ("mechanism", "events", "end"),
-    [(PENDULUM, LIMITS, 2.0), (PENDULUM, CUT, 0.945), (FIVE_BAR, STOPS, 3.0), (BOX, FEET, 0.41)],
-    ids=["limits", "cut", "redundant", "box"],
+    [
+        (PENDULUM, LIMITS, 2.0),
+        (CATCH, CAUGHT, 0.8),
+        (PENDULUM, LOCKS, 1.5),
+        (PENDULUM, CUT, 0.945),
+        (FIVE_BAR, STOPS, 3.0),
+        (BOX, FEET, 0.41),
+    ],
+    ids=["limits", "catch", "locks", "cut", "redundant", "box"],
 )
 def test_machine_code_does_what_the_plain_form_does(mechanism, events, end, monkeypatch):
     ts = np.linspace(0.0, end, 9)
@@ -94,10 +106,10 @@ def phase_codes(mechanism, events):
         assert conditions is not None
         plan = known_event_plan(phases, conditions, 1000, 10, *listed, *compiled)
         problems = [replace(run.problem, compiled=x) for x in compiled]
-        arrays = event_arrays(plan, listed, problems, np.zeros(()), np.asarray(1e-6), np)
-    numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[8:], []
+        arrays = event_arrays(plan, listed, phases, problems, np.zeros(()), np.asarray(1e-6), np)
+    numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[9:], []
     for of_phase in plan.phases:
-        codes.append(PhaseCode(of_phase, rest[: of_phase.count], numbers, inverse_mass, 3))
+        codes.append(PhaseCode(of_phase, rest[: of_phase.count], numbers, inverse_mass, 3, []))
         rest = rest[of_phase.count :]
     return codes, inverse_mass
 

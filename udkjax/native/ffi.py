@@ -10,7 +10,7 @@ closed and leaves: the handler waits for those alone that have begun, so that th
 from typing import Any
 
 from udkjax.native.ir import INT, POINTER, Function, Value
-from udkjax.native.layout import INPUTS
+from udkjax.native.layout import INPUTS, SHARE
 from udkjax.native.module import Module
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
@@ -23,7 +23,6 @@ DATA, RANK, DIMS = 24, 32, 40
 # Of an extension that asks for metadata: where they go, and in them the version (of the interface) that the handler speaks.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)  # major, minor
-SHARE = 32  # members of a thread, at least: to wake it takes some 50 us, and the shortest runs take one or two each
 # Words of the work that threads share: how many may still look at it, how many have begun (and whether it is closed), how many
 # are done, the number of the next member, and what `run` is called with.
 USERS, BEGUN, ENDED, NEXT, CALL = range(5)

@@ -31,6 +31,7 @@ FORMULATION_SETTINGS = (
 SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps", "method")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
+SHARE = 32  # members of a thread, at least: to wake it takes some 50 us, and the shortest runs take one or two each
 INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the last q and v
 
 

@@ -18,7 +18,7 @@ from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, Cl
 from udkjax.native.conditions import Conditions
 from udkjax.native.event_states import EventStates
 from udkjax.native.formulations import FormulationCode
-from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, Plan
+from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, SHARE, Plan
 from udkjax.native.marching import Marching
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -56,6 +56,7 @@ class Operation(ABC):
     settings: ClassVar[tuple[str, ...]] = SETTINGS  # settings of this kind of operation
     in_lanes: ClassVar[bool] = True  # whether members run side by side
     results: ClassVar[int] = len(OUTPUTS)  # the first outputs, which have no directions
+    share: ClassVar[int] = SHARE  # members of a thread, at least
     is_reverse: ClassVar[bool] = False  # whether it runs and walks back in two passes, each without what the other finds
 
     @property
@@ -283,6 +284,7 @@ class StateOperation(Operation):
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
 
     settings: ClassVar[tuple[str, ...]] = StateFunction.settings
+    share: ClassVar[int] = 32 * SHARE  # a state takes a microsecond
     function: ClassVar[type[StateFunction]]
 
     @property

@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -74,7 +74,7 @@ class LoadedCode:
 
     def __init__(self, operation: Operation, width: int, beside: int):
         self._module, self._in_passes = generate(operation, width, beside), operation.is_reverse
-        self._fields = self._module.call_fields
+        self._fields, self._share = self._module.call_fields, operation.share
         settings = operation.all_settings
         self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
         self._seconds = QUICK_SECONDS_OF_LINE * self._module.written_text.count("\n") if operation.code.is_small else 0.0
@@ -137,7 +137,7 @@ class LoadedCode:
         fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
         fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
         call = (ctypes.c_int64 * len(self._fields))(*[fields[name] for name in self._fields])
-        threads = min(members, os.cpu_count() or 1) if members > 1 else 1
+        threads = max(1, min(members // self._share, os.cpu_count() or 1))
         return PreparedCall(code.run, call, following, threads, inputs, found)
 
 
@@ -154,12 +154,17 @@ class PreparedCall(NamedTuple):
     def __call__(self) -> list[np.ndarray]:
         """Return the outputs, which the next call overwrites."""
         self.next_member.value, address = 0, ctypes.addressof(self.record)
-        if self.threads == 1:
-            self.run(address)
-        else:
-            with ThreadPoolExecutor(self.threads) as pool:
-                list(pool.map(lambda _: self.run(address), range(self.threads)))
+        others = [_pool().submit(self.run, address) for _ in range(self.threads - 1)]
+        self.run(address)
+        for other in others:
+            other.result()
         return self.outputs
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """Return the threads that calls share: to start one takes longer than many a run."""
+    return ThreadPoolExecutor(os.cpu_count() or 1)
 
 
 class Code(NamedTuple):

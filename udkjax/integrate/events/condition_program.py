@@ -39,11 +39,11 @@ def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
         return conditions_of(eqx.combine(jax.tree.unflatten(tree, numbers), rest), names, t, q, v)
 
     shapes = [(), (n,), (n,), *(np.shape(x) for x in leaves)]
-    arguments = [_inputs(graph, k, shape) for k, shape in enumerate(shapes)]
+    arguments = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
     closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
     g = list(read_jaxpr(graph, closed, arguments)[0].flat)
     (t,), q, v = (list(x.flat) for x in arguments[:3])
-    a, numbers = list(_inputs(graph, -1, (n,)).flat), [x for array in arguments[3:] for x in array.flat]
+    a, numbers = list(input_array(graph, -1, (n,)).flat), [x for array in arguments[3:] for x in array.flat]
     one, zero = graph.constant(1.0), graph.constant(0.0)
     along = {t: one, **dict(zip((*q, *v), (*v, *a), strict=True))}
     rates = tangents(graph, g, along)
@@ -65,7 +65,7 @@ def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
 _known_conditions = cached_by_identity(_conditions)
 
 
-def _inputs(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
+def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of inputs of a graph, the k-th of all."""
     array = np.empty(shape, object)
     for place in np.ndindex(*shape):

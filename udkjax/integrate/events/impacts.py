@@ -60,6 +60,8 @@ REST = 1e-5
 # of which rounding leaves 1e-15, or more by the condition number of the constraints, up to a thousand.
 COUPLED = 1e-12
 
+ATTACHABLE = 1e-6  # of L, or rad: a joint that is attached must be closed up to that
+
 OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
 
 

@@ -13,10 +13,8 @@ from jaxtyping import Array, Bool, Int
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.integrate.events.crossings import ConditionValues
 from udkjax.integrate.events.hybrid import Hybrid, RunState
-from udkjax.integrate.events.impacts import OPEN, ContactChanges, contact_rows, hit_contacts
+from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, contact_rows, hit_contacts
 from udkjax.integrate.gradients import stop_gradients
-
-ATTACHABLE = 1e-6  # of L, or rad: a joint that is attached must be closed up to that
 
 
 class JumpResult(NamedTuple):

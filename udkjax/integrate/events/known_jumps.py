@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, first_crossing, side_of_zero
-from udkjax.integrate.events.impacts import OPEN, ContactChanges, hit_contacts, rows_of_directions
+from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions
 from udkjax.integrate.events.phase_code import States
 from udkjax.integrate.events.run_members import RunMembers
 from udkjax.integrate.solution import Result
@@ -51,16 +51,18 @@ def _apply(
     sides = members.sides[some].copy()
     sides[rows, e] = np.where(members.impacts[e] | releases, 1, -sides[rows, e])
     closed, happens, noted = np.full((len(some), E), OPEN), np.zeros((len(some), 3 * E), bool), k.copy()
-    blocked = np.zeros(len(some), bool)
+    q, blocked = members.q[some], np.zeros(len(some), bool)
+    if members.plan.added:
+        q, v, blocked = _attach(members, some, k, after)
     if members.impacts.any() and acts.any():
         j = np.flatnonzero(acts)
-        found, free = _hit(members, some[j], k[j], after[j], held[j], values, states, j)
+        found, free = _hit(members, some[j], k[j], after[j], (q[j], v[j]), held[j], values, states, j)
         rests = (found.held & ~held[j]) | found.ends
         happens[j] = np.concatenate([found.hits, held[j] & ~found.held, rests], axis=1)
         own, at = np.arange(len(j)), e[j]
         # The event itself is noted first, be it a contact that only comes to rest.
         noted[j] = np.where(~releases[j] & ~found.hits[own, at] & rests[own, at], 2 * E + k[j], k[j])
-        closed[j], v[j], blocked[j] = found.closed, found.v, found.blocked
+        closed[j], v[j], blocked[j] = found.closed, found.v, blocked[j] | found.blocked
         carried = np.where(closed > OPEN, _put(carried, j, found.carried), carried)
         code[j] = np.where(found.ends.any(1), Result.at_rest, code[j])
         sides = np.where(np.tile(closed > OPEN, 2), 1, sides)
@@ -72,6 +74,7 @@ def _apply(
     code = np.where(full, Result.event_limit, code)
     changes = ~(full | blocked)
     before = members.q[some], members.v[some]
+    members.q[some] = np.where(changes[:, None], q, members.q[some])
     members.v[some] = np.where(changes[:, None], v, members.v[some])
     members.phase[some] = np.where(changes, after, phase)
     members.sides[some], members.carried[some], members.code[some] = sides, carried, code
@@ -91,17 +94,19 @@ def _hit(
     some: Int[np.ndarray, "b"],
     k: Int[np.ndarray, "b"],
     phase: Int[np.ndarray, "b"],
+    after: tuple[np.ndarray, np.ndarray],
     held: Bool[np.ndarray, "b E"],
     values: ConditionValues,
     states: States,
     j: Int[np.ndarray, "b"],
 ) -> tuple[ContactChanges, Int[np.ndarray, "b"]]:
-    """Hit the contacts of members that are closed at an event; return the phase without contacts at rest, too."""
-    q, v, free = members.q[some], members.v[some], phase
-    for contact in np.flatnonzero(members.impacts):
-        free = members.freed[free, contact]
+    """Hit the contacts of members that are closed at an event; return the phase without contacts at rest, too.
+
+    `after` are positions and velocities with the joints that the event adds.
+    """
+    (q, v), free = after, _without_contacts(members, phase)
     values, own = ConditionValues(*(x[j] for x in values)), States(*(x[j] for x in states))
-    if not np.array_equal(free, members.phase[some]):
+    if members.plan.added or not np.array_equal(free, members.phase[some]):
         own = members.look(some, (free, q, v))[1]
     rows = rows_of_directions(own.by_q, own.directions, members.inverse_mass[some])
     contacts = members.contacts_of(some)
@@ -110,6 +115,33 @@ def _hit(
         return members.look(some, (free, q, v))[1].rate_2
 
     return hit_contacts(contacts, k, v, held, values, rows, own.rate, second_rates, None, np), free
+
+
+def _attach(
+    members: RunMembers, some: Int[np.ndarray, "b"], k: Int[np.ndarray, "b"], phase: Int[np.ndarray, "b"]
+) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "b"]]:
+    """Return positions and velocities of members with the joints that events add, and to which these cannot be added.
+
+    Velocities jump to a state that the phase allows, but for contacts at rest, which may be left.
+    """
+    q, v, adds = members.q[some].copy(), members.v[some].copy(), members.add_joints(some, k)
+    free = _without_contacts(members, phase)
+    for kind in np.unique(phase[adds]):
+        j = np.flatnonzero(adds & (phase == kind))
+        t, at = members.t[some[j]], members.phases[int(kind)]
+        q[j] = at.project(some[j], t, q[j], v[j])[0]
+        for without in np.unique(free[j]):
+            i = j[free[j] == without]
+            v[i] = members.phases[int(without)].project(some[i], members.t[some[i]], q[i], v[i])[1]
+    moved = np.abs(q - members.q[some]) / members.unit[some]
+    return q, v, adds & (moved.max(1) > ATTACHABLE)
+
+
+def _without_contacts(members: RunMembers, phase: Int[np.ndarray, "b"]) -> Int[np.ndarray, "b"]:
+    """Return the phases that follow when all contacts at rest let go."""
+    for contact in np.flatnonzero(members.impacts):
+        phase = members.freed[phase, contact]
+    return phase
 
 
 def _with_contacts(members: RunMembers, phase: Int[np.ndarray, "b"], held: Bool[np.ndarray, "b E"]) -> Int[np.ndarray, "b"]:

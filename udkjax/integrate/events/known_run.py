@@ -15,6 +15,7 @@ from udkjax.equations.scales import mass_of
 from udkjax.expressions.numpy_program import Meter, numpy_program
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.actions import Impact, Log, Stop
+from udkjax.integrate.events.added_joints import added_joints, joint_numbers
 from udkjax.integrate.events.condition_program import condition_numbers
 from udkjax.integrate.events.driver import run
 from udkjax.integrate.events.event import Event
@@ -30,7 +31,7 @@ from udkjax.native.host_function import call_host
 from udkjax.scene.identity_cache import cached_by_identity
 
 MOST_OPERATIONS = 10**12  # of NumPy: there is no limit
-SHARED = 8  # arrays of a run besides those of its phases
+SHARED = 9  # arrays of a run besides those of its phases
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,10 @@ def run_by_machine_code(hybrid: Hybrid, given: RunInput, conditions: Conditions,
     arrays = [jnp.asarray(x) for x in leaves if isinstance(x, jax.Array | np.ndarray)]
     others = tuple(None if isinstance(x, jax.Array | np.ndarray) else x for x in leaves)
     plain = PlainForm(tree, others, tuple((x.shape, np.dtype(x.dtype)) for x in arrays), max_events)
-    inputs = [*event_arrays(plan, hybrid.events, problems, given.code, given.drift_tol), *(x[None] for x in arrays)]
+    inputs = [
+        *event_arrays(plan, hybrid.events, hybrid.phases, problems, given.code, given.drift_tol),
+        *(x[None] for x in arrays),
+    ]
     found = EventRun(*(x[0] for x in call_host(KnownRun(plan, len(given.ts), len(given.q), plain), stop_gradients(inputs))))
     whole = ("event_index", "event_phase", "closed", "count", "code", "totals")
     found = found._replace(**{name: getattr(found, name).astype(int) for name in whole})
@@ -107,14 +111,27 @@ class KnownRun:
 
     def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
         B = max(len(x) for x in inputs)
-        ts, q, v, code, units, numbers, restitution, inverse_mass = inputs[:SHARED]
+        ts, q, v, code, units, numbers, restitution, inverse_mass, of_joints = inputs[:SHARED]
         given, phases = list(inputs[SHARED:]), []
+        joints = [np.full((B, len(joint.program.outputs)), np.nan) for joint in self.plan.added]
         for plan in self.plan.phases:
-            phases.append(PhaseCode(plan, given[: plan.count], numbers, inverse_mass, B))
+            phases.append(PhaseCode(plan, given[: plan.count], numbers, inverse_mass, B, joints))
             given = given[plan.count :]
-        spread = [np.broadcast_to(x, (B, *x.shape[1:])) for x in (ts, q, v, code, units, restitution, inverse_mass)]
-        ts, q, v, code, units, *others = spread
-        members = RunMembers(self.plan, phases, ts, q, v, code[:, 0], MemberUnits(*units.T), *others)
+        spread = (ts, q, v, code, units, restitution, inverse_mass, of_joints)
+        ts, q, v, code, units, restitution, inverse_mass, of_joints = (np.broadcast_to(x, (B, *x.shape[1:])) for x in spread)
+        members = RunMembers(
+            plan=self.plan,
+            phases=phases,
+            ts=ts,
+            q=q,
+            v=v,
+            code=code[:, 0],
+            units=MemberUnits(*units.T),
+            restitution=restitution,
+            inverse_mass=inverse_mass,
+            joints=joints,
+            joint_numbers=of_joints,
+        )
         run(members)
         found = _results(members)
         for b in np.flatnonzero(members.unsure):
@@ -168,7 +185,8 @@ def event_plan(
     impacts = tuple(isinstance(e.action, Impact) for e in events)
     at_rest = [e.action.at_rest if isinstance(e.action, Impact) else "" for e in events]
     of_phase = [int(k) for k in np.flatnonzero(impacts)]
-    plans = [phase_plan(m, conditions, held, of_phase) for m, held in zip(compiled, phases.tables.held, strict=True)]
+    added = [name for _, name in phases.added_by]
+    plans = [phase_plan(m, conditions, held, of_phase, added) for m, held in zip(compiled, phases.tables.held, strict=True)]
     return EventPlan(
         phases=tuple(plans),
         tables=phases.tables,
@@ -181,6 +199,7 @@ def event_plan(
         stops=tuple(isinstance(e.action, Stop) for e in events),
         max_steps=max_steps,
         max_events=max_events,
+        added=added_joints(phases),
     )
 
 
@@ -194,6 +213,7 @@ def known_event_plan(phases: Phases, conditions: Conditions, max_steps: int, max
 def event_arrays(
     plan: EventPlan,
     events: Sequence[Event],
+    phases: Phases,
     problems: Sequence[Problem],
     code: Int[Any, ""],
     drift_tol: Float[Any, ""],
@@ -204,6 +224,7 @@ def event_arrays(
     Args:
         plan: common part of all runs.
         events: all events.
+        phases: the phases.
         problems: the run in each phase.
         code: the `Result` that is known before.
         drift_tol: the violation of the constraints that ends it.
@@ -224,6 +245,7 @@ def event_arrays(
         xp.concatenate([*numbers, xp.zeros(0)]),
         vector(restitution),
         1 / mass_of(mechanism, xp),
+        xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in joint_numbers(phases)), xp.zeros(0)]),
     ]
     of_phases = [phase_arrays(p, x, xp) for p, x in zip(problems, plan.phases, strict=True)]
     return [*(xp.asarray(x, float)[None] for x in shared), *(x for phase in of_phases for x in phase)]

@@ -12,11 +12,12 @@ from jaxtyping import Float, Int
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
+from udkjax.integrate.events.added_joints import places_of_joints
 from udkjax.integrate.native_engine import run_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.conditions import HEAD, Conditions
 from udkjax.native.layout import INFO, INPUTS
-from udkjax.native.operations import EvaluateEvents, MarkRows, RunWatched
+from udkjax.native.operations import EvaluateEvents, MarkRows, ProjectStates, RunWatched
 from udkjax.native.primitive import call_members
 
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # of the inputs of a run: times and the initial state
@@ -30,6 +31,8 @@ class PhasePlan(NamedTuple):
     states: EvaluateEvents
     marking: MarkRows | None  # of independent rows, where they are not known beforehand
     projected: bool
+    project: ProjectStates | None  # to the joints that events add, where they do
+    joints: tuple[tuple[int, ...], ...]  # of each such joint: the places of its numbers, none where the phase does not have it
 
     @property
     def count(self) -> int:
@@ -37,7 +40,9 @@ class PhasePlan(NamedTuple):
         return len(PARTS) + bool(self.run.sampled)
 
 
-def phase_plan(compiled: CompiledMechanism, conditions: Conditions, held: Sequence[int], impacts: Sequence[int]) -> PhasePlan:
+def phase_plan(
+    compiled: CompiledMechanism, conditions: Conditions, held: Sequence[int], impacts: Sequence[int], added: Sequence[str]
+) -> PhasePlan:
     """Return the operations of a phase.
 
     Args:
@@ -45,6 +50,7 @@ def phase_plan(compiled: CompiledMechanism, conditions: Conditions, held: Sequen
         conditions: conditions of all events.
         held: of each event, the row of Psi that holds its contact; -1: none.
         impacts: the events that are impacts.
+        added: the names of joints that events add.
     """
     run = compiled.plan.operation
     assert run is not None  # checked by the caller
@@ -53,7 +59,9 @@ def phase_plan(compiled: CompiledMechanism, conditions: Conditions, held: Sequen
     marking = None
     if run.code.marks_rows:
         marking = MarkRows(scene_programs(compiled.textbook.mechanism.at(0.0)).with_all_rows)
-    return PhasePlan(run.watching(replace(conditions, rows=rows)), states, marking, compiled.plan.projected)
+    project = ProjectStates(run.code, run.pseudoinverse, run.formulation) if added else None
+    joints = places_of_joints(compiled.textbook.mechanism, added)
+    return PhasePlan(run.watching(replace(conditions, rows=rows)), states, marking, compiled.plan.projected, project, joints)
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
@@ -110,16 +118,23 @@ class PhaseCode:
         event_numbers: the numbers of all events.
         inverse_mass: one over the mass of each coordinate.
         members: number of members.
+        joints: the numbers of the joints that events have added, of all members; they change.
     """
 
     def __init__(
-        self, plan: PhasePlan, arrays: Sequence[np.ndarray], event_numbers: np.ndarray, inverse_mass: np.ndarray, members: int
+        self,
+        plan: PhasePlan,
+        arrays: Sequence[np.ndarray],
+        event_numbers: np.ndarray,
+        inverse_mass: np.ndarray,
+        members: int,
+        joints: Sequence[np.ndarray],
     ):
         self.plan, (self._numbers, self._settings, self._rows, self._breaks, self._tol, *self._samples) = plan, arrays
         names = plan.run.all_settings
         self._of_states = [names.index(name) for name in plan.states.all_settings]
         self._of_marking = [] if plan.marking is None else [names.index(name) for name in plan.marking.all_settings]
-        self._event_numbers, self._inverse_mass = event_numbers, inverse_mass
+        self._event_numbers, self._inverse_mass, self._joints = event_numbers, inverse_mass, joints
         self._marks = np.full((members, plan.run.code.row_count), np.nan)
 
     def run(self, some: Int[np.ndarray, "b"], ts: np.ndarray, q: np.ndarray, v: np.ndarray, watch: np.ndarray) -> StretchEnd:
@@ -168,9 +183,28 @@ class PhaseCode:
         directions[:, list(operation.impacts)] = of_impacts.reshape(b, -1, n)
         return States(a, g, rate, rate_2, by_t, by_q.reshape(b, E, n), by_v.reshape(b, E, n), directions)
 
+    def project(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions and velocities of some members to the constraints of the phase."""
+        operation, n = self.plan.project, q.shape[1]
+        assert operation is not None  # events add joints
+        further = _of(self._settings, some)[:, self._of_states], _of(self._rows, some), np.zeros((1, 0))
+        given = self._with_marks(some, t, q, v), np.stack([t, t], axis=1), q, v
+        (found,) = call_members(*given, *further, operation=operation, times=2)
+        return found[:, :n], found[:, n:]
+
+    def _numbers_of(self, some: Int[np.ndarray, "b"]) -> np.ndarray:
+        """Return the numbers of some members, those of joints as events have added them."""
+        numbers = _of(self._numbers, some)
+        if any(self.plan.joints):
+            numbers = _spread(numbers, len(some)).copy()
+            for places, joint in zip(self.plan.joints, self._joints, strict=True):
+                if places:
+                    numbers[:, list(places)] = joint[some]
+        return numbers
+
     def _with_marks(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the numbers of some members, with the marks of the rows that are independent near where they came first."""
-        numbers, marking = _of(self._numbers, some), self.plan.marking
+        numbers, marking = self._numbers_of(some), self.plan.marking
         if marking is None:
             return numbers
         m = self.plan.run.code.row_count

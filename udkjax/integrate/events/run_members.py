@@ -1,10 +1,12 @@
 """The members of a batch of runs with events: their states, what is known of their conditions, and the events that are noted."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
+from udkjax.integrate.events.added_joints import AddedJoint, evaluate_joint
 from udkjax.integrate.events.crossings import ConditionValues
 from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, States
@@ -26,6 +28,7 @@ class EventPlan(NamedTuple):
     stops: tuple[bool, ...]
     max_steps: int
     max_events: int
+    added: tuple[AddedJoint, ...]  # by events
 
 
 class MemberUnits(NamedTuple):
@@ -52,6 +55,8 @@ class RunMembers:
         units: numbers of each member.
         restitution: of all events (B, E).
         inverse_mass: of all coordinates (B, n).
+        joints: the numbers of joints that events add, as the code of the phases takes them.
+        joint_numbers: the numbers of these that no state decides (B, k).
     """
 
     def __init__(
@@ -65,15 +70,18 @@ class RunMembers:
         units: MemberUnits,
         restitution: np.ndarray,
         inverse_mass: np.ndarray,
+        joints: Sequence[np.ndarray],
+        joint_numbers: np.ndarray,
     ):
         self.plan, self.phases, self.ts, self.units = plan, phases, ts, units
         self._restitution, self.inverse_mass = restitution, inverse_mass
+        self._joints, self._joint_numbers = joints, joint_numbers
         (B, T), n, E, K = ts.shape, q.shape[1], len(plan.directions), plan.max_events
         self.held = np.array(plan.tables.held)  # of phases and events, the rows
         self.after, self.resting, self.freed = (np.array(x) for x in plan.tables[:3])
         self.impacts, self.changes, self.stops = (np.array(x) for x in (plan.impacts, plan.changes, plan.stops))
         self.directions = np.array([*plan.directions, *[-1] * E])
-        self._unit = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
+        self.unit = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         self.t, self.q, self.v, self.phase = ts[:, 0].copy(), q.copy(), v.copy(), np.zeros(B, int)
         self.sides, self.scale, self.carried = np.zeros((B, 2 * E), int), np.zeros((B, E)), np.zeros((B, E), bool)
         self.code, self.running = code.astype(int), code == Result.successful
@@ -134,6 +142,18 @@ class RunMembers:
             self.impacts, np.array(plan.hold), np.array(plan.stop_at_rest), self._restitution[some], self.units.rate[some]
         )
 
+    def add_joints(self, some: Int[np.ndarray, "b"], event: Int[np.ndarray, "b"]) -> Bool[np.ndarray, "b"]:
+        """Take the numbers of joints from the states of members to which events add them; tell to which they do."""
+        adds, start = np.zeros(len(some), bool), 0
+        for joint, numbers in zip(self.plan.added, self._joints, strict=True):
+            count = len(joint.program.inputs) - self.q.shape[1]
+            is_new = event == joint.event
+            new = some[is_new]
+            if new.size:
+                numbers[new] = evaluate_joint(joint, self.q[new], self._joint_numbers[new, start : start + count])
+            adds, start = adds | is_new, start + count
+        return adds
+
     def watched_of(self, phase: int) -> Int[np.ndarray, "C"]:
         """Return which conditions, and, from E on, which contact forces machine code watches in a phase."""
         return np.append(np.arange(self.event_count), self.event_count + np.flatnonzero(self.held[phase] >= 0))
@@ -145,9 +165,8 @@ class RunMembers:
 
     def write_here(self, some: Int[np.ndarray, "b"]):
         """Write the states of members to outputs that are due right now."""
-        here = (self.ts[some] == self.t[some, None])[..., None]
-        self.qs[some] = np.where(here, self.q[some, None], self.qs[some])
-        self.vs[some] = np.where(here, self.v[some, None], self.vs[some])
+        b, k = np.nonzero(self.ts[some] == self.t[some, None])
+        self.qs[some[b], k], self.vs[some[b], k] = self.q[some[b]], self.v[some[b]]
 
     def look(self, some: Int[np.ndarray, "b"], at: tuple[np.ndarray, ...] | None = None) -> tuple[ConditionValues, States]:
         """Evaluate the conditions of members at their states, or at others (phase, q, v). Scales do not become smaller."""
@@ -164,7 +183,7 @@ class RunMembers:
                 to[of_phase] = x
         states = States(*found)
         if at is None:
-            rate, t, unit = self.units.rate[some, None], np.abs(self.t[some, None]), self._unit[some]
+            rate, t, unit = self.units.rate[some, None], np.abs(self.t[some, None]), self.unit[some]
             by_q = np.abs(states.by_q) * np.maximum(unit, np.abs(q))[:, None]
             by_v = np.abs(states.by_v) * np.maximum(unit * rate, np.abs(v))[:, None]
             size = np.maximum(np.maximum(by_q, by_v).max(2), np.abs(states.by_t) * np.maximum(1 / rate, t))

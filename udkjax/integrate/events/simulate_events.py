@@ -77,7 +77,7 @@ def simulate_events(
         ValueError: the events do not fit the mechanism, or machine code was asked for and cannot run it.
     """
     listed, phases = _prepare(mechanism, events, analysis)
-    has_code = not phases.added and not choices.take_diffrax and jax.default_backend() == "cpu"
+    has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax and jax.default_backend() == "cpu"
     conditions = watched_conditions(listed, phases.mechanisms[0]) if has_code else None
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
     given = Given(phases, listed, ts, state, closure, choices, max_events, conditions)
@@ -112,7 +112,7 @@ def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[st
     problems = [replace(run.problem, compiled=x) for x in compiled]
     settings = choices.max_steps, given.max_events
     plan = known_event_plan(phases, given.conditions, *settings, *given.events, *compiled)
-    arrays = event_arrays(plan, given.events, problems, np.asarray(code.value), choices.drift_tol, np)
+    arrays = event_arrays(plan, given.events, phases, problems, np.asarray(code.value), choices.drift_tol, np)
     found = EventRun(*(x[0] for x in KnownRun(plan, len(run.ts), len(run.problem.q))(*arrays)))
     return None if found.code < 0 else (found, tuple(x.plan.why_not_native for x in compiled))
 

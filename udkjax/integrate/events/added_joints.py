@@ -1,0 +1,75 @@
+"""Joints that events add, for machine code: their numbers as programs of the state at the event, and the places these go to."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.expressions import Graph, ScalarProgram, read_jaxpr
+from udkjax.integrate.events.condition_program import input_array
+from udkjax.integrate.events.conditions import frames_of
+from udkjax.integrate.events.phases import Phases
+from udkjax.scene.mechanism import Mechanism
+
+
+class AddedJoint(NamedTuple):
+    """A joint that an event adds."""
+
+    event: int
+    program: ScalarProgram  # all numbers of the joint, of q and the numbers that do not depend on it
+
+
+class NumberOf(NamedTuple):
+    """The number of values of a leaf of a joint, in its place."""
+
+    size: int
+
+
+def joint_numbers(phases: Phases) -> list[Array]:
+    """Return the numbers of all joints that events add, as far as the state does not decide them."""
+    return jax.tree.leaves(eqx.filter(phases.added, eqx.is_inexact_array))
+
+
+def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
+    """Return the joints that events add."""
+    names, found = phases.mechanisms[0].body_names, []
+    for (event, _), joint in zip(phases.added_by, phases.added, strict=True):
+        arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
+        leaves, tree = jax.tree.flatten(arrays)
+
+        def numbers(q: Array, *numbers: Array, tree=tree, rest=rest) -> list[Array]:
+            joint, frames = eqx.combine(jax.tree.unflatten(tree, numbers), rest), frames_of(names, q)
+            return jax.tree.leaves(joint.complete(*(frames[name] for name in joint.frame_names)))
+
+        shapes, graph = [(3 * len(names),), *(np.shape(x) for x in leaves)], Graph()
+        closed = jax.make_jaxpr(numbers)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+        inputs = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
+        outputs = [x for array in read_jaxpr(graph, closed, inputs) for x in array.flat]
+        found.append(AddedJoint(event, ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
+    return tuple(found)
+
+
+def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Return the places of the numbers of joints among all numbers of a mechanism; none of a joint that it does not have."""
+    found = []
+    for name in names:
+        if name not in mechanism.joint_names:
+            found.append(())
+            continue
+        k = mechanism.joint_names.index(name)
+        sizes = jax.tree.map(lambda x: NumberOf(np.size(x)), mechanism._joints[k])
+        marked = eqx.tree_at(lambda m, k=k: m._joints[k], mechanism, sizes)
+        leaves = jax.tree.leaves(marked, is_leaf=lambda x: isinstance(x, NumberOf))
+        counts = [x.size if isinstance(x, NumberOf) else np.size(x) for x in leaves]
+        starts = np.cumsum([0, *counts])
+        of_joint = [range(a, a + x.size) for a, x in zip(starts, leaves, strict=False) if isinstance(x, NumberOf)]
+        found.append(tuple(int(i) for places in of_joint for i in places))
+    return tuple(found)
+
+
+def evaluate_joint(joint: AddedJoint, q: Float[np.ndarray, "b n"], numbers: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b m"]:
+    """Return all numbers of a joint that is added at some states."""
+    return np.array([joint.program([*map(float, row), *map(float, own)]) for row, own in zip(q, numbers, strict=True)], float)
