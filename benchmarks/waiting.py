@@ -1,6 +1,7 @@
 """How long one waits for what is asked once: eager transformations, events, kinematics, statics and modes, and commands.
 
 Each in a fresh process, first with nothing cached, then with what that has left on disk; and the second call within a process.
+What a call itself waits for is told apart from Python, JAX and the package, which a process imports once.
 """
 
 import statistics
@@ -28,7 +29,9 @@ def time(inertia):
 """
 COMMAND = "import sys; sys.argv = ['udkjax', *{words!r}.split()]; from udkjax.cli import main; main()"
 FOUR_BAR = "examples/four_bar.toml"
+IMPORT = "import the package and what a run takes"
 CASES = {
+    IMPORT: LINKAGE + "udk.simulate",
     "eager grad": LINKAGE + "print(jax.grad(angle, argnums=(0, 1))(*masses))",
     "eager vmap over 8": LINKAGE + "print(jax.vmap(states)(*(jnp.linspace(0.9, 1.1, 8) * x for x in masses)).shape)",
     "hessian of a four-bar": CRANK_ROCKER + "print(jax.hessian(angle)(*masses))",
@@ -40,7 +43,7 @@ CASES = {
     "udkjax modes": COMMAND.format(words=f"modes {FOUR_BAR}"),
     "udkjax animate": COMMAND.format(words=f"animate {FOUR_BAR} --out {{folder}}/page.html --t1 5"),
 }
-QUICK = ("travel",)  # by itself where nothing is measured
+QUICK = (IMPORT, "travel")  # by themselves where nothing is measured
 
 
 def waits(name: str, code: str, bytecode: Path) -> dict[str, Any]:
@@ -78,16 +81,18 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
     figures = call_times(smoke)
     for row in figures:
         print(f"{row['name']:28} {row['milliseconds']:8.3f} ms of CPU")
-    print(f"{'a process':28} {'s':>7} {'CPU s':>7} {'again, s':>9} {'CPU s':>7}")
+    print(f"{'a process':40} {'s':>7} {'CPU s':>7} {'again, s':>9} {'CPU s':>7} {'without imports: s':>19} {'CPU s':>7}")
+    imports: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as bytecode:
         waited("import udkjax, diffrax, tyro", Path(bytecode), Path(bytecode))
         for name, code in CASES.items():
             if smoke and name not in QUICK:
                 continue
             row = waits(name, code, Path(bytecode))
+            imports = imports or row
+            row |= {f"call_{key}": row[key] - imports[key] for key in ("seconds", "cpu_seconds")}
             figures.append(row)
-            numbers = (
-                f"{row['seconds']:7.2f} {row['cpu_seconds']:7.2f} {row['again_seconds']:9.2f} {row['again_cpu_seconds']:7.2f}"
-            )
-            print(f"{name:28} {numbers}", flush=True)
+            widths = {"seconds": 7, "cpu_seconds": 7, "again_seconds": 9, "again_cpu_seconds": 7, "call_seconds": 19}
+            widths["call_cpu_seconds"] = 7
+            print(f"{name:40} {' '.join(f'{row[key]:{width}.2f}' for key, width in widths.items())}", flush=True)
     return figures
