@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -186,9 +187,9 @@ def _add_armature(
             joint.read.refuse(
                 "the armature of a slide is taken over on the ground and across gravity, of a body without other joints"
             )
-        bodies[two] = _with_mass(body, body.mass + armature, body.inertia)
+        bodies[two] = replace(body, mass=body.mass + armature)
     elif not holder:
-        bodies[two] = _with_mass(body, body.mass, body.inertia + armature)
+        bodies[two] = replace(body, inertia=body.inertia + armature)
     else:
         carrier, ratio = bodies[one], float(1 + 2 * armature / body.inertia)
         spin = carrier.angular_velocity + ratio * (body.angular_velocity - carrier.angular_velocity)
@@ -196,14 +197,10 @@ def _add_armature(
         mass = ROTOR_MASS * carrier.mass
         inertia = body.inertia / (2 * ratio)  # A / (N (N - 1))
         bodies[rotor] = Body(mass, inertia, carrier.position, carrier.angle, carrier.velocity, spin)
-        bodies[one] = _with_mass(carrier, carrier.mass - mass, carrier.inertia + armature / ratio)
-        bodies[two] = _with_mass(body, body.mass, body.inertia / 2)
+        bodies[one] = replace(carrier, mass=carrier.mass - mass, inertia=carrier.inertia + armature / ratio)
+        bodies[two] = replace(body, inertia=body.inertia / 2)
         joints[axle] = Revolute((one, rotor), [(0.0, 0.0), (0.0, 0.0)])
         joints[unique_name(f"{joint.name} gear", joints)] = Gear((rotor, two), (1.0, ratio), internal=True, carrier=one)
-
-
-def _with_mass(body: Body, mass: object, inertia: object) -> Body:
-    return Body(mass, inertia, body.position, body.angle, body.velocity, body.angular_velocity)  # pyright: ignore[reportArgumentType]
 
 
 def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str, float]]:
