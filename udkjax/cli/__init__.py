@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
 def store_compiled_programs() -> None:
     """Let JAX store what it compiles beside the machine code: a command that is run again then compiles nothing.
 
-    Who has told JAX where to store programs is left alone, and so is JAX where it is here already.
+    A folder that the environment names for JAX's programs stays, and JAX is left alone where it is imported already.
     """
     from udkjax.native.code_cache import cache_folder
 

@@ -96,7 +96,7 @@ class ScenePrograms:
 
     @property
     def marks_rows(self) -> bool:
-        """True if redundant rows are told by numbers: a mark for each row of Psi, one where it is independent."""
+        """True if numbers mark redundant rows: a mark for each row of Psi, one where it is independent."""
         return self._layout.marks > 0
 
     @cached_property

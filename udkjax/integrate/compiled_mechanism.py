@@ -152,7 +152,7 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
-        return "it computes in float64, which JAX is told not to"
+        return "it computes in float64, which is off in JAX"
     return ""
 
 
@@ -200,7 +200,7 @@ def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
 def _programs(equations: TextbookEquations) -> ScenePrograms:
     """Return the programs of a scene: with pivots that are refused, where the method falls back on a rank-revealing one.
 
-    `Elimination` drops the rows that depend on others, whether they are known or not; to all else they are told.
+    `Elimination` drops the rows that depend on others, whether they are known or not; all others need them as input.
     """
     policy = RankPolicy.REFUSE if isinstance(equations.method, Auto) else RankPolicy.DROP
     redundant = () if equations.redundant is None and isinstance(equations.method, Elimination) else equations.redundant

@@ -16,9 +16,9 @@ class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
     With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would store for the next
-    step (FSAL) belongs to the state before projection; told that the state has jumped, the solver takes a new one. (Not so a
-    multistep method, which would forget its whole history: it sees for itself that its newest point was moved.) What projection
-    takes back of an error hardly counts. Where the equations integrate only some coordinates, errors are those of these alone.
+    step (FSAL) belongs to the state before projection; a solver that learns of the jump takes a new one. (A multistep method
+    would forget its whole history and does not learn of it: it sees for itself that its newest point was moved.) The part of an
+    error that projection removes hardly counts. Where only some coordinates are integrated, errors are those of these alone.
     Error estimates, with their counts, and interpolation are the wrapped solver's.
     """
 

@@ -31,10 +31,10 @@ LAST_CHANGE = 1e-7  # of the event time, in T: Taylor's step makes an error of i
 MOST_LANDINGS = 5  # steps that end at a crossing: one, as a rule
 LEAST_STEP = 10  # times the smallest, to a crossing: the next may be a fifth as long
 WANTED, UNDER_WAY = 1, 2  # the states of a landing: from the point before the crossing a step is to be taken, or is being taken
-SHORTEST_SPAN = 100  # times the smallest step: shorter ones are not told from one another
+SHORTEST_SPAN = 100  # times the smallest step: shorter ones are not distinguished
 VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is not resolved, or not a number
 FORCE_STEP = 1e-7  # T: over which the rate of a contact force is its difference
-HEAD = 3  # numbers of what is told of a run before its sides: the event, or -1; the time; the largest violation at a node
+HEAD = 3  # numbers about the end of a run before its sides: the event, or -1; the time; the largest violation at a node
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def _retry_or_fall_back(module: Module, f: Function, s: Lane, bad: Value) -> tup
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
     """Return the next step over this one, and the error over the length to the power of the order."""
     where, order, error = f.select, module.method.order, s.error
-    # An error that lets a step grow as far as it may is not told from a smaller one, which may be rounding and say nothing.
+    # Errors below the one that lets a step grow as far as it may count as that one: they may be rounding and say nothing.
     size = where(f.is_finite(error), f.max(error, GROW ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
     foreseen = size * (rate / s.rate)  # the error of a step as long, where errors grow as they did (Gustafsson 1994)

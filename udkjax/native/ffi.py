@@ -1,7 +1,8 @@
 """A function of ours as an operation of a compiled JAX program: XLA's typed foreign functions, without a C++ compiler.
 
 XLA calls a handler with a frame whose layout is its stable C interface (jaxlib/include/xla/ffi/api/c_api.h). The handler is
-generated along with the code that it calls: it reads the buffers of the frame and writes what `run` is told (trajectory.py).
+generated along with the code that it calls: it reads the buffers of the frame and writes the call record of `run`
+(trajectory.py).
 
 Many members are shared with the threads of XLA's pool, as its own operations are. A thread that comes too late finds the work
 closed and leaves: the handler waits for those alone that have begun, so that threads that all wait cannot be waited for.

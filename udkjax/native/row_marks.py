@@ -1,6 +1,6 @@
 """Machine code that finds which rows of Psi are independent, for mechanisms whose numbers are known only when they run.
 
-Rows that depend on others everywhere have to be told from those that do so at the initial position alone, in a singular
+Rows that depend on others everywhere have to be distinguished from those that do so at the initial position alone, in a singular
 configuration. So a mechanism takes one step aside, along its velocity or, at rest, along some direction that its constraints
 allow, with its drivers a little ahead; it is closed there by Newton's method, and rows are marked that elimination does not leave
 out. Where it does not close, or is led back, as at rest where two branches of its motion meet, all rows are marked: elimination

@@ -83,5 +83,5 @@ NEWTON_TOL = 1e-8
 # Tolerance of an output after its projection, each row over its scale: Newton's last step leaves far less, and
 # interpolation of a row that is not projected far more. Beyond it, the output is closed on all rows.
 OPEN_OUTPUT = 1e-9
-# An output that lies nearer to the manifold takes one Newton step in q and v alike: what that leaves is the square.
+# An output that lies nearer to the manifold takes one Newton step in q and v alike: its residual is the square of that.
 SINGLE_STEP_TOL = 1e-7

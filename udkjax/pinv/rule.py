@@ -22,7 +22,7 @@ from udkjax.annotations import Numbers, Scalar
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
 
-# Accelerators round float32 products to ten bits unless told otherwise.
+# Accelerators round float32 products to ten bits by default.
 dot = partial(jnp.matmul, precision="highest")
 
 

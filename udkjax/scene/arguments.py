@@ -1,7 +1,7 @@
 """The one door: arguments of public functions are checked before anything is computed.
 
 `@checked` reads the annotations and names of a function's parameters. A parameter annotated with classes takes their instances,
-one annotated `Literal` its choices; arrays are told by their names (named_arguments.py): shapes are those of the mechanism,
+one annotated `Literal` its choices; arrays are recognized by their names (named_arguments.py): shapes are those of the mechanism,
 numbers are real, finite and of the right sign. Of traced values the shapes and dtypes are checked; their values are data.
 """
 

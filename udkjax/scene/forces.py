@@ -98,7 +98,7 @@ class TorsionSpring(ForceElement):
         bodies: the names of the two bodies; "ground" is the fixed frame.
         stiffness: in N m/rad, not negative.
         damping: in N m s/rad, not negative; None: no damper.
-        angle: theta2 - theta1 without load (rad); a `Held` is what a servo is told.
+        angle: theta2 - theta1 without load (rad); a `Held` is the target of a servo.
     """
 
     stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)

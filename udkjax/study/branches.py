@@ -35,7 +35,7 @@ def branches(
 
     Args:
         mechanism: a mechanism without a degree of freedom once its driver holds; its numbers must be known.
-        driver: a driver, or a coordinate by name or as a `Coordinate`, as of `kinematics`; None: all drivers.
+        driver: a driver, or a coordinate by name or as a `Coordinate`, as for `kinematics`; None: all drivers.
         value: of the driver (rad, m); of None the time (s).
         starts: number of positions to search from.
         seed: of these positions.

@@ -48,7 +48,7 @@ class Reached(PrintsWords):
     beyond_limit = 2  # a toggle, the limit of travel, lies before it
     lost = 3  # no step, however short, follows the branch
     open = 4  # the mechanism cannot be closed where it starts
-    not_determined = 5  # closed; but velocities do not follow from the driver's: a toggle, or branches that cannot be told apart
+    not_determined = 5  # closed; but velocities do not follow from the driver's: a toggle, or branches too close to distinguish
 
     @classmethod
     def has_position(cls, status: Int[Array, "..."]) -> Bool[Array, "..."]:

@@ -140,7 +140,7 @@ def equilibria(
     """Return the different equilibria found from `starts` positions: the given one and random ones of the same mechanism.
 
     Random positions turn every body by a random angle and close it again, so that all branches are tried. Not exhaustive; the
-    lowest stiffness last: the most stable first. Args as of `equilibrium`; numbers must be known.
+    lowest stiffness last: the most stable first. Args as for `equilibrium`; numbers must be known.
     """
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)

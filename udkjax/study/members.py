@@ -104,8 +104,8 @@ _EXECUTABLES: OrderedDict[Hashable, jax.stages.Compiled] = OrderedDict()  # the 
 def _compile(lowered: jax.stages.Lowered, devices: tuple[Any, ...]) -> jax.stages.Compiled:
     """Return the executable of a program: one serves all studies that differ by the values of its arguments alone.
 
-    Programs are told by their text, but for those whose text does not hold all of them: functions of Python that they call, and
-    constants that JAX may keep beside them.
+    Programs are identified by their text, but for those whose text does not hold all of them: functions of Python that they call,
+    and constants that JAX may keep beside them.
     """
     text = lowered.as_text()
     if "callback" in text or getattr(jax.config, "jax_use_simplified_jaxpr_constants", False):

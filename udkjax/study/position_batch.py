@@ -58,7 +58,7 @@ class PositionBatch:
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.
-        driver: driver, as of `kinematics`.
+        driver: a driver or coordinate, as for `kinematics`.
         free: names of the numbers in which members differ: `pin.A`, `pin.C[0]`, `joint.B.points`.
         derivatives: whether there are derivatives by the value and the free numbers.
 

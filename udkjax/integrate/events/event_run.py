@@ -45,6 +45,6 @@ def run_plain(hybrid: Hybrid, given: RunInput, max_events: int) -> EventRun:
     loop = run_loop(hybrid, given.ts, state, given.code, given.drift_tol, max_events)
     record, smooth = loop.record, (loop.q, loop.v, loop.state.t)
     events = record.t, record.q, record.v, record.index, record.phase, record.together, record.closed, record.count
-    # Before it is no number, a condition may vary quickly: that is told by how the run ended.
+    # Before it is no number, a condition may vary quickly: the end of the run says so.
     faults = jnp.where(loop.undefined, jnp.inf, loop.unresolved[: hybrid.count]), loop.undefined
     return EventRun(*smooth, *events, *faults, loop.code, loop.totals)

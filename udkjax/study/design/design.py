@@ -146,7 +146,7 @@ def design(
         transmission: the least angle (rad) between the transmission and none: of a four-bar, by how much the transmission angle
             stays away from 0 and pi; over the whole turn if there is one.
         rotation: whether the driver has to make a whole turn; by default where it is an angle.
-        driver: a driver or coordinate as of `kinematics`; by default the only driver.
+        driver: a driver or coordinate, as for `kinematics`; by default the only driver.
         starts: number of mechanisms to start from.
         seed: of these; the same seed gives the same result.
         results: most designs to return.

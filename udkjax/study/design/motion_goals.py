@@ -194,7 +194,7 @@ class ToleranceGoal(MotionTerm):
     """The error of a point where numbers have errors t_k: sqrt(sum_k (t_k dp/dx_k)^2) (m) stays below `most`.
 
     Args:
-        point: point, as of a `PathGoal`.
+        point: point, as for a `PathGoal`.
         tolerances: of free numbers by their names, in their units; each entry of a pin has it by itself. The further arguments
             are those of a `MotionGoal`.
     """

@@ -75,7 +75,7 @@ def design_all(
         driver: the motor, or another driver or coordinate that is the angle of a link at the ground; by default the only driver.
         bounds: (low, high) by the names of pins, such as `pin.O` (m): of the first position. Designs beyond limits are left out.
         lengths: (least, most) distances (m) by two pins.
-        areas: circles and polygons by pins, as of `design`: of the first position.
+        areas: circles and polygons by pins, as for `design`: of the first position.
         transmission: the least angle (rad) by which the transmission angle stays away from 0 and pi in all positions.
         rotation: whether the driver has to make a whole turn.
 
