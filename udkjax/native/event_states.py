@@ -39,7 +39,7 @@ class EventStates(StateTangentPart, StateAccelerations):
 
     @property
     def solving(self) -> list[str]:
-        return ["accelerations", "tangent_part"]
+        return ["accelerations", *(["tangent_part"] if self.impacts else [])]
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         given = self.member_address(f, self.call_record(f), "event_numbers", member)

@@ -48,9 +48,9 @@ def _begin(members: RunMembers, some: Int[np.ndarray, "b"]):
 def _advance(members: RunMembers, some: Int[np.ndarray, "b"]):
     """Take members to their next crossings, or to their ends."""
     event = np.full(len(some), NO_EVENT)
-    for phase in np.unique(members.phase[some]):
+    for phase in set(members.phase[some].tolist()):
         of_phase = members.phase[some] == phase
-        event[of_phase] = _run_phase(members, int(phase), some[of_phase])
+        event[of_phase] = _run_phase(members, phase, some[of_phase])
     event, some = event[members.running[some]], some[members.running[some]]
     if not some.size:
         return
@@ -104,7 +104,7 @@ def _run_phase(members: RunMembers, phase: int, some: Int[np.ndarray, "b"]) -> I
 
 def _take_end(members: RunMembers, some: Int[np.ndarray, "b"], found: StretchEnd, drifts: Bool[np.ndarray, "b"], phase: int):
     """Take over how some runs have ended, and where."""
-    n, known = members.q.shape[1], np.isin(found.status, (CROSSED, DONE)) & ~drifts
+    n, known = members.q.shape[1], ((found.status == CROSSED) | (found.status == DONE)) & ~drifts
     members.unsure[some] |= (found.status == UNSURE) & ~drifts
     code = np.where(found.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = np.where(found.status == NOT_FINITE, Result.not_finite, code)

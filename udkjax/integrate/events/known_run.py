@@ -230,22 +230,26 @@ def event_arrays(
         drift_tol: the violation of the constraints that ends it.
         xp: jax.numpy, or NumPy.
     """
-    first = problems[0]
-    scales, mechanism = first.textbook.scales, first.textbook.mechanism
+    first, scales = problems[0], problems[0].textbook.scales
     units = MemberUnits(first.smallest, first.rate, scales.length, scales.rate, scales.mass, drift_tol)
-    restitution = [e.action.restitution if isinstance(e.action, Impact) else 0.0 for e in events]
-    numbers = [xp.ravel(xp.asarray(x, float)) for x in condition_numbers(events)]
-    vector = lambda xs: xp.stack([xp.asarray(x, float) for x in xs])  # noqa: E731
-    shared = [
-        first.ts,
-        first.q,
-        first.v,
-        vector([code]),
-        vector(units),
-        xp.concatenate([*numbers, xp.zeros(0)]),
-        vector(restitution),
-        1 / mass_of(mechanism, xp),
-        xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in joint_numbers(phases)), xp.zeros(0)]),
-    ]
+    of_run = [xp.asarray(x, float)[None] for x in (first.ts, first.q, first.v, _stack([code], xp), _stack(units, xp))]
     of_phases = [phase_arrays(p, x, xp) for p, x in zip(problems, plan.phases, strict=True)]
-    return [*(xp.asarray(x, float)[None] for x in shared), *(x for phase in of_phases for x in phase)]
+    of_events = (_known_numbers if xp is np else _numbers)(xp, phases, *events)
+    return [*of_run, *of_events, *(x for phase in of_phases for x in phase)]
+
+
+def _stack(numbers: Sequence[Any], xp: ModuleType) -> Any:
+    return xp.stack([xp.asarray(x, float) for x in numbers])
+
+
+def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
+    """Return the arrays that no state and no choice decides: of conditions, of impacts, of masses and of joints."""
+    restitution = [e.action.restitution if isinstance(e.action, Impact) else 0.0 for e in events]
+    of_conditions, of_joints = (
+        xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
+        for numbers in (condition_numbers(events), joint_numbers(phases))
+    )
+    return [x[None] for x in (of_conditions, _stack(restitution, xp), 1 / mass_of(phases.mechanisms[0], xp), of_joints)]
+
+
+_known_numbers = cached_by_identity(_numbers)

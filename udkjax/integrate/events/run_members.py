@@ -80,6 +80,8 @@ class RunMembers:
         self.held = np.array(plan.tables.held)  # of phases and events, the rows
         self.after, self.resting, self.freed = (np.array(x) for x in plan.tables[:3])
         self.impacts, self.changes, self.stops = (np.array(x) for x in (plan.impacts, plan.changes, plan.stops))
+        self._hold, self._stop_at_rest = np.array(plan.hold), np.array(plan.stop_at_rest)
+        self._watched = [np.append(np.arange(E), E + np.flatnonzero(rows >= 0)) for rows in self.held]
         self.directions = np.array([*plan.directions, *[-1] * E])
         self.unit = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         self.t, self.q, self.v, self.phase = ts[:, 0].copy(), q.copy(), v.copy(), np.zeros(B, int)
@@ -136,11 +138,8 @@ class RunMembers:
         self.count[some] += is_noted.sum(1)
 
     def contacts_of(self, some: Int[np.ndarray, "b"]) -> Contacts:
-        """Return what is known of the contacts of some members."""
-        plan = self.plan
-        return Contacts(
-            self.impacts, np.array(plan.hold), np.array(plan.stop_at_rest), self._restitution[some], self.units.rate[some]
-        )
+        """Return the contacts of some members, as far as no state changes them."""
+        return Contacts(self.impacts, self._hold, self._stop_at_rest, self._restitution[some], self.units.rate[some])
 
     def add_joints(self, some: Int[np.ndarray, "b"], event: Int[np.ndarray, "b"]) -> Bool[np.ndarray, "b"]:
         """Take the numbers of joints from the states of members to which events add them; tell to which they do."""
@@ -156,7 +155,7 @@ class RunMembers:
 
     def watched_of(self, phase: int) -> Int[np.ndarray, "C"]:
         """Return which conditions, and, from E on, which contact forces machine code watches in a phase."""
-        return np.append(np.arange(self.event_count), self.event_count + np.flatnonzero(self.held[phase] >= 0))
+        return self._watched[phase]
 
     def watched(self, some: Int[np.ndarray, "b"]) -> Bool[np.ndarray, "b 2E"]:
         """Tell which conditions and contact forces count."""
@@ -172,7 +171,7 @@ class RunMembers:
         """Evaluate the conditions of members at their states, or at others (phase, q, v). Scales do not become smaller."""
         phases, q, v = (self.phase[some], self.q[some], self.v[some]) if at is None else at
         found: list[np.ndarray] = []
-        for phase in np.unique(phases):
+        for phase in set(phases.tolist()):
             of_phase = phases == phase
             states = self.phases[phase].at(some[of_phase], self.t[some[of_phase]], q[of_phase], v[of_phase])
             if of_phase.all():
