@@ -27,10 +27,6 @@ def test_everything_comes_back(everything, same, tmp_path):
     assert dumps(udk.load(str(tmp_path / "scene.toml"))) == dumps(everything)
 
 
-def test_absent_dampings_stay_absent(everything):
-    assert loads(dumps(everything)).forces["undamped"].damping is None
-
-
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=5e-324, allow_infinity=False)
 numbers = st.tuples(finite, finite)
