@@ -607,6 +607,7 @@ def test_a_click_selects_while_it_runs_and_what_is_selected_can_be_deleted(studi
     name = studio.js("Object.keys(studio.document.pins)[1]")
     studio.page.mouse.click(*studio.pin(name))
     assert studio.js("[studio.motion.playing, studio.motion.posed, studio.selection[0].name]") == [True, None, name]
+    assert studio.js("getComputedStyle(studio.canvas.element).outlineStyle") == "none"  # no ring around all that was clicked
     studio.page.keyboard.press("Delete")
     assert name not in studio.document["pins"]
     assert studio.js("[studio.motion.playing, studio.motion.t]") == [False, 0]

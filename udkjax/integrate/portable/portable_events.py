@@ -35,8 +35,8 @@ class PortableEvents:
         self._events = expand_events(events, mechanism) if events else ()
         for event in self._events:
             if not isinstance(event.action, Log | Stop):
-                kind = type(event.action).__name__
-                raise ArgumentError(f"live: a page knows Log and Stop, and event {quote(event.name)} has {kind}: leave out live")
+                kind, cure = type(event.action).__name__, "a page knows Log and Stop alone; leave out live"
+                raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) is no program yet: {cure}")
         self._conditions = watched_conditions(self._events, mechanism) if events else None
         if self._conditions is None and events:
             raise UnsupportedError("the condition of an event")

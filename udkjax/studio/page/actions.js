@@ -14,7 +14,7 @@ const LIFT = 0.4, CAM_POINTS = 12;  // of the radius where the follower stands
 const last = (document, section) => ({kind: section, index: list(document, section).length - 1});
 
 /** The document with a pin at a target, and its name. */
-export function pinFor(document, {pin, link, place}) {
+function pinFor(document, {pin, link, place}) {
   if (pin !== undefined && pin !== null) return [document, pin];
   if (link !== undefined && link !== null) return addPinToLink(document, link, place);
   return addPin(document, place);

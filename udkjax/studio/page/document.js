@@ -21,7 +21,7 @@ export const placeOf = (document, pin) => point(pinsOf(document)[pin], document)
 export const nameOf = (document, section, index) => list(document, section)[index]?.name ?? `${section}${index + 1}`;
 
 /** The document with a section in place of the old one; an empty one is left out. */
-export function withSection(document, section, entries) {
+function withSection(document, section, entries) {
   const {[section]: _, ...rest} = document;
   const order = Object.keys(document);
   if (!entries.length) return rest;
@@ -50,7 +50,7 @@ export function members(document, pin) {
 }
 
 /** A name that no pin has: A, B, ..., Z, A1, ... */
-export function freshPin(document) {
+function freshPin(document) {
   const taken = new Set([...Object.keys(pinsOf(document)), ...LISTS.flatMap(s => list(document, s).map((_, k) => nameOf(document, s, k)))]);
   for (let k = 0; ; k++) {
     const name = String.fromCharCode(65 + (k % 26)) + (k < 26 ? "" : Math.floor(k / 26));

@@ -135,7 +135,7 @@ function itemNamed(document, name) {
 }
 
 /** The element that a mistake is about. */
-export function itemOf(document, problem) {
+function itemOf(document, problem) {
   const pin = /^pins\.([^:]+?)(?:\[\d+\])?:/.exec(problem)?.[1];
   if (pin !== undefined && Object.hasOwn(pinsOf(document), pin)) return {kind: "pin", name: pin};
   const found = /\(([a-z]+)\[(\d+)\]\)/.exec(problem);

@@ -42,7 +42,7 @@ export class Gestures {
     if (event.button > 1) return undefined;
     const pixel = this.pixel(event);
     this.element.setPointerCapture(event.pointerId);
-    this.element.focus({preventScroll: true});  // now, so that a field gives what is typed in it before the gesture begins
+    this.element.focus({preventScroll: true, focusVisible: false});  // now, so that a field gives what is typed in it before the gesture begins
     if (this.studio.source.timer) return this.studio.say("the text is being read: try again");
     this.studio.draw();
     this.pointers.set(event.pointerId, pixel);

@@ -25,7 +25,7 @@ const EXAMPLES = {density: "7850", mass: "0.2 kg", inertia: "1e-4 kg m2", speed:
 const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", length: "m"};
 
 /** The unit of plain numbers of a quantity in a document. */
-export function unitOf(document, quantity) {
+function unitOf(document, quantity) {
   const chosen = document.units?.[{speed: "angular_velocity"}[quantity] ?? quantity];
   if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // a plain number is refused: of what?
   return chosen ?? SI[quantity] ?? "";

@@ -9,7 +9,7 @@ const BREATH = 120;  // ms without a change before an engine is compiled, which 
 const PAUSE = 250;  // ms without a change before a drawing is diagnosed, which takes the server a second
 
 /** What an engine is compiled for: all of a drawing but the places of its pins, which are parameters. */
-export const structureOf = ({pins, ...rest}) => JSON.stringify([Object.keys(pins ?? {}), rest]);
+const structureOf = ({pins, ...rest}) => JSON.stringify([Object.keys(pins ?? {}), rest]);
 
 export class Sync {
   constructor(studio) {
