@@ -653,63 +653,102 @@ function followPointers(player, canvas, liveRun) {
     player.draw();
   }, {passive: false});
 }
-/** The conditions at a state: each one's side of zero, 0 at zero, and its scale, what a displacement of a length or a turn of a
- *  radian changes in it, which never becomes smaller than `before`. */
-function look(engine, numbers, rate, state, before) {
-  const {data: {events}, size: n} = engine, scales = [], sides = [];
-  engine.conditions(numbers, state).forEach(([g, ...slopes], k) => {
-    const sizes = [Math.max(1 / rate, Math.abs(state.t)), ...[...state.q].map((x, i) => Math.max(engine.unit(i), Math.abs(x))),
-      ...[...state.v].map((x, i) => Math.max(engine.unit(i) * rate, Math.abs(x)))];
-    scales[k] = slopes.slice(0, 1 + 2 * n).reduce((most, slope, i) => Math.max(most, Math.abs(slope * sizes[i]) || 0), before?.scales[k] ?? 0);
-    sides[k] = Number.isFinite(g) ? (Math.abs(g) > events.zero * scales[k] ? Math.sign(g) : 0) : NaN;
-  });
-  return {scales, sides};
+/** The conditions at a state, with their rates, what impulses along them do, and their scales: what a displacement of a length or
+ *  a turn of a radian changes in each, which never becomes smaller than `before`. */
+function look(engine, numbers, settings, state, before) {
+  const {tolerances: {zero}} = engine.data.events, found = engine.conditions(numbers, settings, state), rate = settings.omega;
+  const largest = (slopes, size) => slopes.reduce((most, slope, i) => Math.max(most, Math.abs(slope * size(i)) || 0), 0);
+  found.scales = Array.from(found.g, (_, k) => Math.max(Math.abs(found.byT[k]) * Math.max(1 / rate, Math.abs(state.t)),
+    largest(found.byQ[k], i => Math.max(engine.unit(i), Math.abs(state.q[i]))),
+    largest(found.byV[k], i => Math.max(engine.unit(i) * rate, Math.abs(state.v[i]))), before?.scales[k] ?? 0));
+  found.sides = Array.from(found.g, (g, k) => (Number.isFinite(g) ? (Math.abs(g) > zero * found.scales[k] ? Math.sign(g) : 0) : NaN));
+  return found;
+}
+/** The velocities behind an impact of contact k by Newton's law, g_dot+ = -e g_dot-, and whether it is over with its rebounds; or
+ *  `words` where more happens than that: several contacts at once, and contacts that are held at rest, are no programs of a page. */
+function hit(engine, numbers, settings, at, watch, k) {
+  const {events} = engine.data, {tolerances: tol} = events, {omega} = settings, {g, rate, rate2, scales, byQ, directions} = watch;
+  const along = (i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0), W = along(k, k), unit = j => scales[j] * omega;
+  const isHit = j => j !== k && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j] && rate[j] <= tol.zero_rate * unit(j)
+    && Math.abs(along(j, k)) > tol.coupled * Math.sqrt(along(j, j) * W);
+  const other = events.names.findIndex((_, j) => isHit(j)), name = events.names[k];
+  if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which is no program of a page yet`};
+  const inverse = engine.inverseMasses(numbers);
+  if (!(W > tol.blocked * byQ[k].reduce((sum, x, i) => sum + x * x * inverse[i], 0))) return {words: `the joints leave ${name} no motion`};
+  const floor = tol.zero_rate * unit(k), isPressed = acceleration => acceleration < -tol.zero_rate_2 * unit(k) * omega;
+  const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
+  const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
+  const v = at.v.map((x, i) => x + impulse * directions[k][i]), hits = !isSlow && rate[k] < -floor;
+  const stays = after <= Math.max(floor, tol.still * Math.abs(rate[k])) || (isSlow && rate[k] > 0);
+  return {v, hits, rests: stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k])};
 }
 /** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. */
 function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
   const {data: {events, count, knots, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
+  const {zero} = events.tolerances, own = numbers.subarray(count + knots), isImpact = k => events.restitution[k] !== null;
   const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: [],
     steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
-  let at = {...state, t: ts[0]}, watch = state.watch ?? look(engine, numbers, settings.omega, at, null);
-  const put = (row, q, v, violation) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = violation; };
+  let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0;
+  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; };
   const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch}, marks: at.marks, ...more});
-  let violation = 0, first = 0;
+  const note = index => found.events.push({t: at.t, index, q: at.q, v: at.v});
+  const stop = words => {  // with the state there as the last output
+    if (first < T && !(first && ts[first - 1] === at.t)) {
+      ts[first] = at.t;
+      put(first++, at.q, at.v, violation);
+    }
+    return finish(words, {stop: stops ? words : null, count: first});
+  };
+  if (!watch) {
+    watch = look(engine, numbers, settings, at, null);
+    const beyond = watch.sides.findIndex((side, k) => isImpact(k) && side < 0);
+    if (beyond >= 0) return finish(`it begins beyond ${events.names[beyond]}`);
+    watch.sides = watch.sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
+  }
   for (;;) {
     while (first < T && ts[first] <= at.t) put(first++, at.q, at.v, violation);
     found.count = first;
-    const undefined_ = watch.sides.findIndex(side => Number.isNaN(side));
-    if (undefined_ >= 0) return finish(`the condition of ${events.names[undefined_]} is not a number`);
+    const noNumber = watch.sides.findIndex(Number.isNaN);
+    if (noNumber >= 0) return finish(`the condition of ${events.names[noNumber]} is not a number`);
     if (end - at.t <= 2 * settings.smallest) {
       while (first < T) put(first++, at.q, at.v, violation);
       return finish("", {done: true, count: T});
     }
-    const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => events.zero * x);
-    const given = [...numbers.subarray(count + knots), ...watch.sides, ...Array(E).fill(1), ...floors, ...events.directions, events.slowest];
-    const part = engine.piece(numbers, settings, at, times, limit - found.tried, given), {crossing} = part, [event, sure, worst] = crossing;
-    const sides = [...crossing.subarray(events.head, events.head + E)];
+    const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => zero * x);
+    const given = [...own, ...watch.sides, ...Array(E).fill(1), ...floors, ...events.directions, events.slowest];
+    const part = engine.piece(numbers, settings, at, times, limit - found.tried, given), [event, sure, worst] = part.crossing;
+    const before = [...part.crossing.subarray(events.head, events.head + E)];
     found.steps += part.steps;
     found.tried += part.tried;
     for (let k = 1; k < part.count && times[k] <= sure; k++) {
       put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
       found.count = ++first;
     }
-    at = {t: sure, q: crossing.slice(-2 * n, -n), v: crossing.slice(-n), marks: part.marks};
+    at = {t: sure, q: part.crossing.slice(-2 * n, -n), v: part.crossing.slice(-n), marks: part.marks};
     violation = worst;
     if (!(worst <= driftTol)) return finish("the loops do not stay closed");
-    watch = look(engine, numbers, settings.omega, at, watch);
-    watch.sides = watch.sides.map((side, k) => (k === event ? -sides[k] : side || (Number.isNaN(side) ? NaN : sides[k])));
+    watch = look(engine, numbers, settings, at, watch);
+    const jump = event >= 0 && isImpact(event) ? hit(engine, numbers, settings, at, watch, event) : null;
+    if (jump?.words) return finish(jump.words);
+    if (event >= 0 && (!jump || jump.hits || !jump.rests)) note(event);
+    if (jump) {
+      at = {...at, v: jump.v};
+      if (jump.rests) {
+        note(2 * E + event);
+        const words = `${events.names[event]} has come to rest`;
+        return events.ends_at_rest[event] ? stop(words) : finish(`${words}, and how it is held is no program of a page yet`);
+      }
+      watch = look(engine, numbers, settings, at, watch);
+    }
+    watch.sides = watch.sides.map((side, k) => {
+      if (k === event) return jump ? 1 : -before[k];
+      return Number.isNaN(side) || (side !== 0 && !(jump && events.by_velocity[k])) ? side : before[k];
+    });
     if (event < 0) {
       if (part.done) continue;
       return finish(part.words, {limited: part.limited});
     }
-    found.events.push({t: at.t, index: event, q: at.q, v: at.v});
-    if (events.stops[event] && stops) {
-      if (first < T && ts[first - 1] < at.t) {
-        ts[first] = at.t;
-        put(first++, at.q, at.v, violation);
-      }
-      return finish("", {stop: events.names[event], count: first});
-    }
+    if (events.stops[event] && stops) return stop(`${events.names[event]} stops it`);
     if (found.events.length >= events.most) return finish(`more than ${events.most} events`);
   }
 }
@@ -837,7 +876,8 @@ class Engine {
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
    *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
-   *  `events`, a list of {t, index, q, v}. Where one stops it, `stop` is its name, and the last time that of the event.
+   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index. Where one
+   *  ends it as it should, `stop` says so, and the last time is that of the event.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data} = this, numbers = this.numbers(parameters), T = times.length;
@@ -864,14 +904,23 @@ class Engine {
     return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t, code: ended.code,
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
-  /** The conditions of events at a state, each followed by its derivatives by t, q and v. */
-  conditions(numbers, {t, q, v}) {
-    const module = this.instances.evaluate, {count, knots, events} = this.data, each = 2 + 2 * this.size;
-    module.begin();
-    const given = module.put([t, ...q, ...v, ...numbers.subarray(count + knots)]), to = module.reserve(8 * each * events.names.length);
-    module.exports.conditions(given, to);
-    return Array.from(events.names, (_, k) => module.view(to + 8 * k * each, each).slice());
+  /** The conditions of events at a state: g, their first and second rates, derivatives by t, q and v, and for each impact the
+   *  velocities that a unit impulse along it gives. */
+  conditions(numbers, settings, state) {
+    const {data: {count, knots, events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
+    const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
+    const marks = state.marks ?? this.markRows(numbers, state), total = n + 4 * E + 2 * E * n + impacts.length * n;
+    const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows, breaks: [],
+      settings: states.module.settings.map(name => settings[name]), event_numbers: [...numbers.subarray(count + knots), ...this.inverseMasses(numbers)]};
+    const {found} = states.run(inputs, {found: total}, {times: 2, knots: 0});
+    let place = n;
+    const take = size => found.slice(place, place += size), rowsOf = () => Array.from({length: E}, () => take(n));
+    const known = {g: take(E), rate: take(E), rate2: take(E), byT: take(E), byQ: rowsOf(), byV: rowsOf()}, directions = [];
+    for (const k of impacts) directions[k] = take(n);
+    return {...known, directions};
   }
+  /** One over the mass, or the inertia, of each coordinate. */
+  inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
    *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
    *  whose shares would be a choice. */
@@ -1119,7 +1168,6 @@ const GHOST = 0.28;  // how much one sees of the first motion
 const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
 const STEP_BYTES = 4e7;
 const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
-const endOf = run => (run.stop ? `${run.stop} stops it` : run.words);
 class LiveRun {
   /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
   constructor(live, run, record, data) {
@@ -1186,7 +1234,7 @@ class LiveRun {
     this.job = null;
     const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
     const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${endOf(part)}.`;
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
     const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
     return {words, bad: !part.done && !part.stop};
   }
@@ -1205,7 +1253,10 @@ class LiveRun {
     this.changed = true;
   }
   /** Events as they are shown: {t, name}. */
-  named(events) { return events.map(({t, index}) => ({t, name: this.engine.data.events.names[index]})); }
+  named(events) {
+    const names = this.engine.data.events?.names ?? [], nameOf = k => (k < names.length ? names[k] : `${names[k % names.length]} rests`);
+    return events.map(({t, index}) => ({t, name: nameOf(index)}));
+  }
   /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
   reactions(forces) {
     const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
@@ -1302,7 +1353,7 @@ class LiveRun {
     this.happened.push(...this.named(run.events));
     this.showPast();
     this.player.setEnd(this.live.end);
-    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${endOf(run)}.`;
+    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
     this.live.say(run.done ? "Let go: the motion goes on by itself." : ended, !run.done && !run.stop);
     this.player.play();
   }

@@ -140,7 +140,8 @@ def test_numbers_of_conditions_follow_those_of_the_mechanism():
     assert 0.7 in numbers and 0.2 not in numbers
 
 
-def test_what_a_page_cannot_look_at_is_named():
-    ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))})
-    with pytest.raises(ValueError, match=r'the jump of event "ball on ground" \(Impact\) is no program yet'):
-        portable_engine(ball, events=[udk.Contact("ball")])
+def test_what_no_page_can_do_is_named():
+    pendulum = udk.library.simple_pendulum()
+    cut = udk.Event(lambda t, at: at["bob"].x, udk.Release("rod"), name="cut")
+    with pytest.raises(ValueError, match=r'the jump of event "cut" \(Release\) is no program yet'):
+        portable_engine(pendulum, events=[cut])

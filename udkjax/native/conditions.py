@@ -3,8 +3,6 @@
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from udkjax.expressions import ScalarProgram
 
 PER_TIME = 16  # intervals in the shortest time in which anything changes
@@ -66,15 +64,6 @@ class Conditions:
     def count(self) -> int:
         """The number of all that is watched."""
         return self.own_count + len(self.rows)
-
-    @property
-    def slopes(self) -> ScalarProgram:
-        """The program of each condition, with its derivatives by t, q and v behind it, of t, q, v and numbers of their own."""
-        program, E = self.at_state, self.own_count
-        n = (len(program.inputs) - 1 - self.number_count) // 3
-        g, _, by_t, by_q, by_v = np.split(np.array(program.outputs, object), np.cumsum([E, 2 * E, E, E * n]))
-        outputs = np.concatenate([g[:, None], by_t[:, None], by_q.reshape(E, n), by_v.reshape(E, n)], axis=1)
-        return ScalarProgram(program.graph, [*program.inputs[: 1 + 2 * n], *program.inputs[1 + 3 * n :]], list(outputs.flat))
 
     def output_count(self, n: int) -> int:
         """Return how many numbers a run of n coordinates tells of its end."""

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.integrate.event_scenes import BALL, PENDULUM
 from tests.show.player.conftest import Motion
 from tests.show.player.test_browser import HOST, PLAYER, on_screen, picture, plain, ring_centre, until
 from udkjax.show.player.animation import FailedRunWarning
@@ -232,6 +233,50 @@ def test_conditions_that_cross_zero_together_are_all_noted(opened):
             (expected.names[k], round(float(t), 7)) for t, k in zip(expected.time, expected.index, strict=True)
         )
         assert_allclose([e["t"] for e in shown], expected.time, rtol=0, atol=1e-9)
+
+
+SLOWING = udk.Event(lambda t, at: at["link"].omega + 1.0, udk.Log(), name="slowing")  # which an impact may jump over
+IMPACTS = {
+    "rebounds": (BALL, [udk.Contact("ball", restitution=0.8, name="floor")]),
+    "rest": (BALL, [udk.Contact("ball", restitution=0.5, at_rest="stop", name="floor")]),
+    "inelastic": (BALL, [udk.Contact("ball", at_rest="stop", name="floor")]),
+    "limits": (PENDULUM, [udk.JointLimit("A", -2.0, 1.0, restitution=0.9)]),
+    "velocity": (PENDULUM, [udk.JointLimit("A", lower=-2.0, restitution=0.9), SLOWING]),
+}
+
+
+@pytest.mark.parametrize("name", [n if n in ("rest", "velocity") else pytest.param(n, marks=pytest.mark.slow) for n in IMPACTS])
+def test_impacts_are_those_of_the_new_motion(opened, name):
+    mechanism, events = IMPACTS[name]
+    ts, tight = np.linspace(0.0, 3.0, 91), {"rtol": 1e-11, "atol": 1e-11, "max_events": 300}
+    animation = udk.animate(mechanism, udk.simulate(mechanism, ts, events=events, **tight), live=["gravity[1]"], events=events)
+    run = udk.simulate(mechanism.with_parameters({"gravity[1]": -6.0}), ts, events=events, **tight)
+    expected, alive = events_of(run), np.isfinite(run.q).all((1, 2))
+    with opened(animation) as page:
+        move(page, "gravity y", -6.0)
+        shown = page.evaluate(f"{LIVE}.runs[0].run.events")
+        assert [event["name"] for event in shown] == [expected.names[k] for k in expected.index]
+        assert_allclose([event["t"] for event in shown], expected.time, rtol=0, atol=1e-9)
+        q = shown_q(page)
+        assert_allclose(q[: alive.sum()], np.asarray(run.q)[alive].reshape(alive.sum(), -1), rtol=0, atol=1e-8)
+        if run.result.name == "at_rest":
+            assert "floor has come to rest" in note(page) and page.locator(".note.bad").count() == 0
+            assert_allclose(q[-1], np.ravel(expected.q_after[-1]), rtol=0, atol=1e-9)
+        else:
+            assert alive.all() and len(q) == len(ts)
+
+
+def test_what_a_contact_does_that_is_no_program_yet_is_said(opened):
+    """To be held at rest, and to be hit together with another."""
+    place = [0.5 * np.cos(0.1), 0.5 * np.sin(0.1) + 0.2]
+    box = udk.Mechanism({"box": udk.Body(mass=1.0, inertia=1.0, position=place)})
+    feet = [udk.Contact("box", point=[x, 0.0], name=name, restitution=0.5) for x, name in ((-0.5, "left"), (0.5, "right"))]
+    held = [udk.Contact("ball", restitution=0.5, name="floor")]
+    for mechanism, events, words in ((box, feet, "left and right are hit at once"), (BALL, held, "floor has come to rest")):
+        run = udk.simulate(mechanism, np.linspace(0.0, 3.0, 61), events=events, max_events=300)
+        with opened(udk.animate(mechanism, run, live=["gravity[1]"], events=events)) as page:
+            move(page, "gravity y", -8.0)
+            assert words in note(page) and "no program of a page yet" in note(page) and page.locator(".note.bad").count() == 1
 
 
 def test_a_hand_comes_by_events_and_is_not_stopped(opened, with_events):

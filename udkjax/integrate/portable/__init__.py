@@ -7,9 +7,10 @@ bodies       names; a state is q and v, x, y (m), angle (rad) of each body in tu
 parameters   a list of {name, unit, value}: numbers of the scene that may change, in the order in which they are given
 numbers      base64 of float64: all numbers of the scene, `count` of them, then the times (s) where its motion is not smooth,
              `knots` of them, and the numbers of the conditions of events
-events       {names, directions: in which zeros count, 0 for either, stops: whether each ends the run, slowest: rate of the scene
-             (1/s), zero: of a condition's scale, below which it is zero, most: how many may happen, head: how many numbers a run
-             tells before the sides of conditions}, or null
+events       {names, directions: in which zeros count, 0 for either, by_velocity: masks, stops: whether each ends the run,
+             restitution: of an impact, else null, ends_at_rest: whether its rest ends the run, slowest: rate of the scene (1/s),
+             most: how many may happen, head: how many numbers a run tells before the sides of conditions, tolerances: of
+             integrate/events by their names}, or null
 thresholds   of pivots, which a run takes behind the numbers; of closing, those in `closing`
 closing      {thresholds, settings, tol and rounding: what counts as closed (equations/position_closure.py)}
 guess        {q, v}: places in `numbers` of the initial guess
@@ -27,8 +28,8 @@ efforts      a list of {driver, unit, row: of Psi, place: of that row in x0}
 forces       how the forces of joints are found, while no row is redundant
 pulls        of each body the places in `numbers` of a spring that holds it: point x, y, target x, y, stiffness, damping; or []
 why          why there is no "run"; empty where there is
-modules      run, close, evaluate, mark: {code: base64 of deflated WebAssembly, data_end, fields or places and size, inputs,
-             results}
+modules      run, states (conditions of events), close, evaluate, mark: {code: base64 of deflated WebAssembly, data_end, fields or
+             places and size, settings, inputs, results}
 
 udkjax/show/player/engine.js runs it: `loadEngine(data)` gives an object with `close(parameters, guess)` and
 `run(parameters, state, times)`, which say there what they return.

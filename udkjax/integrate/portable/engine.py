@@ -78,7 +78,7 @@ def portable_engine(
 
     Raises:
         SceneError: a parameter is unknown.
-        ArgumentError: an event changes the motion.
+        ArgumentError: an event changes the constraints.
         UnsupportedError: a scene, the condition of an event, or how numbers follow from a parameter, takes what machine code has
             no instruction for.
     """
@@ -111,10 +111,10 @@ def portable_engine(
     if data["marks"]:
         modules["mark"] = _operation(MarkRows(scene_programs(dressed).with_all_rows))
     if runs and not data["why"]:
-        modules["run"] = _run(problem, data, watched)
+        modules |= _run(problem, data, watched)
         if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
-    modules["evaluate"] = _evaluation(dressed, analysis, numbers, data, watched)
+    modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
     return PortableEngine(data | {"modules": modules}, numbers, dressed)
 
 
@@ -137,7 +137,7 @@ def _module(linked: LinkedModule, **further: Any) -> Json:
 def _operation(operation: Operation) -> Json:
     linked, module = wasm_module(operation)
     names = {"inputs": [*INPUTS, *module.inputs], "results": [*module.results, *module.outputs]}
-    return _module(linked, fields=list(module.call_fields), **names)
+    return _module(linked, fields=list(module.call_fields), settings=list(operation.all_settings), **names)
 
 
 def _places(mechanism: Mechanism, pull: bool) -> Json:
@@ -179,7 +179,10 @@ def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
         "sampled": list(operation.sampled),
         "samples": floats(inputs[len(INPUTS)][0]) if operation.sampled else "",
     }
-    return _operation(events.watched_by(operation))
+    modules = {"run": _operation(events.watched_by(operation))}
+    if data["events"] is not None:
+        modules["states"] = _operation(events.states_of(operation))
+    return modules
 
 
 def _close(mechanism: Mechanism, data: Json) -> Json:
@@ -190,17 +193,16 @@ def _close(mechanism: Mechanism, data: Json) -> Json:
     return _operation(Close(scene_programs(mechanism).with_all_rows))
 
 
-def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json, events: PortableEvents) -> Json:
+def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json) -> Json:
     """Return the module of evaluations; which efforts it finds goes into the data."""
     code = scene_programs(mechanism, analysis.redundant_rows)
-    further = [numbers.function(), *events.functions()]
-    evaluation = Evaluation(code, further)
+    evaluation = Evaluation(code, [numbers.function()])
     data["efforts"] = [
         {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", **places}
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
     data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
-    linked = compile_wasm(evaluation.text(), (*(f.name for f in further), *evaluation.exports))
+    linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
     return _module(linked, places=evaluation.places, size=evaluation.size)
 
 

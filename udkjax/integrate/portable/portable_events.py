@@ -1,4 +1,4 @@
-"""Events of a portable engine: what a page knows of them, and the program by which it looks at their conditions."""
+"""Events of a portable engine: what a page knows of them, and the operations by which it runs to the next and looks at states."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,26 +7,36 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.analysis import Analysis
-from udkjax.integrate.events.actions import Log, Stop
+from udkjax.integrate.events import impacts as law
+from udkjax.integrate.events.actions import Impact, Log, Stop
 from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions
-from udkjax.integrate.events.crossings import ZERO
+from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.native.conditions import HEAD
-from udkjax.native.ir import Function
-from udkjax.native.operations import RunStates
-from udkjax.native.program import UnsupportedError, consecutive, write
+from udkjax.native.operations import EvaluateEvents, RunStates
+from udkjax.native.program import UnsupportedError
 from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError
 
 MOST_EVENTS = 1000  # of a run in a page: beyond, nobody would look at them
+TOLERANCES = {
+    "zero": ZERO,
+    "zero_rate": ZERO_RATE,
+    "zero_rate_2": ZERO_RATE_2,
+    "closed": law.CLOSED,
+    "still": law.STILL,
+    "rest": law.REST,
+    "blocked": law.BLOCKED,
+    "coupled": law.COUPLED,
+}
 
 
 class PortableEvents:
     """The events of the runs of a portable engine; there may be none.
 
     Raises:
-        ArgumentError: an event changes the motion.
+        ArgumentError: an event changes the constraints.
         UnsupportedError: a condition takes what machine code has no instruction for.
     """
 
@@ -34,8 +44,8 @@ class PortableEvents:
         self._given = tuple(events)
         self._events = expand_events(events, mechanism) if events else ()
         for event in self._events:
-            if not isinstance(event.action, Log | Stop):
-                kind, cure = type(event.action).__name__, "a page knows Log and Stop alone; leave out live"
+            if not isinstance(event.action, Log | Stop | Impact):
+                kind, cure = type(event.action).__name__, "a page knows Log, Stop and Impact; leave out live"
                 raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) is no program yet: {cure}")
         self._conditions = watched_conditions(self._events, mechanism) if events else None
         if self._conditions is None and events:
@@ -45,14 +55,19 @@ class PortableEvents:
         """Return what a page knows of the events; None where there are none."""
         if not self._events:
             return None
+        impacts = [event.action if isinstance(event.action, Impact) else None for event in self._events]
+        assert self._conditions is not None  # since there are events
         return {
             "names": [event.name for event in self._events],
             "directions": [event.direction for event in self._events],
+            "by_velocity": list(self._conditions.by_velocity),
             "stops": [isinstance(event.action, Stop) for event in self._events],
+            "restitution": [None if impact is None else float(impact.restitution) for impact in impacts],
+            "ends_at_rest": [impact is not None and impact.at_rest == "stop" for impact in impacts],
             "slowest": float(analysis.scales.rate),
-            "zero": ZERO,
             "most": MOST_EVENTS,
             "head": HEAD,
+            "tolerances": TOLERANCES,
         }
 
     def numbers(self, mechanism: Mechanism) -> Sequence[Array | np.ndarray]:
@@ -63,10 +78,8 @@ class PortableEvents:
         """Return the run that ends where a condition crosses zero."""
         return operation if self._conditions is None else operation.watching(self._conditions)
 
-    def functions(self) -> list[Function]:
-        """Return `conditions(in, out)`: of t, q, v and their numbers each condition, and its derivatives by t, q and v."""
-        if self._conditions is None:
-            return []
-        program = self._conditions.slopes
-        places = consecutive("in", len(program.inputs)), consecutive("out", len(program.outputs))
-        return [write(program, "conditions", 1, ("in", "out"), *places)]
+    def states_of(self, run: RunStates) -> EvaluateEvents:
+        """Return the operation that finds conditions, their rates and slopes, and directions of impulses at states."""
+        assert self._conditions is not None  # since there are events
+        impacts = tuple(k for k, event in enumerate(self._events) if isinstance(event.action, Impact))
+        return EvaluateEvents(run.code, run.pseudoinverse, run.formulation, self._conditions, impacts)

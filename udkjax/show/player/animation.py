@@ -149,8 +149,8 @@ def animate(
             takes every number of the scene. Of several runs a slider changes all that have its number. By default ten
             seconds. Its measures are violation, energy and effort,
             which the page finds anew, behind those of your own, which it shows of the first motion alone; "rank" is none.
-        events: of live runs, as `simulate` took them: the page finds anew when each happens. Those that note or stop (`Log`,
-            `Stop`), since no other action is a program yet.
+        events: of live runs, as `simulate` took them: the page finds anew when each happens. Of actions it knows `Log`, `Stop`
+            and `Impact`, of one contact at a time.
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.

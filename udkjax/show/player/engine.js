@@ -157,7 +157,8 @@ class Engine {
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
    *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
-   *  `events`, a list of {t, index, q, v}. Where one stops it, `stop` is its name, and the last time that of the event.
+   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index. Where one
+   *  ends it as it should, `stop` says so, and the last time is that of the event.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data} = this, numbers = this.numbers(parameters), T = times.length;
@@ -186,14 +187,24 @@ class Engine {
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
 
-  /** The conditions of events at a state, each followed by its derivatives by t, q and v. */
-  conditions(numbers, {t, q, v}) {
-    const module = this.instances.evaluate, {count, knots, events} = this.data, each = 2 + 2 * this.size;
-    module.begin();
-    const given = module.put([t, ...q, ...v, ...numbers.subarray(count + knots)]), to = module.reserve(8 * each * events.names.length);
-    module.exports.conditions(given, to);
-    return Array.from(events.names, (_, k) => module.view(to + 8 * k * each, each).slice());
+  /** The conditions of events at a state: g, their first and second rates, derivatives by t, q and v, and for each impact the
+   *  velocities that a unit impulse along it gives. */
+  conditions(numbers, settings, state) {
+    const {data: {count, knots, events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
+    const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
+    const marks = state.marks ?? this.markRows(numbers, state), total = n + 4 * E + 2 * E * n + impacts.length * n;
+    const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows, breaks: [],
+      settings: states.module.settings.map(name => settings[name]), event_numbers: [...numbers.subarray(count + knots), ...this.inverseMasses(numbers)]};
+    const {found} = states.run(inputs, {found: total}, {times: 2, knots: 0});
+    let place = n;
+    const take = size => found.slice(place, place += size), rowsOf = () => Array.from({length: E}, () => take(n));
+    const known = {g: take(E), rate: take(E), rate2: take(E), byT: take(E), byQ: rowsOf(), byV: rowsOf()}, directions = [];
+    for (const k of impacts) directions[k] = take(n);
+    return {...known, directions};
   }
+
+  /** One over the mass, or the inertia, of each coordinate. */
+  inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
 
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
    *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,

@@ -12,8 +12,6 @@ const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be graspe
 const STEP_BYTES = 4e7;
 const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
 
-const endOf = run => (run.stop ? `${run.stop} stops it` : run.words);
-
 export class LiveRun {
   /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
   constructor(live, run, record, data) {
@@ -91,7 +89,7 @@ export class LiveRun {
     this.job = null;
     const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
     const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${endOf(part)}.`;
+      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
     const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
     return {words, bad: !part.done && !part.stop};
   }
@@ -115,7 +113,10 @@ export class LiveRun {
   }
 
   /** Events as they are shown: {t, name}. */
-  named(events) { return events.map(({t, index}) => ({t, name: this.engine.data.events.names[index]})); }
+  named(events) {
+    const names = this.engine.data.events?.names ?? [], nameOf = k => (k < names.length ? names[k] : `${names[k % names.length]} rests`);
+    return events.map(({t, index}) => ({t, name: nameOf(index)}));
+  }
 
   /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
   reactions(forces) {
@@ -227,7 +228,7 @@ export class LiveRun {
     this.happened.push(...this.named(run.events));
     this.showPast();
     this.player.setEnd(this.live.end);
-    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${endOf(run)}.`;
+    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
     this.live.say(run.done ? "Let go: the motion goes on by itself." : ended, !run.done && !run.stop);
     this.player.play();
   }
