@@ -95,7 +95,7 @@ def of_scene(name: str, tolerances: Any, grid: Any, alphas: Any, betas: Any) -> 
     fits = [loss.tuned() for loss in losses]
     evaluations = [loss.calls / len(GUESSES) for loss in losses]
     closed = Drift(one, int(asked[0]), 0.0).tuned()
-    best, unheld = (np.exp([fit.z[np.argmin(fit.cost)] for fit in found]) for found in (fits, [closed]))
+    best, unheld = (np.exp([min(each, key=lambda fit: fit.cost).z for each in found]) for found in (fits, [closed]))
     gains = np.concatenate([equal, best])
     runs = [by_tolerance(one, gains, tol) for tol in tolerances]
     scan = np.log(np.geomspace(*SCAN, many * len(ENDS)))
@@ -111,8 +111,11 @@ def of_scene(name: str, tolerances: Any, grid: Any, alphas: Any, betas: Any) -> 
         | {
             "asked": ("tol", np.asarray(asked), {"long_name": "steps that the tolerance asks for, with the reference's gains"}),
             "asked_right_hand_sides": ("tol", [run["right_hand_sides"][0] for run in known]),
-            "tuned": (("tol", "guess", "of"), np.exp([fit.z for fit in fits]), {"units": "1/s"}),
-            "tuned_drift": (("tol", "guess"), [np.sqrt(2 * f.cost) * d.unit for f, d in zip(fits, losses, strict=True)]),
+            "tuned": (("tol", "guess", "of"), np.exp([[fit.z for fit in each] for each in fits]), {"units": "1/s"}),
+            "tuned_drift": (
+                ("tol", "guess"),
+                [[d.unit * np.sqrt(2 * fit.cost) for fit in f] for f, d in zip(fits, losses, strict=True)],
+            ),
             "evaluations": ("tol", evaluations, {"long_name": "per guess"}),
             "equal_drift": (("tol", "gains"), np.array([loss(np.log(gains)) for loss in losses])),
             "from_closed": ("of", unheld[0], {"units": "1/s", "long_name": "tuned from a closed start, at the first tolerance"}),

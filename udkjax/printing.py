@@ -24,11 +24,15 @@ Plain = bool | int | float | complex | np.ndarray | np.generic
 
 
 class PrintedTable(NamedTuple):
-    """A title, and cells row by row below the names of the columns; without these the first column names its row."""
+    """A title, and cells row by row below the names of the columns; without these the first column names its row.
+
+    Remarks, a sentence each, follow the rows.
+    """
 
     title: str
     rows: Sequence[Sequence[object]]
     heads: Sequence[str] = ()
+    remarks: Sequence[str] = ()
 
 
 def text_table(table: PrintedTable, most: int = MOST_ROWS) -> str:
@@ -37,7 +41,7 @@ def text_table(table: PrintedTable, most: int = MOST_ROWS) -> str:
     lines = align_columns([list(table.heads), *cells] if table.heads else cells)
     if len(table.rows) > most:
         lines.append(f"  and {len(table.rows) - most} more")
-    return "\n".join([table.title, *lines])
+    return "\n".join([table.title, *lines, *table.remarks])
 
 
 def align_columns(cells: Sequence[Sequence[str]]) -> list[str]:
@@ -56,7 +60,8 @@ def html_table(table: PrintedTable) -> str:
     if len(rows) > MOST_HTML_ROWS:
         body += f'<tr><td colspan="{len(heads) or len(rows[0])}">and {len(rows) - MOST_HTML_ROWS} more</td></tr>'
     top = f"<thead><tr>{head}</tr></thead>" if heads else ""
-    return f"<table><caption>{escape(table.title)}</caption>{top}<tbody>{body}</tbody></table>"
+    remarks = f"<p>{'<br>'.join(map(escape, table.remarks))}</p>" if table.remarks else ""
+    return f"<table><caption>{escape(table.title)}</caption>{top}<tbody>{body}</tbody></table>{remarks}"
 
 
 def _cell(value: object, is_head: bool) -> str:

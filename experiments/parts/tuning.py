@@ -98,10 +98,10 @@ class Drift:
         chunks = np.split(z, range(LANES, len(z), LANES))
         return self.unit * np.concatenate([np.linalg.norm(self.evaluate(chunk).r, axis=1) for chunk in chunks])
 
-    def tuned(self) -> Fit:
+    def tuned(self) -> list[Fit]:
         """Fits from all guesses."""
         self.calls = 0
-        return minimize_squares(self.evaluate, np.log(GUESSES), settled=SETTLED)
+        return [minimize_squares(self.evaluate, guess, settled=SETTLED) for guess in np.log(GUESSES)]
 
     def last(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
         """The length of Psi (B, 2) at the end of the run, and its derivative by the logarithm of both gains."""

@@ -83,16 +83,10 @@ def save(data: "xarray.Dataset", out: Path) -> None:
     """
     kind = out.suffix.lower()
     if kind == ".csv":
-        import csv
-
         import numpy as np
+        import pandas  # which xarray is made of
 
-        columns = list(_columns(data))
-        with out.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow([heading for heading, _ in columns])
-            rows = zip(*(values.tolist() for _, values in columns), strict=True)
-            writer.writerows([["" if isinstance(x, float) and not np.isfinite(x) else x for x in row] for row in rows])
+        pandas.DataFrame(dict(_columns(data))).replace([np.inf, -np.inf], np.nan).to_csv(out, index=False)
     elif kind == ".npz":
         import json
 

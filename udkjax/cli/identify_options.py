@@ -54,7 +54,7 @@ class IdentifyOptions:
         left_out = [name for group in ignore for name in group]
         found = self._try(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
         found = self._try(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
-        return [record.with_start(Start(estimate=start)) for record in found]
+        return [record.changed(initial_state=Start(estimate=start)) for record in found]
 
     def profiled(self, groups: Groups) -> list[str]:
         """Return the names of parameters, as the estimate has them, that are called by all of their names or one of them."""

@@ -4,8 +4,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from udkjax.cli.channels import channels_of, choose_driver, measure_channels
-from udkjax.cli.common import Json, Scene, fail, refuse, show
+from udkjax.cli.common import Json, Scene, channels_of, choose_driver, fail, measure_channels, refuse, show
 from udkjax.cli.datasets import load_to_write, write
 from udkjax.extras import OptionalImport
 

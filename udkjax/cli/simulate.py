@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from udkjax.cli.channels import channels_of, measure_channels
-from udkjax.cli.common import Json, Scene, fail, load, output_times, refuse, show
+from udkjax.cli.common import Json, Scene, channels_of, fail, load, measure_channels, output_times, refuse, show
 from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, save
 from udkjax.extras import require
 

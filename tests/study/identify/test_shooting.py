@@ -62,20 +62,20 @@ def test_a_first_guess_follows_what_was_measured(pieces):
 
 def test_the_fit_is_that_of_the_whole_record(problem):
     pieces, fit = fit_pieces(problem, np.zeros(problem.K), TOL, Minimizer(), samples=6)
-    assert fit.settled[0] and explains(pieces, fit, TOL)
-    assert pieces.gaps(fit.z, TOL)[0] < 1e-7
-    whole = Minimizer().minimize(problem, fit.z[:, :2], TOL)
-    assert np.abs(fit.z[0, :2] - whole.z[0]).max() < 1e-5
-    assert np.all(np.abs(problem.unknowns.values(fit.z[0, :2]) / [0.375, 0.2] - 1.0) < 0.02)
+    assert fit.settled and explains(pieces, fit, TOL)
+    assert pieces.gaps(fit.z[None], TOL)[0] < 1e-7
+    whole = Minimizer().minimize(problem, fit.z[:2], TOL)
+    assert np.abs(fit.z[:2] - whole.z).max() < 1e-5
+    assert np.all(np.abs(problem.unknowns.values(fit.z[:2]) / [0.375, 0.2] - 1.0) < 0.02)
     # Errors of the integration, 1e-9, count in defects, which weigh 1e7.
-    assert fit.cost[0] == pytest.approx(whole.cost[0], rel=1e-3)
+    assert fit.cost == pytest.approx(whole.cost, rel=1e-3)
 
 
 @pytest.mark.slow
 def test_whole_records_end_the_fit_where_they_can(problem):
     found = search(problem, np.zeros((1, problem.K)), TOL, Minimizer(), strategy="pieces")
-    assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.settled[0]
-    assert found.fit.z.shape == (1, 2)
+    assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.settled
+    assert found.fit.z.shape == (2,)
 
 
 def test_an_unknown_strategy_is_refused(problem):
@@ -98,7 +98,7 @@ def test_chaos():
         first = udk.with_length(first, "upper", factors[1])
         whole = FitProblem(first, unknowns_of(first, names), [record])
         along = fit_growing_records(whole, np.zeros(3), TOL, Minimizer())
-        assert along.cost[0] > 1e3 * q.size  # half of it would be noise
+        assert along.cost > 1e3 * q.size  # half of it would be noise
         estimate = identify(first, record, names, progress=False)
         assert estimate.ways[-1] == "records in pieces" and isinstance(estimate.problem, MultipleShooting)
         assert estimate.success

@@ -1,6 +1,5 @@
 """What a sweep has written: whole, never twice, never mixed with another sweep."""
 
-import errno
 import json
 import os
 import signal
@@ -167,23 +166,6 @@ def test_what_was_being_written_when_the_process_died_is_removed(tmp_path):
     torn.write_bytes(b"half")
     with FolderStore(tmp_path, FINGERPRINT) as stored:
         assert not torn.exists()
-        assert not_done(stored) == CHUNKS[1:]
-
-
-@pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_full_disk_is_named_and_what_is_finished_stays_valid(tmp_path, monkeypatch, call):
-    with FolderStore(tmp_path, FINGERPRINT) as stored:
-        stored.write(CHUNKS[0], data(CHUNKS[0]))
-
-        def full(*_):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        with monkeypatch.context() as patched:
-            patched.setattr(os, call, full)
-            with pytest.raises(StoreError, match=r"No space left on device; 1 chunks in .* stay valid.*run the same sweep again"):
-                stored.write(CHUNKS[1], data(CHUNKS[1]))
-        assert len(files(tmp_path)) == 1
-    with FolderStore(tmp_path, FINGERPRINT) as stored:
         assert not_done(stored) == CHUNKS[1:]
 
 

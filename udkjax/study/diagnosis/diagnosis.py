@@ -1,10 +1,10 @@
 """Result of `diagnose`, as numbers and as text."""
 
-import html
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from udkjax.printing import PrintedTable, html_table
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import Clearance, RankChange
 from udkjax.study.diagnosis.configuration import JointForces
@@ -118,12 +118,8 @@ class Diagnosis(NamedTuple):
         return f"Diagnosis({self.mechanism.name!r}, rank {self.rank}, {self.degrees_of_freedom} degrees of freedom)"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th style='text-align:left;vertical-align:top'>{html.escape(title)}</th>"
-            f"<td style='text-align:left'>{'<br>'.join(html.escape(entry) for entry in entries)}</td></tr>"
-            for title, entries in _sections(self)
-        )
-        return f"<table><caption>{html.escape(self.mechanism.name or 'mechanism')}</caption>{rows}</table>"
+        rows = [(title if k == 0 else "", entry) for title, entries in _sections(self) for k, entry in enumerate(entries)]
+        return html_table(PrintedTable(self.mechanism.name or "mechanism", rows))
 
 
 # --- as text

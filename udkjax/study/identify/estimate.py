@@ -1,6 +1,5 @@
 """The result of an identification: values, their uncertainty, what the records do not show, and how it was found."""
 
-import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from jaxtyping import Float
 from udkjax.extras import OptionalImport
 from udkjax.integrate.assembly import State
 from udkjax.integrate.solution import scene_text, versions
-from udkjax.printing import PrintedTable, align_columns, html_table
+from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.fit_problem import FitProblem
@@ -165,18 +164,17 @@ class Estimate:
         ]
         return [Row(*row) for row in zip(*columns, strict=True)] + states
 
-    def _cells(self) -> list[tuple[str, ...]]:
-        cells = [("parameter", "value", "standard error", "unit", "first guess", "")]
+    def _table(self) -> PrintedTable:
+        title, problem = self.mechanism.name or "mechanism", self.problem
+        numbers = f"{plural(len(problem.index), 'number')} in {plural(len(problem.records), 'record')}"
+        cells = []
         for row in self.rows():
             error = "unknown" if not math.isfinite(row.standard_error) else f"{row.standard_error:.2g}"
             value = format_value(row.value, row.standard_error)
             cells.append((row.parameter, value, error, row.units, f"{row.first_guess:.6g}", row.note))
-        return cells
-
-    def _head(self) -> str:
-        title, problem = self.mechanism.name or "mechanism", self.problem
-        numbers = f"{plural(len(problem.index), 'number')} in {plural(len(problem.records), 'record')}"
-        return f"{title}: {plural(len(self.names), 'parameter')} from {numbers}"
+        remarks = *(f"{name}: {text}" for name, text in self._facts().items()), *self.message.splitlines()
+        heads = "parameter", "value", "standard error", "unit", "first guess", ""
+        return PrintedTable(f"{title}: {plural(len(self.names), 'parameter')} from {numbers}", cells, heads, remarks)
 
     def _facts(self) -> dict[str, str]:
         problem, known = self.problem, self.uncertainty
@@ -195,15 +193,10 @@ class Estimate:
         return facts
 
     def __str__(self) -> str:
-        width = max(map(len, facts := self._facts()))
-        lines = [self._head(), *align_columns(self._cells()), *(f"  {name:<{width}}  {text}" for name, text in facts.items())]
-        return "\n".join([*lines, self.message])
+        return text_table(table := self._table(), len(table.rows))
 
     def _repr_html_(self) -> str:
-        heads, *cells = self._cells()
-        lines = *(f"{name}: {text}" for name, text in self._facts().items()), *self.message.splitlines()
-        remarks = "".join(f"<br>{html.escape(text)}" for text in lines)
-        return html_table(PrintedTable(self._head(), cells, heads)) + f"<p>{remarks.removeprefix('<br>')}</p>"
+        return html_table(self._table())
 
     def __repr__(self) -> str:
         return f"Estimate({', '.join(f'{name}: {value:.6g}' for name, value in self.parameters.items())})"

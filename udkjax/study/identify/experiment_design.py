@@ -9,13 +9,14 @@ for. The best candidate has the largest det M (criterion "D"), the smallest trac
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.integrate.assembly import State
+from udkjax.printing import PrintedTable, prints_table
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
@@ -44,8 +45,8 @@ class Candidate:
     name: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Design:
+@prints_table
+class Design(NamedTuple):
     """A ranking of N candidates by what they would show of P parameters; each alone, with what was known before.
 
     Attributes:
@@ -74,12 +75,10 @@ class Design:
         """The candidate that shows most."""
         return self.order[0]
 
-    def __str__(self) -> str:
-        rows = [f"{'':24}{f'{self.criterion}':>12}" + "".join(f"{name[-24:]:>26}" for name in self.names)]
-        for k in self.order:
-            errors = "".join(f"{error:26.3g}" for error in self.standard_errors[k])
-            rows.append(f"{self.candidates[k][:24]:24}{self.scores[k]:12.4g}{errors}")
-        return "\n".join(rows)
+    def _table(self) -> PrintedTable:
+        errors = [[f"{error:.3g}" for error in self.standard_errors[k]] for k in self.order]
+        rows = [(self.candidates[k], f"{self.scores[k]:.4g}", *own) for k, own in zip(self.order, errors, strict=True)]
+        return PrintedTable("experiments, the best first", rows, ("", self.criterion, *self.names))
 
 
 @checked

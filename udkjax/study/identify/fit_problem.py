@@ -250,7 +250,7 @@ def _with_initial_state(records: Sequence[Record], given: Start | Estimated | No
     if given is None:
         return records
     start = given if isinstance(given, Start) else Start(estimate=given)
-    return [record.with_start(start) for record in records]
+    return [record.changed(initial_state=start) for record in records]
 
 
 def _check_settings(mechanism: Mechanism, settings: Mapping[str, Any]) -> None:

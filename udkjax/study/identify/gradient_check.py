@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.solution import CAUSES, Result
-from udkjax.printing import align_columns
+from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
@@ -133,7 +133,10 @@ class GradientCheck:
         return "\n".join(_sentences(self)) or "derivatives agree with differences as far as differences can tell"
 
     def __str__(self) -> str:
-        return _table(self)
+        return text_table(table := _table(self), len(table.rows))
+
+    def _repr_html_(self) -> str:
+        return html_table(_table(self))
 
     def __repr__(self) -> str:
         return f"GradientCheck(ok={self.ok}, {len(self.names)} directions, {len(self.series)} series)"
@@ -280,10 +283,10 @@ def _sentence(check: GradientCheck, d: int, s: int) -> str:
     return ""
 
 
-def _table(check: GradientCheck) -> str:
+def _table(check: GradientCheck) -> PrintedTable:
     several = len(check.series) > 1
     where = ["worst in"] if several else []
-    cells: list[Sequence[str]] = [("direction", *where, "size", "differs by", "noise", "truncation", "own error", "step", "")]
+    cells, heads = [], ("direction", *where, "size", "differs by", "noise", "truncation", "own error", "step", "")
     parts = [check.at_best(x) for x in (check.discrepancy, check.noise, check.truncation)]
     for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
         size = check.size[d, s]
@@ -293,4 +296,4 @@ def _table(check: GradientCheck) -> str:
         where = [check.labels[s]] if several else []
         cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))
     title = f"{check.title}: derivatives against differences, at a tolerance of {check.tol[0]:.1g}"
-    return "\n".join([title, *align_columns(cells), check.message])
+    return PrintedTable(title, cells, heads, check.message.splitlines())

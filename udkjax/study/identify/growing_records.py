@@ -90,22 +90,22 @@ def fit_growing_records(
         if ahead >= whole:
             break
         one = minimizer.with_label(f"{ahead / whole:.0%} of the records")
-        fit = one.minimize(held, at[None], tol, ahead, FEW_STEPS, COARSE_STEP)
+        fit = one.minimize(held, at, tol, ahead, FEW_STEPS, COARSE_STEP)
         history += fit.history
         own = times <= ahead
-        found = np.sqrt(2.0 * fit.cost[0] / max(own.sum(), 1))
+        found = np.sqrt(2.0 * fit.cost / max(own.sum(), 1))
         if fitted and not found <= LOST_RATIO * max(size, 1.0) and ahead > LEAST_GROWTH * fitted:
             ahead = np.sqrt(ahead * fitted)  # too far: from the same unknowns again, less far
             continue
-        if np.isfinite(fit.cost[0]):
-            at = fit.z[0]
+        if np.isfinite(fit.cost):
+            at = fit.z
         if not fitted:
             begun = at
             for beginning, same in known or ():
                 if np.abs(at - beginning).max() <= SAME_BEGINNING_DISTANCE:
                     return same._replace(history=history)
         fitted, size, ahead = ahead, found, 0.0
-    fit = minimizer.with_label("whole records").minimize(problem, at[None], tol, None, STEPS, LOOSE_STEP)
+    fit = minimizer.with_label("whole records").minimize(problem, at, tol, None, STEPS, LOOSE_STEP)
     if known is not None:
         known.append((begun, fit))
     return fit._replace(history=history + fit.history)

@@ -113,8 +113,7 @@ def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None
         raise IdentificationError(
             [f"guesses: must be of shape (B, {P}), one finite value a parameter; is of shape {given.shape}"]
         )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        z = problem.unknowns.z_of(given)
+    z = problem.unknowns.z_of(given)
     if not np.isfinite(z).all():
         wrong = problem.unknowns.names[int(np.argmax(~np.isfinite(z).all(0)))]
         raise IdentificationError([f"guesses: one of {wrong} is not between its bounds, or not positive"])
@@ -122,8 +121,8 @@ def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None
 
 
 def _require_finite(problem: FitProblem, found: SearchResult) -> None:
-    if not np.isfinite(found.fit.cost).any():
-        code = problem.evaluate(found.fit.z, (LOOSE_TOL, LOOSE_TOL)).code[0]
+    if not np.isfinite(found.fit.cost):
+        code = problem.evaluate(found.fit.z[None], (LOOSE_TOL, LOOSE_TOL)).code[0]
         raise IdentificationError([f"no first guess could be simulated along the records: {CAUSES[Result(int(code))]}"])
 
 
@@ -145,7 +144,7 @@ def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[
     return fit, history
 
 
-def reweigh(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:
+def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:
     """Take what a fit leaves of each channel as its noise, where that is not known, and `least` of what the channel shows.
 
     Returns:
@@ -153,7 +152,7 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances, l
     """
     before = problem.sigma.copy()
     rows = len(problem.index)
-    r = problem.evaluate(z, tol).r[0, :rows]
+    r = problem.evaluate(z[None], tol).r[0, :rows]
     left, kept = r * problem.sigma, ~find_outlier_rows(problem, r)
     for c in range(len(problem.channels)):
         own = (problem.index[:, 2] == c) & ~problem.noise_given & kept
@@ -170,9 +169,9 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances, l
 def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerances, loss: Loss, seconds: float) -> Estimate:
     """Return the estimate of a fit."""
     problem = found.problem
-    unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z[0]
+    unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z
     x, states = unknowns.values(z[:P]), problem.state_sizes * z[P:]
-    plain, rows = problem.evaluate(fit.z, tol), len(problem.index)
+    plain, rows = problem.evaluate(z[None], tol), len(problem.index)
     weighted = loss(plain)
     outlying, robust = find_outlier_rows(problem, plain.r[0, :rows]), loss is not squares
     # By a robust loss outliers hardly count, and are left out here; squares count them, and so do standard errors.
@@ -219,7 +218,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
         noise=problem.by_record(sigma),
         outliers=list_outliers(problem, outlying, left, sigma),
         whiteness=white,
-        converged=bool(fit.settled[0]),
+        converged=fit.settled,
         agreeing=found.agreeing,
         guesses=found.guesses,
         ways=found.ways,

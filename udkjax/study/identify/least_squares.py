@@ -1,4 +1,4 @@
-"""Least squares: the trust-region method of SciPy from several first guesses, ended by steps that are known to be small enough.
+"""Least squares: the trust-region method of SciPy, ended by steps that are known to be small enough.
 
 Within a radius around a point z the residuals are taken to be linear, r + J dz. Where the cost falls as that promises, the radius
 grows, and it shrinks where it does not, or where a trial cannot be computed. Near a minimum steps are those of Gauss and Newton.
@@ -6,12 +6,12 @@ grows, and it shrinks where it does not, or where a trial cannot be computed. Ne
 Source: M. A. Branch, T. F. Coleman & Y. Li, SIAM Journal on Scientific Computing 21 (1999) 1.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.linalg import lstsq
 
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
@@ -34,8 +34,8 @@ Report: TypeAlias = Callable[[str], None]  # is called with a text after each st
 History: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an unknown by the next step: after each step
 
 
-class End(NamedTuple):
-    """The end of one fit: unknowns, cost r.r / 2, whether it settled, and how it went."""
+class Fit(NamedTuple):
+    """The end of a fit: unknowns, cost r.r / 2, whether it settled, and how it went."""
 
     z: Float[np.ndarray, "K"]
     cost: float
@@ -43,52 +43,21 @@ class End(NamedTuple):
     history: History
 
 
-class Fit(NamedTuple):
-    """The ends of B fits: unknowns, costs r.r / 2, whether they settled, and how the best of them went."""
-
-    z: Float[np.ndarray, "B K"]
-    cost: Float[np.ndarray, "B"]
-    settled: Bool[np.ndarray, "B"]
-    history: History  # of the best fit
-
-    @classmethod
-    def of(cls, ends: Sequence[End]) -> "Fit":
-        """Return where some fits ended as one."""
-        z, cost, settled, _ = zip(*ends, strict=True)
-        return cls(np.array(z), np.array(cost), np.array(settled), min(ends, key=lambda end: end.cost).history)
-
-    def take(self, which: Int[np.ndarray, "n"]) -> "Fit":
-        """Return some of the fits."""
-        return Fit(self.z[which], self.cost[which], self.settled[which], self.history)
-
-    def join(self, other: "Fit") -> "Fit":
-        """Return these fits, then others."""
-        z, cost, settled = (np.concatenate(pair) for pair in zip(self[:3], other[:3], strict=True))
-        return Fit(z, cost, settled, self.history)
-
-
 def minimize_squares(
     evaluate: Objective,
-    z: Float[np.ndarray, "B K"],
+    z: Float[np.ndarray, "K"],
     steps: int = STEPS,
     settled: float = EXACT_STEP,
     report: Report = lambda text: None,
 ) -> Fit:
-    """Minimize r.r / 2 from several first guesses.
-
-    A fit has settled where its Gauss-Newton step is below `settled` (dimensionless).
-    """
-    return Fit.of([_minimize(evaluate, guess, steps, settled, report) for guess in z])
-
-
-def _minimize(evaluate: Objective, guess: Float[np.ndarray, "K"], steps: int, settled: float, report: Report) -> End:
+    """Minimize r.r / 2 from a first guess. A fit has settled where its Gauss-Newton step is below `settled` (dimensionless)."""
     from scipy.optimize import least_squares
 
-    fit = _TrustRegionFit(evaluate, guess, settled, report)
+    fit = _TrustRegionFit(evaluate, z, settled, report)
     # `Descent` says when a fit ends, but for its steps.
     choices: dict[str, Any] = {"jac": fit.jacobian, "ftol": None, "gtol": None, "xtol": ROUNDING, "max_nfev": steps}
     with suppress(StopIteration):
-        least_squares(fit.residuals, np.zeros(len(guess)), **choices)
+        least_squares(fit.residuals, np.zeros(len(z)), **choices)
     return fit.end
 
 
@@ -97,7 +66,7 @@ class Descent:
 
     def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], settled: float, report: Report):
         self.evaluate, self.guess, self.settled, self.report = evaluate, guess, settled, report
-        self.end, self.size = End(guess, np.inf, False, []), np.inf
+        self.end, self.size = Fit(guess, np.inf, False, []), np.inf
 
     def note(self, size: float) -> None:
         """Note the length of the step that the best point asks for; end where that is short enough."""

@@ -132,13 +132,13 @@ class Minimizer:
     def minimize(
         self,
         problem: Evaluated,
-        z: Float[np.ndarray, "B K"],
+        z: Float[np.ndarray, "K"],
         tol: Tolerances,
         horizon: float | None = None,
         steps: int = STEPS,
         settled: float = EXACT_STEP,
     ) -> Fit:
-        """Fit the first `horizon` seconds of each record (None: all of it) from several first guesses: see `minimize_squares`."""
+        """Fit the first `horizon` seconds of each record (None: all of it) from a first guess: see `minimize_squares`."""
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if self.method is not None:
             return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)
@@ -152,23 +152,20 @@ class Minimizer:
 def minimize_by_gradient(
     method: GradientMethod,
     evaluate: Objective,
-    z: Float[np.ndarray, "B K"],
+    z: Float[np.ndarray, "K"],
     steps: int = GRADIENT_STEPS,
     settled: float = FINE_STEP,
     report: Report = lambda text: None,
 ) -> Fit:
-    """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from guesses one after another.
+    """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from a first guess.
 
     A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
     taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
     """
-    ends = []
-    for first in z:
-        descent = _LossDescent(method.loss or _half_square, evaluate, first, max(settled, FINE_STEP), report)
-        with suppress(StopIteration):
-            _descend(method.optimizer, descent, steps)
-        ends.append(descent.end)
-    return Fit.of(ends)
+    descent = _LossDescent(method.loss or _half_square, evaluate, z, max(settled, FINE_STEP), report)
+    with suppress(StopIteration):
+        _descend(method.optimizer, descent, steps)
+    return descent.end
 
 
 def _descend(optimizer: Optimizer, descent: "_LossDescent", steps: int) -> None:

@@ -85,8 +85,8 @@ def profile_likelihood(
         others = np.delete(z0, index)
         if not others.size:
             return z0, _cost(evaluate(z0[None]))
-        found = minimize_squares(fix_unknown(evaluate, index, fixed), others[None], settled=FINE_STEP)
-        return np.insert(found.z[0], index, fixed), float(found.cost[0])
+        found = minimize_squares(fix_unknown(evaluate, index, fixed), others, settled=FINE_STEP)
+        return np.insert(found.z, index, fixed), found.cost
 
     def value(fixed: float) -> float:
         every = z[:P].copy()

@@ -243,7 +243,7 @@ class _DataReader:
         if list(values) == list(record.values) or len(values) != len(record.values):
             return record
         noise = dict(zip(values, record.noise.values(), strict=True))
-        return record.with_channels(values, noise)
+        return record.changed(values=values, noise=noise)
 
     def with_noise(self, record: Record, given: dict[Key, ArrayLike | None]) -> Record:
         """Return the record with the `given` standard deviation for those channels that have none of their own."""
@@ -251,7 +251,7 @@ class _DataReader:
             return record
         noise = {channel: given.get(channel) if own is None else own for channel, own in record.noise.items()}
         try:
-            return record.with_channels(record.values, noise)
+            return record.changed(noise=noise)
         except IdentificationError as error:
             self.problems += error.problems
             return record

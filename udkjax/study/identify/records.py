@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -117,13 +117,10 @@ class Record:
         """The text that messages about it begin with."""
         return f"record {quote(self.name)}: " if self.name else ""
 
-    def with_start(self, start: Start) -> "Record":
-        """Return the same record with another start."""
-        return Record(self.times, self.values, self.noise, start, self.t0, self.conditions, self.name)
-
-    def with_channels(self, values: Mapping[Key, np.ndarray], noise: Mapping[Key, ArrayLike | None]) -> "Record":
-        """Return the same record with other values and noise."""
-        return Record(self.times, values, noise, self.start, self.t0, self.conditions, self.name)
+    def changed(self, **changes: Any) -> "Record":
+        """Return the same record with other `values`, `noise` or `initial_state`."""
+        own = {"values": self.values, "noise": self.noise, "initial_state": self.start, "t0": self.t0}
+        return Record(self.times, **own | {"conditions": self.conditions, "name": self.name} | changes)
 
     def __repr__(self) -> str:
         return f"Record({len(self.times)} times, {', '.join(map(str, self.values))})"

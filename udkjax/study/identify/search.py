@@ -5,7 +5,7 @@ parts and follows them as they grow: see `growing_records`. Where that fails too
 one after another until one explains the records. What is left are records of chaotic motion: see `shooting`.
 """
 
-from functools import reduce
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,57 +62,59 @@ def search(
     loose = max(tol[0], LOOSE_TOL), max(tol[1], LOOSE_TOL)
     if strategy == "pieces":
         along = fit_growing_records(problem, z[0], loose, minimizer)
-        if found := fit_in_pieces(problem, np.concatenate([along.z, z]), tol, minimizer):
+        if found := fit_in_pieces(problem, np.array([along.z, *z]), tol, minimizer):
             return found._replace(history=along.history + found.history)
-    ways, tried = ["whole records"], [z]
+    ways, tried = ["whole records"], list(z)
     known: Known = []
-    fit = minimizer.with_label("whole records").minimize(problem, z, loose, None, SOME_STEPS, LOOSE_STEP)
-    history = list(fit.history)
-    if not explains(problem, fit, loose):
+    whole = minimizer.with_label("whole records")
+    fits = [whole.minimize(problem, guess, loose, None, SOME_STEPS, LOOSE_STEP) for guess in z]
+    history = list(_best(fits).history)
+    if not explains(problem, _best(fits), loose):
         ways.append("growing records")
         grown = [fit_growing_records(problem, guess, loose, minimizer, known) for guess in z]
-        tried.append(np.concatenate([one.z for one in grown]))
+        tried += [one.z for one in grown]
         history += [row for one in grown for row in one.history]
-        others = reduce(Fit.join, grown)
-        fit = fit.join(others).take(np.arange(len(z)) + np.where(others.cost < fit.cost, len(z), 0))
-    count = len(z)
-    if more and not explains(problem, fit, loose):
+        fits = [_best(pair) for pair in zip(fits, grown, strict=True)]
+    if more and not explains(problem, _best(fits), loose):
         ways.append("more first guesses")
         sampled = sample_guesses(problem.unknowns, z[0], SAMPLES_PER_GUESS * more, seed)
         for guess in rank_guesses(problem, sampled, loose):
             one = fit_growing_records(problem, guess, loose, minimizer, known)
             history += one.history
             tried.append(one.z)
-            fit, count = fit.join(one), count + 1
+            fits.append(one)
             if (
-                explains(problem, fit, loose)
+                explains(problem, _best(fits), loose)
                 or len(known) >= len(z) + more
-                or (_count_agreeing(fit) >= ENOUGH_AGREEING and _shows_most(problem, fit))
+                or (_count_agreeing(fits) >= ENOUGH_AGREEING and _shows_most(problem, _best(fits)))
             ):
                 break
-    best, agreeing = int(np.argmin(fit.cost)), _count_agreeing(fit)
-    only = fit.take(np.array([best]))
-    if more and not explains(problem, only, loose):
+    best, agreeing = _best(fits), _count_agreeing(fits)
+    if more and not explains(problem, best, loose):
         # Where half of the guesses agree, the mechanism does not move like that.
-        chaotic = is_chaotic(problem, only.z, loose)
-        pieces = MOST_GUESSES_IN_PIECES if chaotic else 2 * agreeing < count
-        found = fit_in_pieces(problem, np.concatenate(tried), tol, minimizer, pieces)
+        chaotic = is_chaotic(problem, best.z, loose)
+        pieces = MOST_GUESSES_IN_PIECES if chaotic else 2 * agreeing < len(fits)
+        found = fit_in_pieces(problem, np.array(tried), tol, minimizer, pieces)
         if found:
-            return found._replace(guesses=count, ways=(*ways, *found.ways), history=history + found.history)
-    return SearchResult(only, agreeing, count, tuple(ways), history, problem)
+            return found._replace(guesses=len(fits), ways=(*ways, *found.ways), history=history + found.history)
+    return SearchResult(best, agreeing, len(fits), tuple(ways), history, problem)
 
 
-def _count_agreeing(fit: Fit) -> int:
+def _best(fits: Sequence[Fit]) -> Fit:
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _count_agreeing(fits: Sequence[Fit]) -> int:
     """Return how many fits are at the best minimum."""
-    best = int(np.argmin(fit.cost))
-    agreeing = np.abs(fit.z - fit.z[best]).max(1) <= SAME_MINIMUM_DISTANCE * (1.0 + np.abs(fit.z[best]).max())
-    return int((agreeing & np.isfinite(fit.cost)).sum())
+    best = _best(fits).z
+    near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best).max())
+    return sum(bool(np.isfinite(fit.cost)) and bool(np.abs(fit.z - best).max() <= near) for fit in fits)
 
 
 def _shows_most(problem: FitProblem, fit: Fit) -> bool:
-    """Return whether the best fit shows most of the motion."""
+    """Return whether a fit shows most of the motion."""
     scale = problem.channel_scale[problem.index[:, 2]] / problem.sigma
-    return bool(2.0 * fit.cost.min() < SHOWN_PART**2 * np.sum(scale**2))
+    return bool(2.0 * fit.cost < SHOWN_PART**2 * np.sum(scale**2))
 
 
 def fit_in_pieces(
@@ -130,7 +132,7 @@ def fit_in_pieces(
             continue
         if explains(pieces, fit, loose):
             found = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)
-            along = fit.z[:, : problem.K]
+            along = fit.z[: problem.K]
             whole = minimizer.with_label("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP)
             if explains(problem, whole, tol):
                 return found._replace(fit=whole, history=fit.history + whole.history, problem=problem)
@@ -138,11 +140,11 @@ def fit_in_pieces(
     return None
 
 
-def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "1 K"], tol: Tolerances) -> bool:
+def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances) -> bool:
     """Return whether derivatives grow along a record faster than where motions only fall out of step: like t or t^2."""
     record, time, _ = problem.index.T
     late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
-    J = np.abs(problem.evaluate(z, tol).J[0, : len(problem.index), : len(problem.unknowns.names)])
+    J = np.abs(problem.evaluate(z[None], tol).J[0, : len(problem.index), : len(problem.unknowns.names)])
     with np.errstate(invalid="ignore", divide="ignore"):
         return bool((J[late].max(0, initial=0.0) / J[~late].max(0, initial=0.0) > CHAOTIC_GROWTH).any())
 
@@ -170,11 +172,10 @@ def horizons(problem: FitProblem) -> list[float]:
 
 
 def explains(problem: FitProblem, fit: Fit, tol: Tolerances) -> bool:
-    """Return whether the best of some fits leaves nothing but noise."""
-    best = int(np.argmin(fit.cost))
-    if not (np.isfinite(fit.cost[best]) and fit.settled[best]):
+    """Return whether a fit leaves nothing but noise."""
+    if not (np.isfinite(fit.cost) and fit.settled):
         return False
-    found = problem.evaluate(fit.z[best : best + 1], tol)
+    found = problem.evaluate(fit.z[None], tol)
     if not found.ok[0]:
         return False
     r = found.r[0, : len(problem.index)]

@@ -123,8 +123,8 @@ class MultipleShooting(FitProblem):
             columns = self.columns[p]
             if piece.first:
                 self._begin_at(p, ends[1], x)  # the piece before is of the same record
-                fit = minimize_squares(self._residuals_of_piece(p, x, tol), np.zeros((1, self.S)), FEW_STEPS, COARSE_STEP)
-                found[columns] = np.where(np.isfinite(fit.cost[0]), fit.z[0], 0.0)
+                fit = minimize_squares(self._residuals_of_piece(p, x, tol), np.zeros(self.S), FEW_STEPS, COARSE_STEP)
+                found[columns] = fit.z if np.isfinite(fit.cost) else 0.0
             ends = np.asarray(self._predict_piece(p, x, np.where(columns < 0, 0.0, found[columns])[None], tol).ends)[0]
             if not np.isfinite(ends).all():
                 raise PieceFailed
@@ -195,14 +195,14 @@ def fit_pieces(
     first guess, `PieceFailed` is raised.
     """
     shooting = MultipleShooting(problem, z, tol, samples)
-    fit, history = Fit(shooting.guess[None], np.full(1, np.inf), np.zeros(1, bool), []), []
+    fit, history = Fit(shooting.guess, np.inf, False, []), []
     for weight in WEIGHTS:
         shooting.weight = weight
         one = minimizer.with_label(f"pieces held together by {weight:.0e}")
         steps, settled = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
         fit = one.minimize(shooting, fit.z, tol, None, steps, settled)
         history += fit.history
-        if weight > WEIGHTS[0] and not fit.settled[0]:  # with larger weights they would only be farther from a minimum
+        if weight > WEIGHTS[0] and not fit.settled:  # with larger weights they would only be farther from a minimum
             break
     return shooting, fit._replace(history=history)
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.linalg import qr
+from scipy.special import expit, logit
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.scales import known_scales
@@ -90,30 +91,21 @@ class Unknowns:
 
     @np.errstate(over="ignore", invalid="ignore")
     def _values_and_slopes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, slope = np.empty_like(z), np.empty_like(z)
-        for k, kind in enumerate(self.kinds):
-            x0, low, high = self.guess[k], self.low[k], self.high[k]
-            if kind == "positive":
-                x[..., k] = slope[..., k] = x0 * np.exp(z[..., k])
-            elif kind == "bounded":
-                part = 1.0 / (1.0 + ((high - x0) / (x0 - low)) * np.exp(-z[..., k]))
-                x[..., k], slope[..., k] = low + (high - low) * part, (high - low) * part * (1.0 - part)
-            else:
-                x[..., k], slope[..., k] = x0 + self.scale[k] * z[..., k], self.scale[k]
-        return x, slope
+        width, x = self.high - self.low, self.guess * np.exp(z)
+        part = expit(z + logit((self.guess - self.low) / width))
+        values = self._by_kind(x, self.low + width * part, self.guess + self.scale * z)
+        return values, self._by_kind(x, width * part * (1.0 - part), self.scale)
 
+    @np.errstate(divide="ignore", invalid="ignore")
     def z_of(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return z(x)."""
-        z = np.empty_like(x)
-        for k, kind in enumerate(self.kinds):
-            x0, low, high = self.guess[k], self.low[k], self.high[k]
-            if kind == "positive":
-                z[..., k] = np.log(x[..., k] / x0)
-            elif kind == "bounded":
-                z[..., k] = np.log((x[..., k] - low) / (high - x[..., k]) * ((high - x0) / (x0 - low)))
-            else:
-                z[..., k] = (x[..., k] - x0) / self.scale[k]
-        return z
+        """Return z(x); not finite where a value is not between its bounds, or not positive."""
+        width = self.high - self.low
+        bounded = logit((x - self.low) / width) - logit((self.guess - self.low) / width)
+        return self._by_kind(np.log(x / self.guess), bounded, (x - self.guess) / self.scale)
+
+    def _by_kind(self, positive: np.ndarray, bounded: np.ndarray, free: np.ndarray) -> np.ndarray:
+        kinds = np.array(self.kinds)
+        return np.select([kinds == "positive", kinds == "bounded"], [positive, bounded], free)
 
     def at_bounds(self, x: Float[np.ndarray, "P"]) -> tuple[str, ...]:
         """Return the names of those that are at one of their bounds."""

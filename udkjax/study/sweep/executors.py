@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, TypeAlias, cast
 
 import jax
@@ -137,19 +137,14 @@ def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]
     """Start a client of the scheduler at this address; without one, of a process for each core, which end with the client."""
     with OptionalImport():
         import distributed
-    if scheduler is not None:
+    cluster = {"n_workers": cores(), "threads_per_worker": 1, "dashboard_address": ":0"}
+    with nullcontext(scheduler) if scheduler is not None else distributed.LocalCluster(**cluster) as where:
         try:
-            client = distributed.Client(scheduler)
+            client = distributed.Client(where)
         except (OSError, ValueError) as error:
             raise ClusterError(f"no scheduler of dask answers at {scheduler}: {error}") from error
         with client:
             yield client
-        return
-    with (
-        distributed.LocalCluster(n_workers=cores(), threads_per_worker=1, dashboard_address=":0") as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        yield client
 
 
 def _same(plan: SweepPlan) -> SweepPlan:

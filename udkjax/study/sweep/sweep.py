@@ -4,7 +4,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -166,23 +166,18 @@ class Watch:
         failures = _count_failures(before.failures, data["result"])
         slowest = _find_slowest(before.slowest, chunk.members, data.get(STEPS))
         slowest_chunk = _find_slowest(before.slowest_chunk, [chunk.index], seconds)
-        self.state = SweepProgress(
-            before.what,
-            before.done + len(chunk.members),
-            before.total,
-            now - self.begun,
-            _message(failures, slowest, slowest_chunk),
-            self.new / max(now - self.begun, 1e-9),
-            self._left(now),
-            failures,
-            slowest,
-            slowest_chunk,
+        self.state = replace(
+            before,
+            done=before.done + len(chunk.members),
+            seconds=now - self.begun,
+            message=_message(failures, slowest, slowest_chunk),
+            rate=self.new / max(now - self.begun, 1e-9),
+            remaining=(now - self.since) / self.work_done * (self.work - self.work_done) if self.work_done > 0 else None,
+            failures=failures,
+            slowest=slowest,
+            slowest_chunk=slowest_chunk,
         )
         self.show(self.state)
-
-    def _left(self, now: float) -> float | None:
-        """Estimate how long the rest takes (s), by the pace since its work is known."""
-        return (now - self.since) / self.work_done * (self.work - self.work_done) if self.work_done > 0 else None
 
 
 def _message(
