@@ -84,7 +84,7 @@ def save(data: "xarray.Dataset", out: Path) -> None:
     kind = out.suffix.lower()
     if kind == ".csv":
         import numpy as np
-        import pandas  # which xarray is made of
+        import pandas  # required by xarray
 
         pandas.DataFrame(dict(_columns(data))).replace([np.inf, -np.inf], np.nan).to_csv(out, index=False)
     elif kind == ".npz":
