@@ -31,7 +31,19 @@ FEWEST = 16  # trials that go on, at least; as many are polished in the end
 class DesignSearch:
     """A design that is compiled once and searched as often as wanted, such as from several seeds.
 
-    Its arguments, and what it raises, are those of `design`.
+    Args:
+        drawing: see `design`.
+        goal: see `design`.
+        free: see `design`.
+        bounds: see `design`.
+        lengths: see `design`.
+        areas: see `design`.
+        transmission: see `design`.
+        rotation: see `design`.
+        driver: see `design`.
+
+    Raises:
+        SceneError: see `design`.
     """
 
     @checked
