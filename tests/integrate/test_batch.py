@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from udkjax.equations.written_out import WrittenOut
-from udkjax.native import operations, primitive
+from udkjax.native import primitive, runs
 from udkjax.study.accuracy import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
@@ -188,7 +188,7 @@ def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
 
     monkeypatch.setattr(primitive, "machine_code", lambda kind, *lanes: found.append(kind) or machine_code(kind, *lanes))
     jax.jit(jax.jacfwd(angle)).lower(1.0)
-    (run,) = (x for x in found if isinstance(x, operations.RunTangents))
+    (run,) = (x for x in found if isinstance(x, runs.RunTangents))
     assert sum(run.active) == 1 and len(run.active) > 30
     written_out = WrittenOut(run.code, [], ["accelerations"], run.active)
     assert 1 <= len(written_out.moving) <= 8 < len(run.code.constants)

@@ -51,8 +51,8 @@ def test_few_functions_stand_between_a_call_and_machine_code(monkeypatch):
     mechanism = udk.library.parallelogram()
     udk.simulate(mechanism, TS)
     seen = called(lambda: udk.simulate(mechanism, TS))
-    assert len(seen) <= 51
-    assert len({file for file, _ in seen}) <= 19
+    assert len(seen) <= 38
+    assert len({file for file, _ in seen}) <= 12
 
 
 def test_what_is_decided_of_a_mechanism_is_decided_once():

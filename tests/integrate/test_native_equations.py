@@ -32,7 +32,7 @@ def both(mechanism, chosen, stabilization=Projection()):
     q, v, scales = mechanism.q0.ravel(), mechanism.v0.ravel(), analysis.scales
     marks = mark_rows(compiled, jnp.zeros(()), q, v, scales.length, jnp.maximum(scales.rate, 1.0))
     assert compiled.plan.evaluation is not None
-    return native_equations(compiled.textbook, marks, compiled.equations, compiled.plan.evaluation), compiled.textbook
+    return native_equations(compiled, marks), compiled.textbook
 
 
 @eqx.filter_jit

@@ -108,6 +108,22 @@ class At:
         loops.run(getattr(self.code, name), found)
         return found
 
+    def value(self, name, constants, q, v, steps):
+        """The results of a differentiable program; a projection takes so many steps."""
+        if name == "projection":
+            for _ in range(steps):
+                q = self.run("newton_q", constants=constants, q=q)["q1"]
+            return np.append(q, self.run("newton_v_and_psi", constants=constants, q=q, v=v)["v1"])
+        found = self.arrays(constants, q, v)
+        loops.run(self.code.differentiable[name].program, found)
+        return np.concatenate([found[x] for x in RESULTS[name]])
+
+    def evaluated(self, name, q, v):
+        """The arrays that a differentiable program leaves."""
+        found = self.arrays(q=q, v=v)
+        loops.run(self.code.differentiable[name].program, found)
+        return found
+
 
 @pytest.fixture(scope="module", params=SCENES)
 def at(request):
@@ -217,19 +233,11 @@ def test_derivatives_against_differences(at, name):
     dq, dv = random.standard_normal((2, code.coordinate_count))
 
     def value(h):
-        constants, moved_q, moved_v = at.constants + h * dconstants, q + h * dq, v + h * dv
-        if name == "projection":
-            for _ in range(3):
-                moved_q = at.run("newton_q", constants=constants, q=moved_q)["q1"]
-            return np.append(moved_q, at.run("newton_v_and_psi", constants=constants, q=moved_q, v=moved_v)["v1"])
-        found = at.arrays(constants, moved_q, moved_v)
-        loops.run(evaluated.program, found)
-        return np.concatenate([found[x] for x in results])
+        return at.value(name, at.constants + h * dconstants, q + h * dq, v + h * dv, 3)
 
     h = 1e-6
     slope = (value(h) - value(-h)) / (2 * h)
-    found = at.arrays(q=q, v=v)
-    loops.run(evaluated.program, found)
+    found = at.evaluated(name, q, v)
     changes = {f"d_{x}": np.full(len(a), np.nan) for x, a in found.items()}
     changes |= {"d_constants": dconstants, "d_q": dq, "d_v": dv}
     forward = found | changes
@@ -259,14 +267,7 @@ def test_second_derivatives_against_differences(at, name):
     def value(h):
         constants = at.constants.copy()
         loops.run(code.prologue, {"numbers": at.numbers + h @ numbers, "constants": constants})
-        moved_q, moved_v = q + h @ dq, v + h @ dv
-        if name == "projection":
-            for _ in range(4):
-                moved_q = at.run("newton_q", constants=constants, q=moved_q)["q1"]
-            return np.append(moved_q, at.run("newton_v_and_psi", constants=constants, q=moved_q, v=moved_v)["v1"])
-        found = at.arrays(constants, moved_q, moved_v)
-        loops.run(evaluated.program, found)
-        return np.concatenate([found[x] for x in results])
+        return at.value(name, constants, q + h @ dq, v + h @ dv, 4)
 
     def mixed(h):
         one, two = h * np.array([1.0, 1.0]), h * np.array([1.0, -1.0])
@@ -274,8 +275,7 @@ def test_second_derivatives_against_differences(at, name):
 
     h = 2e-4
     expected = (4 * mixed(h) - mixed(2 * h)) / 3
-    found = at.arrays(q=q, v=v)
-    loops.run(evaluated.program, found)
+    found = at.evaluated(name, q, v)
     found["numbers"] = at.numbers
     found |= {prefix + x: np.full(len(a), np.nan) for x, a in found.items() for prefix in PREFIXES[TWICE]}
     for x, given in {"numbers": numbers, "q": dq, "v": dv}.items():

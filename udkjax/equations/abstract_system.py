@@ -83,11 +83,11 @@ class AbstractSystem(eqx.Module):
     def matrices(
         self, t: Time, q: Vector, v: Vector
     ) -> tuple[Float[Array, "n n"], Vector, Float[Array, "m n"], Float[Array, "m"]]:
-        """M, F, A and c of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
+        """Return M, F, A and c of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
 
     @abstractmethod
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """q and v returned to the constraint manifold."""
+        """Return q and v to the constraint manifold."""
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """Return the part of small changes of q and v that a projection at q does not remove. By default all of it."""
@@ -95,7 +95,7 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
-        """Psi and the residuals of the velocities, of all rows."""
+        """Return Psi and the residuals of the velocities, of all rows."""
 
     @abstractmethod
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
@@ -146,11 +146,11 @@ class MechanismSystem(AbstractSystem):
 
     @abstractmethod
     def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
-        """Psi_q of all rows."""
+        """Return Psi_q of all rows."""
 
     @abstractmethod
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
+        """Return D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
 
     @abstractmethod
     def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:

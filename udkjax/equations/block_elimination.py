@@ -83,12 +83,12 @@ class BlockElimination:
             yield KernelLoop(self.terms.kernel(key, write), self._front_table(e))
 
     def solve(self, solve: int = 0) -> Parts:
-        """x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
+        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
         yield from self.substitute(solve)
         yield from self.terms.jt(solve)
 
     def substitute(self, solve: int) -> Parts:
-        """x = (Psi_q M^(-1) Psi_q^T)^(-1) right."""
+        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right."""
         names = arrays_of_solve(solve)
         yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
         for e in self.order:

@@ -44,7 +44,7 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
 
 @traced_once
 def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
-    """Psi_q = dPsi/dq, the Jacobian of the constraints.
+    """Return Psi_q = dPsi/dq, the Jacobian of the constraints.
 
     Args:
         mechanism: The scene.
@@ -59,7 +59,7 @@ def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
 
 @traced_once
 def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
-    """Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion.
+    """Return Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion.
 
     Args:
         mechanism: The scene.
@@ -75,7 +75,7 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Arr
 
 @traced_once
 def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
-    """gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
+    """Return gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
 
     It is minus the rate of Psi_dot along the motion of constant v.
 
@@ -109,13 +109,13 @@ def _row_order(found: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
 
 
 def rate_along_motion(f: Callable[[Array, Array], Array], t: ArrayLike, q: State, v: State) -> Array:
-    """df/dt + (df/dq) v, the rate of f(t, q) along a motion with velocities v."""
+    """Return df/dt + (df/dq) v, the rate of f(t, q) along a motion with velocities v."""
     t, q, v = jnp.asarray(t, jnp.result_type(float)), vector(q), vector(v)
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]
 
 
 def bodies(state: State) -> Float[Array, "bodies 3"]:
-    """q or v as an array (bodies, 3)."""
+    """Return q or v as an array (bodies, 3)."""
     return vector(state).reshape(-1, 3)
 
 

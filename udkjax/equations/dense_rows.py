@@ -54,11 +54,11 @@ class RowTerms:
         self._arrays_at = arrays_in_time(mechanism)
 
     def geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Psi (m,), Psi_dot (m,), and the entries of Psi_q."""
+        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q."""
         return self._arrays_at(t).geometry(t, q, v)
 
     def psi(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Psi (m,)."""
+        """Return Psi (m,)."""
         return self._arrays_at(t).psi(t, q)
 
 
@@ -66,14 +66,14 @@ class DenseTerms(RowTerms):
     """Psi of a mechanism with known numbers and its derivatives, as whole matrices."""
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Psi_q (m, n) and Psi_t (m,)."""
+        """Return Psi_q (m, n) and Psi_t (m,)."""
         _, rate, entries = self.geometry(t, q, np.zeros_like(q))
         found = np.zeros((self.count, self.size))
         found[self.entries] = entries
         return found, rate
 
     def gamma(self, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """gamma (m,), of Psi_q a = gamma."""
+        """Return gamma (m,), of Psi_q a = gamma."""
         free, b = self._arrays_at(t).loads(t, q, v)
         return b + self.slopes(t, q)[0] @ free
 
@@ -87,14 +87,14 @@ class DenseRows(DenseTerms):
         self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(rank_tolerance(mechanism))
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Psi and Psi_dot."""
+        """Return Psi and Psi_dot."""
         return self.geometry(t, q, v)[:2]
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return self.psi(t, q) / self.scales.rows
 
     def jacobian(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Psi_q (m, n)."""
+        """Return Psi_q (m, n)."""
         return self.slopes(t, q)[0]
 
     def plus(self, t: Time, q: np.ndarray) -> TruncatedPseudoinverse:
@@ -158,7 +158,7 @@ class KinematicRows(DenseRows):
         self.driver_time_step = driver_time_step(self.scales)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
+        """Return Psi, the lengths of the rows of D, and D with rows of length one, as solutions of consistent systems stay."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction

@@ -45,7 +45,7 @@ class LeftNullSpace(NamedTuple):
 
 
 def scaled_jacobian(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysis | None = None) -> Float[Array, "m n"]:
-    """J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit.
+    """Return J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit.
 
     Args:
         mechanism: The scene.

@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
+from udkjax.equations.implicit_terms import ImplicitTerms
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import Parts
 from udkjax.expressions.loop_derivative import COTANGENT, OTHER, SECOND, TANGENT, LoopDerivative
@@ -58,7 +59,7 @@ class DifferentiablePrograms:
     """The differentiable programs of a scene, by their names."""
 
     def __init__(self, solver: SceneSolver):
-        self._solver = solver
+        self._solver, self._implicit_terms = solver, ImplicitTerms(solver.terms)
 
     def __getitem__(self, name: str) -> DifferentiableProgram:
         return getattr(self, name)
@@ -98,23 +99,24 @@ class DifferentiablePrograms:
         return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
 
     def _corrected(self, right: str, **names: str) -> Parts:
-        """x0, which is known and changes by what two corrections change by, and jt_x0."""
-        terms = self._solver.terms
+        """Compute x0, which is known and changes by what two corrections change by, and jt_x0."""
+        terms, implicit = self._solver.terms, self._implicit_terms
         yield Reset("x0", 0, terms.layout.sizes["x0"])
         for solve in (1, 2):
-            yield from terms.transposed(**names)
+            yield from implicit.transposed(**names)
             yield terms.add("z", solution=0)
-            yield from terms.difference(right, solve, **names)
+            yield from implicit.difference(right, solve, **names)
             yield from self._solver.elimination.substitute(solve)
-            yield from terms.correct_solution(solve)
-        yield from terms.transposed(**names)
+            yield from implicit.correct_solution(solve)
+        yield from implicit.transposed(**names)
 
     def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, to: str, sign: int) -> DifferentiableProgram:
-        """x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
+        """Compute x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
         solver, terms = self._solver, self._solver.terms
         z, result = terms.add("z", solution=0), terms.add(to, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
-        implicit = [*terms.residuals(right), z, *terms.rates("z", 1, subtract=True), *solver.solve(1)]
+        residuals = self._implicit_terms.residuals(right)
+        implicit = [*residuals, z, *terms.rates("z", 1, subtract=True), *solver.solve(1)]
         return DifferentiableProgram(
             program(system, solver.solve(), [z, result], [solver.safe] if to == "a" else []),
             [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],

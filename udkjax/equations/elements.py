@@ -68,7 +68,7 @@ def differentiate_constraint(
 
 
 def _gamma_by_entries(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
-    """(Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
+    """Return (Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
     entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
     column = {s.index: j for j, s in enumerate(q)}
     total = []

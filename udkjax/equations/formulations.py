@@ -40,7 +40,7 @@ class PointwiseFormulation(Formulation):
 
     @abstractmethod
     def solve(self, M: Float[Array, "n n"], F: Vector, A: Float[Array, "m n"], c: Float[Array, "m"]) -> Vector:
-        """a of M a + A^T lambda = F, A a = c."""
+        """Return a of M a + A^T lambda = F, A a = c."""
 
 
 class Augmented(PointwiseFormulation):
@@ -132,7 +132,7 @@ class NullSpaceSVD(PointwiseFormulation):
 
 
 def null_space_accelerations(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector) -> Vector:
-    """a = a_p + N z with N^T M N z = N^T (F - M a_p). The columns of N are independent; those that are zero do not count."""
+    """Return a = a_p + N z with N^T M N z = N^T (F - M a_p), of independent columns of N; zero ones do not count."""
     projected = N.T @ M @ N
     missing = jnp.all(N == 0, axis=0)
     z = jnp.linalg.solve(projected + jnp.diag(jnp.where(missing, 1.0, 0.0)), N.T @ (F - M @ a_p))

@@ -68,7 +68,7 @@ class GeneralEquations(AbstractSystem):
         return q, v
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """(I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
+        """Return (I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
         if self.system.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
             plus, weight = self._plus(q, slopes)

@@ -33,7 +33,7 @@ def mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 @traced_once
 def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
-    """F = -V_q + the loads of force elements.
+    """Return F, -V_q and the loads of force elements.
 
     Args:
         mechanism: The scene.
@@ -48,7 +48,7 @@ def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array
 
 
 def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
-    """T = v^T M v / 2.
+    """Return T = v^T M v / 2.
 
     Args:
         mechanism: The scene.
@@ -62,7 +62,7 @@ def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
 
 @traced_once
 def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, ""]:
-    """V = the potential energy of gravity, zero at the origin, and of the force elements that have one.
+    """Return V, the potential energy of gravity, zero at the origin, and of the force elements that have one.
 
     Args:
         mechanism: The scene.

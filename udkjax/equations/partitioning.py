@@ -68,11 +68,11 @@ class PartitionedSystem(WrappedSystem):
     dependent: Bool[Array, "n"] | None = None  # the dependent coordinates, if the partition is fixed
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
-        """a = a_p + N z at the state as it is."""
+        """Return a = a_p + N z at the state as it is."""
         return _accelerations(self.fix_partition(t, q, v), t, q, v)
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """v and a at the state that the independent coordinates and velocities determine."""
+        """Return v and a at the state that the independent coordinates and velocities determine."""
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
         # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.

@@ -8,7 +8,7 @@ that are known are closed by NumPy: nothing is compiled for it. Numbers that are
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from udkjax.equations.abstract_system import MechanismSystem, Time
+from udkjax.equations.control_flow import control_flow
 from udkjax.equations.scales import Scales
 from udkjax.equations.structure import AnyArray, ArrayLibrary
 
@@ -29,7 +30,6 @@ PACE_STEPS = 4  # steps by which the pace of a closure is measured: see `try_to_
 VELOCITIES = 2  # corrections of v: the second removes the rounding errors of the first
 STEP_HALVINGS = 12  # of one step: 2^-12 of it has to lower the residual, or the position cannot be closed
 
-State = TypeVar("State")
 Assembly = tuple[AnyArray, AnyArray, AnyArray, AnyArray, ArrayLike]  # q, v, Psi, Psi_dot and the rank of D
 
 
@@ -42,11 +42,11 @@ class Rows(Protocol[AnyArray]):
         ...
 
     def residual(self, t: Time, q: AnyArray) -> AnyArray:
-        """Psi, each row over its scale."""
+        """Return Psi, each row over its scale."""
         ...
 
     def correction(self, t: Time, q: AnyArray) -> AnyArray:
-        """-W D^+ Psi."""
+        """Return -W D^+ Psi."""
         ...
 
 
@@ -69,41 +69,34 @@ def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -
     return step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
 
 
-def _python_loop(condition: Callable[[State], ArrayLike], body: Callable[[State], State], state: State) -> State:
-    while condition(state):
-        state = body(state)
-    return state
-
-
-def _identity(x: State) -> State:
-    return x
-
-
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
     """Take one step, halved until the residual falls; return whether it does. A residual of rounding takes no step."""
-    loop, stop = (_python_loop, _identity) if xp is np else (jax.lax.while_loop, jax.lax.stop_gradient)
     step = limited_step(rows, t, q, xp)
-    fixed, current, fixed_step = stop(rows), stop(q), stop(step)
+    fixed, current, fixed_step = (rows, q, step) if xp is np else jax.lax.stop_gradient((rows, q, step))
     size = xp.linalg.norm(fixed.residual(t, current))
 
     def is_worse(trial: tuple[AnyArray, Any]) -> ArrayLike:
         scale, k = trial
         return (k < STEP_HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
 
-    scale, k = loop(is_worse, lambda trial: (0.5 * trial[0], trial[1] + 1), (xp.ones(()), 0))
+    halve = lambda trial: (0.5 * trial[0], trial[1] + 1)  # noqa: E731
+    scale, k = control_flow(xp).while_loop(is_worse, halve, (xp.ones(()), 0))
     improves = (k < STEP_HALVINGS) & (size > rounding(rows.scales, current, xp))
     return xp.where(improves, q + scale * step, q), improves
 
 
 def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
     """Take steps until the residual is rounding, or no step makes it smaller."""
-    loop = _python_loop if xp is np else jax.lax.while_loop
 
     def goes_on(state: tuple[AnyArray, Any, int]) -> ArrayLike:
         _, improves, k = state
         return improves & (k < CLOSURE_ITERATIONS)
 
-    return loop(goes_on, lambda state: (*damped_step(rows, t, state[0], xp), state[2] + 1), (q, xp.asarray(True), 0))[0]
+    def body(state: tuple[AnyArray, Any, int]) -> tuple[AnyArray, Any, int]:
+        q, _, k = state
+        return *damped_step(rows, t, q, xp), k + 1
+
+    return control_flow(xp).while_loop(goes_on, body, (q, xp.asarray(True), 0))[0]
 
 
 def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:

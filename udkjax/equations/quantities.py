@@ -104,7 +104,7 @@ def accelerations(
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
 ) -> Float[Array, "bodies 3"] | tuple[Float[Array, "bodies 3"], Float[Array, "m"]]:
-    """a = a_F + M^(-1/2) D^+ b, and lambda = -(D^+)^T D^+ b where asked for. The state need not be closed.
+    """Return a = a_F + M^(-1/2) D^+ b, and lambda = -(D^+)^T D^+ b where asked for. The state need not be closed.
 
     Args:
         mechanism: The mechanism, or a `ConstrainedSystem`.
@@ -129,7 +129,7 @@ def accelerations(
 
 @checked
 def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) -> Float[Array, "T m"]:
-    """Psi at each time of a solution.
+    """Return Psi at each time of a solution.
 
     Args:
         mechanism: The mechanism, or a `ConstrainedSystem`.
@@ -143,7 +143,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) 
 
 @checked
 def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
-    """T = v^T M v / 2 and V at each time of a solution.
+    """Return T = v^T M v / 2 and V at each time of a solution.
 
     Args:
         mechanism: The scene.

@@ -222,7 +222,7 @@ def split_by_compliance(
 
 @deferred
 def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about):
-    """-Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
+    """Compute -Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
     equations = prepare(mechanism, method, baumgarte, analysis)
 
     def one(t, q, v):

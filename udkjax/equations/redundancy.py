@@ -70,7 +70,7 @@ class PositionRows(Protocol[Position]):
     driver_time_step: float
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Psi, the lengths of the rows of D, and D with rows of length one."""
+        """Return Psi, the lengths of the rows of D, and D with rows of length one."""
         ...
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> Position | None:
@@ -172,7 +172,7 @@ def ordinary_position(mechanism: Mechanism) -> np.ndarray | None:
 
 
 def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:
-    """Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
+    """Return Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
     if not (large or (large is None and not scene_programs(mechanism).is_small)):
         return KinematicRows(mechanism)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without

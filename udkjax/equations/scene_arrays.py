@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Generic
+from typing import Generic
 
 import numpy as np
 
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, Time, numbers_as_vector
-from udkjax.expressions.loop_program import NumpyLoops, evaluate_loops
+from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.scene.mechanism import Mechanism
 
 ROWS_AND_LOADS = ("psi", "psi_dot", "psi_q", "terms")
@@ -28,17 +28,17 @@ class SceneArrays(Generic[AnyArray]):
         self._constants = constants_of(programs, numbers, xp)
 
     def psi(self, t: Time, q: AnyArray) -> AnyArray:
-        """Psi (m,)."""
+        """Return Psi (m,)."""
         return self._run("psi", t, q, q)["psi"]
 
     def geometry(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
-        """Psi (m,), Psi_dot (m,), and the entries of Psi_q, as `ScenePrograms.psi_q_entries` has them."""
+        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q, as `ScenePrograms.psi_q_entries` has them."""
         found = self._run("geometry", t, q, v)
         _, _, places, factors = self.programs.psi_q_entries
         return found["psi"], found["psi_dot"], found["psi_q"][places] * factors
 
     def loads(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """a_F (n,), and b (m,)."""
+        """Return a_F (n,), and b (m,)."""
         terms = self._run("equation_terms", t, q, v)["terms"]
         return terms[: self.programs.coordinate_count], terms[self.programs.coordinate_count :]
 
@@ -69,12 +69,8 @@ def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -
     return evaluate(given)["constants"]
 
 
-Evaluate = Callable[[dict[str, Any]], dict[str, Any]]
-
-
 @lru_cache(maxsize=256)
-def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[Evaluate, set[str]]:
+def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[ArrayLoops, set[str]]:
     """Return a program as a function of its arrays, and the names of those: made once."""
     program = getattr(programs, name)
-    arrays = program.arrays | set(ROWS_AND_LOADS)
-    return (NumpyLoops(program) if xp is np else lambda given: evaluate_loops(program, given)), arrays
+    return ArrayLoops(program, xp), program.arrays | set(ROWS_AND_LOADS)

@@ -237,7 +237,7 @@ class ScenePrograms:
         return self._terms.sincos()
 
     def rows(self, residual: str) -> list[KernelLoop | Reset]:
-        """Psi_q, Psi or Psi_dot as psi, of all rows, and root, M^(-1/2); of a state whose sines are known."""
+        """Return Psi_q, Psi or Psi_dot as psi, of all rows, and root, M^(-1/2); of a state whose sines are known."""
         return [*self._terms.every_entry(), *self._terms.row_terms(residual, "psi"), self._root]
 
     @property

@@ -48,7 +48,7 @@ class SceneSolver:
         return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
 
     def newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
-        """x - M^(-1) Psi_q^T y, of q or v, so that a residual vanishes."""
+        """Compute x - M^(-1) Psi_q^T y, of q or v, so that a residual vanishes."""
         factorize = self.factorize_dropping if dropping else self.factorize
         step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
         return [*self.position_terms("psi_q", residual), *factorize, *step]
@@ -78,7 +78,7 @@ class SceneSolver:
         return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
 
     def tangent_parts(self, solve: int) -> Parts:
-        """dq1 and dv1, the parts of dq and dv within the manifold, by the systems `solve` and the one after it; distance."""
+        """Compute dq1 and dv1, the parts of dq and dv within the manifold, by the systems `solve` and `solve` + 1; distance."""
         for k, change in enumerate(("dq", "dv"), solve):
             yield from self.terms.rates(change, k)
             yield from self.solve(k)

@@ -95,7 +95,7 @@ class SceneTerms:
         return self.over_bodies("sincos", write, q=q, sines=sines)
 
     def free_accelerations(self, v: str) -> Parts:
-        """a_F, where there are force elements: without them it is gravity."""
+        """Compute a_F, where there are force elements: without them it is gravity."""
         if not self.layout.forces:
             return
         yield Reset("load", 0, self.layout.coordinate_count)
@@ -129,7 +129,7 @@ class SceneTerms:
         groups: Sequence[ConstraintGroup] | None = None,
         **names: str,
     ) -> Parts:
-        """Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and of those after it.
+        """Compute Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and those after it.
 
         `groups` are those whose rows are eliminated, unless others are given.
         """
@@ -148,12 +148,12 @@ class SceneTerms:
             yield self.over_group(outputs, group, write, v=v, **named, **names)
 
     def every_entry(self) -> Parts:
-        """Psi_q of all rows; behind its entries a one, for those that are constants."""
+        """Compute Psi_q of all rows; behind its entries a one, for those that are constants."""
         yield Reset("psi_q", self.layout.one, 1, 1.0)
         yield from self.element_terms(("psi_q",), groups=self.layout.constraints)
 
     def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> Parts:
-        """Psi, Psi_dot or b of all rows in their order, into an array."""
+        """Compute Psi, Psi_dot or b of all rows in their order, into an array."""
         for group in self.layout.constraints:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -163,7 +163,7 @@ class SceneTerms:
             yield self.over_group((name, start), group, write, to=array, **names)
 
     def energy(self) -> Parts:
-        """v^T M v / 2, and the potential energy of gravity and of the force elements."""
+        """Compute v^T M v / 2, and the potential energy of gravity and of the force elements."""
         yield Reset("energy", 0, 2)
 
         def write(w: KernelWriter):
@@ -197,11 +197,11 @@ class SceneTerms:
     # --- products with Psi_q and its transpose, of the eliminated rows
 
     def rates(self, change: str, solve: int, subtract: bool = False) -> Parts:
-        """Psi_q times a change of coordinates, as the right-hand side of a linear system, or subtracted from that."""
+        """Compute Psi_q times a change of coordinates, as the right-hand side of a linear system, or subtracted from that."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                dq = [w.read("change", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
+                dq = read_bodies(w, group, "change")
                 for i, row in enumerate(group.rows):
                     rate = dot(w.graph, group.entries(w, row), dq)
                     w.write(-rate if subtract else rate, "right", RIGHT, i, ADD if subtract else SET)
@@ -210,13 +210,13 @@ class SceneTerms:
             yield KernelLoop(self.kernel(("rates", group, subtract), write), group.table, names)
 
     def jt(self, solve: int) -> Parts:
-        """jt_x = Psi_q^T x of a linear system."""
+        """Compute jt_x = Psi_q^T x of a linear system."""
         names = arrays_of_solve(solve)
         yield Reset(names["jt_x"], 0, self.layout.coordinate_count)
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                _write_jt(w, group, [group.entries(w, row) for row in group.rows], [w.read("x", RIGHT, i) for i in rows(group)])
+                write_jt(w, group, [group.entries(w, row) for row in group.rows], [w.read("x", RIGHT, i) for i in rows(group)])
 
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
@@ -225,9 +225,8 @@ class SceneTerms:
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                bases = [BODIES + 3 * (k // 3) for k in range(group.coordinates)]
-                jt_x = [w.read("jt_x", base + BODY_COORDINATES, k % 3) for k, base in enumerate(bases)]
-                z = [compliance(w, k % 3, base + BODY_CONSTANTS) * s for k, (base, s) in enumerate(zip(bases, jt_x, strict=True))]
+                jt_x = read_bodies(w, group, "jt_x")
+                z = [compliance(w, k % 3, BODIES + 3 * (k // 3) + BODY_CONSTANTS) * s for k, s in enumerate(jt_x)]
                 for i, row in enumerate(group.rows):
                     w.write(w.read("right", RIGHT, i) - dot(w.graph, group.entries(w, row), z), "remainder", RIGHT, i)
 
@@ -244,7 +243,7 @@ class SceneTerms:
         update: str = SET,
         fixed: Collection[str] = (),
     ) -> KernelLoop:
-        """to = start + change, of each body, or start - change, with zero for what is not given.
+        """Set to = start + change, of each body, or start - change, with zero for what is not given.
 
         `start` is an array, or `free`; `change` an array, or M^(-1) Psi_q^T y with the solution y of a linear system.
         """
@@ -269,7 +268,7 @@ class SceneTerms:
         )
 
     def multipliers(self, solution: int) -> Parts:
-        """multipliers: lambda = -x of a linear system, by rows of Psi; zero of those that are left out."""
+        """Compute multipliers, lambda = -x of a linear system, by rows of Psi; zero of those that are left out."""
         yield Reset("multipliers", 0, self.layout.row_count)
         for group in self.layout.eliminated:
 
@@ -279,58 +278,10 @@ class SceneTerms:
 
             yield KernelLoop(self.kernel(("multipliers", group.rows), write), group.table, {"x": f"x{solution}"})
 
-    # --- derivatives of a linear system, by the implicit rule
 
-    def residuals(self, output: str, v: str = "v") -> Parts:
-        """right1 = b - Psi_q z, and jt_x0 = Psi_q^T x0, as functions of all but z = M^(-1) Psi_q^T x0 and x0."""
-        yield Reset("jt_x0", 0, self.layout.coordinate_count)
-        for group in self.layout.eliminated:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                outputs, n, entries = group.programs.outputs, group.coordinates, _entries(group)
-                z = [w.read("z", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(n)]
-                for i, row in enumerate(group.rows):
-                    w.write(outputs[output][row] - dot(w.graph, entries[i], z), "right1", RIGHT, i)
-                _write_jt(w, group, entries, [w.read("x0", RIGHT, i) for i in rows(group)], "jt_x0")
-
-            yield self.over_group(("residual", output), group, write, fixed=("x0", "z"), v=v)
-
-    def transposed(self, **names: str) -> Parts:
-        """jt_x0 = Psi_q^T x0, with Psi_q as a function of the state."""
-        yield Reset("jt_x0", 0, self.layout.coordinate_count)
-        for group in self.layout.eliminated:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                _write_jt(w, group, _entries(group), [w.read("x0", RIGHT, i) for i in rows(group)], "jt_x0")
-
-            yield self.over_group("transposed", group, write, **names)
-
-    def difference(self, output: str, solve: int, **names: str) -> Parts:
-        """right = b - Psi_q z of a linear system, with Psi_q and b as functions of the state."""
-        for group in self.layout.eliminated:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                z = [w.read("z", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
-                for i, (row, entries) in enumerate(zip(group.rows, _entries(group), strict=True)):
-                    w.write(group.programs.outputs[output][row] - dot(w.graph, entries, z), "right", RIGHT, i)
-
-            yield self.over_group(("difference", output), group, write, right=f"right{solve}", **names)
-
-    def correct_solution(self, solve: int) -> Parts:
-        """x0 + x, with x of a linear system, in place of x0."""
-        for group in self.layout.eliminated:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                for i in rows(group):
-                    w.write(w.read("x", RIGHT, i), "x0", RIGHT, i, ADD)
-
-            yield KernelLoop(self.kernel(("correct", len(group.rows)), write), group.table, {"x": f"x{solve}"})
-
-
-def _entries(group: ConstraintGroup) -> list[list[Scalar]]:
-    """Return the entries of the eliminated rows of Psi_q of a group, as functions of the state."""
-    n = group.coordinates
-    return [group.programs.outputs["psi_q"][row * n : (row + 1) * n] for row in group.rows]
+def read_bodies(w: KernelWriter, group: ElementGroup, array: str) -> list[Scalar]:
+    """Read what an array of coordinates holds of the bodies of an element."""
+    return [w.read(array, BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
 
 
 def rows(group: ConstraintGroup) -> range:
@@ -343,7 +294,8 @@ def compliance(w: KernelWriter, k: int, base: int = BODY_CONSTANTS) -> Scalar:
     return w.read("constants", base, MASS_OR_INERTIA[k])
 
 
-def _write_jt(w: KernelWriter, group: ConstraintGroup, entries: list[list[Scalar]], x: list[Scalar], to: str = "jt_x") -> None:
+def write_jt(w: KernelWriter, group: ConstraintGroup, entries: list[list[Scalar]], x: list[Scalar], to: str = "jt_x") -> None:
+    """Add Psi_q^T x of the eliminated rows of a group to an array of coordinates."""
     for k in range(group.coordinates):
         total = dot(w.graph, [row[k] for row in entries], x)
         if not total.is_zero:

@@ -119,7 +119,7 @@ class SparseRows(RowTerms):
         return minimum_degree(rows)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
-        """Psi, the lengths of the rows of D, and D with rows of length one (which changes no solution of a consistent system)."""
+        """Return Psi, the lengths of the rows of D, and D with rows of length one, as solutions of consistent systems stay."""
         psi, _, values = self.geometry(t, q, q)
         D, length = self._normalize_rows(values)
         return psi, length, D
@@ -138,7 +138,7 @@ class SparseRows(RowTerms):
         return self._solve(D, psi / length)
 
     def _solve(self, D: SparseMatrix, residual: np.ndarray) -> np.ndarray:
-        """-W D^T (D D^T + damping)^(-1) of a residual."""
+        """Return -W D^T (D D^T + damping)^(-1) of a residual."""
         if not np.all(np.isfinite(D.data)):
             return np.full(self.size, np.nan)
         system = csc_array(D @ D.T + DAMPING * eye_array(self.count))

@@ -30,11 +30,11 @@ class TextbookEquations(MechanismSystem):
     redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: they are not known
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
-        """a = a_F + M^(-1/2) D^+ b."""
+        """Return a = a_F + M^(-1/2) D^+ b."""
         return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights)
 
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
-        """lambda = -(D^+)^T D^+ b."""
+        """Return lambda = -(D^+)^T D^+ b."""
         return uk.multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -46,13 +46,13 @@ class TextbookEquations(MechanismSystem):
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """(I - M^(-1/2) D^+ D M^(1/2)) of two vectors: the parts of small changes within the manifold at q."""
+        """Return (I - M^(-1/2) D^+ D M^(1/2)) of two vectors: the parts of small changes within the manifold at q."""
         mechanism, w = self.mechanism, self.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return TangentPart(*of(jnp.stack([dq, dv])))
 
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
-        """Psi and Psi_dot, of all rows."""
+        """Return Psi and Psi_dot, of all rows."""
         return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
@@ -60,17 +60,17 @@ class TextbookEquations(MechanismSystem):
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in self.matrices(t, q, v)]))
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
-        """M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows."""
+        """Return M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows."""
         mechanism, A = self.mechanism, constraints.psi_q(self.mechanism, t, q)
         c = uk.b(mechanism, t, q, v, self.baumgarte) + A @ uk.a_F(mechanism, t, q, v)
         return jnp.diag(loads.mass(mechanism)), loads.force(mechanism, t, q, v), A, c
 
     def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
-        """Psi_q of all rows."""
+        """Return Psi_q of all rows."""
         return constraints.psi_q(self.mechanism, t, q)
 
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """D and Psi, their rows weighted, and M^(-1/2), of all rows."""
+        """Return D and Psi, their rows weighted, and M^(-1/2), of all rows."""
         w = self.scales.weights
         return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.inverse_sqrt_mass(self.mechanism)
 

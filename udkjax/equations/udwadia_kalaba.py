@@ -53,19 +53,19 @@ class Baumgarte(PrintsLine):
 
 
 def D(mechanism: Mechanism, t: Scalar, q: State, w: Weights = None) -> Float[Array, "m n"]:
-    """D = Psi_q M^(-1/2)."""
+    """Return D = Psi_q M^(-1/2)."""
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
 def a_F(mechanism: Mechanism, t: Scalar, q: State, v: State) -> Float[Array, "n"]:
-    """a_F = M^(-1) F: the accelerations without constraints."""
+    """Return a_F = M^(-1) F: the accelerations without constraints."""
     return loads.force(mechanism, t, q, v) / loads.mass(mechanism)
 
 
 def b(
     mechanism: Mechanism, t: Scalar, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
 ) -> Float[Array, "m"]:
-    """b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
+    """Return b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
     b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v)
     if baumgarte is not None:
         b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
@@ -82,7 +82,7 @@ def accelerations(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "n"]:
-    """a = a_F + M^(-1/2) D^+ b."""
+    """Return a = a_F + M^(-1/2) D^+ b."""
     x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
     return a_F(mechanism, t, q, v) + inverse_sqrt_mass(mechanism) * x
 
@@ -96,7 +96,7 @@ def multipliers(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "m"]:
-    """lambda = -(D^+)^T D^+ b: of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
+    """Return lambda = -(D^+)^T D^+ b: of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
     D_plus = pseudoinverse(method, D(mechanism, t, q, w))
     return weigh(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
 
@@ -122,7 +122,7 @@ def project(
 def tangent_part(
     mechanism: Mechanism, t: Scalar, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
 ) -> Float[Array, "n"]:
-    """(I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which a projection leaves."""
+    """Return (I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which projection leaves."""
     matrix = D(mechanism, t, q, w)
     return change - inverse_sqrt_mass(mechanism) * (
         pseudoinverse(method, matrix) @ (matrix @ (change / inverse_sqrt_mass(mechanism)))
@@ -135,7 +135,7 @@ def inverse_sqrt_mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 
 def weigh(w: Weights, rows: Array) -> Array:
-    """diag(w) times some rows, or times one number for each row; `rows` as they are where w is None."""
+    """Return diag(w) times some rows, or times one number for each row; `rows` as they are where w is None."""
     return rows if w is None else (rows.T * jnp.asarray(w)).T
 
 

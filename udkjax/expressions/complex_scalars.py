@@ -40,7 +40,7 @@ class ComplexScalar(NamedTuple):
         return self.re * self.re + self.im * self.im
 
     def inverse(self) -> "ComplexScalar":
-        """1/z."""
+        """Return 1/z."""
         return self.conjugate.scaled(1.0 / self.squared_modulus)
 
 

@@ -120,11 +120,11 @@ class Graph:
     # --- arithmetic
 
     def negate(self, a: Scalar) -> Scalar:
-        """-a."""
+        """Return -a."""
         return a if a.is_zero else Scalar(self, a.index, -a.sign)
 
     def add(self, a: Scalar, b: Scalar) -> Scalar:
-        """A + b."""
+        """Return a + b."""
         x, y = a.constant, b.constant
         if x == 0.0:
             return b
@@ -140,7 +140,7 @@ class Graph:
         return Scalar(self, self._operation(kind, (Scalar(self, a.index), Scalar(self, b.index))), a.sign)
 
     def multiply(self, a: Scalar, b: Scalar) -> Scalar:
-        """A * b."""
+        """Return a * b."""
         x, y = a.constant, b.constant
         if x is not None and y is not None:
             return self.constant(x * y, a.node.dtype)
@@ -154,7 +154,7 @@ class Graph:
         return Scalar(self, self._operation("mul", (Scalar(self, a.index), Scalar(self, b.index))), a.sign * b.sign)
 
     def divide(self, a: Scalar, b: Scalar) -> Scalar:
-        """A / b."""
+        """Return a / b."""
         if a.is_zero:
             return a
         if b.constant in (1.0, -1.0):

@@ -5,18 +5,19 @@ row of a table of bases, in order. The code grows with the number of kinds of el
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
 # Ways to write an output over the number in its place: replace it, add to it, keep the larger one, or whichever is false.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
-ADD_ONE_BY_ONE = "add one by one"  # in loops by NumPy
 MOST_TURNS = 8  # updates of one place by a loop, in a program of JAX: each is an operation of it, or all are a loop
 
 
@@ -101,43 +102,90 @@ class LoopProgram(NamedTuple):
         return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, KernelLoop)))
 
 
-def evaluate_loops(program: LoopProgram, arrays: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    """Return the arrays as a program leaves them, by JAX; no row of a loop may read what another writes.
+class LaidOutPart(NamedTuple):
+    """A part of a program with the places of all its numbers, one for each row of its table."""
 
-    All reads of a loop from an array, and all its writes to one, are one operation each: XLA takes milliseconds to compile any.
+    run: ScalarProgram | float  # a number: what a part of an array is set to
+    inputs: list[tuple[str, Any]]  # the array of each, "" if it is not used
+    outputs: list[tuple[str, Any, str]]  # the array of each, and what is done with the number there
+    count: int  # of rows
+
+
+class ArrayLoops:
+    """A program of loops as a function of its arrays, by NumPy or JAX; no row of a loop may read what another writes.
+
+    The places of all numbers are found once, for as many calls as there are.
     """
-    found = dict(arrays)
-    for part in program.parts:
-        if isinstance(part, Reset):
-            x, end = found[part.array], part.start + part.count
-            found[part.array] = jnp.concatenate([x[: part.start], jnp.full(part.count, part.value), x[end:]])
-            continue
-        kernel, table = part.kernel, part.table
-        if not kernel.outputs or not len(table):
-            continue
-        values: list = [np.zeros(len(table))] * len(kernel.inputs)
-        pairs = zip(kernel.program.inputs, kernel.inputs, strict=True)
-        for name, numbers in _by_array(part, [x if kernel.program.uses(s) else None for s, x in pairs]).items():
-            rows = _take(found[name], np.stack([_places(kernel.inputs[k], table) for k in numbers]))
-            for k, row in zip(numbers, rows, strict=True):
+
+    def __init__(self, program: LoopProgram, xp: ModuleType):
+        self._parts, self._xp = list(map(_lay_out, program.parts)), xp
+        self._written = {name for part in self._parts for name, *_ in part.outputs}
+
+    def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the arrays as the program leaves them; what is given stays as it is."""
+        if self._xp is jnp:
+            found = dict(arrays)
+            for part in self._parts:
+                _run_by_jax(part, found)
+            return found
+        found = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
+        for part in self._parts:
+            _run_by_numpy(part, found)
+        return found
+
+
+def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:
+    if isinstance(part, Reset):
+        return LaidOutPart(part.value, [], [(part.array, slice(part.start, part.start + part.count), SET)], part.count)
+    kernel, table = part.kernel, part.table
+
+    def places(address: Address) -> np.ndarray:
+        return address.offset + (np.zeros(len(table), int) if address.base is None else table[:, address.base])
+
+    used = [kernel.program.uses(s) for s in kernel.program.inputs]
+    inputs = [(part.array(x.array) if is_used else "", places(x)) for x, is_used in zip(kernel.inputs, used, strict=True)]
+    outputs = [(part.array(x.array), places(x), x.update) for x in kernel.outputs] if len(table) else []
+    return LaidOutPart(kernel.program, inputs, outputs, len(table))
+
+
+def _run_by_numpy(part: LaidOutPart, found: dict[str, np.ndarray]) -> None:
+    results: Any = [part.run]
+    if isinstance(part.run, ScalarProgram):
+        results = part.run.by_numpy([found[name][places] if name else places for name, places in part.inputs])
+    for x, (name, places, update) in zip(results, part.outputs, strict=True):
+        if update == ADD:
+            np.add.at(found[name], places, x)
+        else:
+            found[name][places] = x
+
+
+def _run_by_jax(part: LaidOutPart, found: dict[str, Array]) -> None:
+    """Run a part: what it reads of an array, and what it writes to one, is one operation: XLA takes milliseconds for each."""
+    if not isinstance(part.run, ScalarProgram):
+        for name, places, _ in part.outputs:
+            x = found[name]
+            found[name] = jnp.concatenate([x[: places.start], jnp.full(part.count, part.run), x[places.stop :]])
+        return
+    if not part.outputs:
+        return
+    values: list = [np.zeros(part.count)] * len(part.inputs)
+    for (name,), some in _group(part.inputs, 1).items():
+        if name:
+            rows = _take(found[name], np.stack([places for _, (_, places) in some]))
+            for (k, _), row in zip(some, rows, strict=True):
                 values[k] = row
-        run: Callable = jax.vmap(kernel.program) if values else kernel.program.by_numpy
-        results = run(values)
-        for name, numbers in _by_array(part, kernel.outputs).items():
-            for update in {kernel.outputs[k].update: None for k in numbers}:
-                some = [k for k in numbers if kernel.outputs[k].update == update]
-                places = np.concatenate([_places(kernel.outputs[k], table) for k in some])
-                new = jnp.concatenate([jnp.broadcast_to(results[k], len(table)) for k in some])
-                found[name] = _put(found[name], places, new, update)
-    return found
+    run: Callable = jax.vmap(part.run) if values else part.run.by_numpy
+    results = run(values)
+    for (name, update), some in _group([(name, update, places) for name, places, update in part.outputs], 2).items():
+        new = jnp.concatenate([jnp.broadcast_to(results[k], part.count) for k, _ in some])
+        found[name] = _put(found[name], np.concatenate([places for _, (*_, places) in some]), new, update)
 
 
-def _by_array(part: KernelLoop, addresses: Sequence[Address | None]) -> dict[str, list[int]]:
-    """Return the numbers of the addresses of each array of the program."""
-    found: dict[str, list[int]] = {}
-    for k, address in enumerate(addresses):
-        if address is not None:
-            found.setdefault(part.array(address.array), []).append(k)
+def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tuple]]]:
+    """Return numbered items by their first entries."""
+    found: dict[tuple, list[tuple[int, tuple]]] = {}
+    for k, item in enumerate(items):
+        found.setdefault(item[:heads], []).append((k, item))
     return found
 
 
@@ -165,53 +213,3 @@ def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.A
         taken, known = _take(padded, source), source < len(places)
         x = x + taken if update == ADD else taken if known.all() else jnp.where(known, taken, x)
     return x
-
-
-class NumpyLoops:
-    """A program of loops as a function of its arrays, by NumPy: what `evaluate_loops` does, without compiling anything.
-
-    The indices of all numbers are made once, for as many calls as there are.
-    """
-
-    def __init__(self, program: LoopProgram):
-        self._parts: list[tuple[ScalarProgram | float, list, list]] = []
-        for part in program.parts:
-            if isinstance(part, Reset):
-                self._parts.append((part.value, [], [(part.array, slice(part.start, part.start + part.count), SET)]))
-            elif part.kernel.outputs and len(part.table):
-                kernel, unused = part.kernel, ("", np.zeros(len(part.table)))
-                inputs = [
-                    (part.array(x.array), _places(x, part.table)) if kernel.program.uses(s) else unused
-                    for s, x in zip(kernel.program.inputs, kernel.inputs, strict=True)
-                ]
-                outputs = [self._output(part, address) for address in kernel.outputs]
-                self._parts.append((kernel.program, inputs, outputs))
-        self._written = {name for *_, outputs in self._parts for name, *_ in outputs}
-
-    @staticmethod
-    def _output(part: KernelLoop, address: Address) -> tuple[str, np.ndarray, str]:
-        """Return where the results of a loop go, and what they do there: those that share a place are added one by one."""
-        places, update = _places(address, part.table), address.update
-        return part.array(address.array), places, ADD_ONE_BY_ONE if update == ADD and len(set(places)) < len(places) else update
-
-    def __call__(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the arrays as the program leaves them; the given arrays stay as they are."""
-        found = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
-        for program, inputs, outputs in self._parts:
-            if isinstance(program, ScalarProgram):
-                results = program.by_numpy([found[name][places] if name else places for name, places in inputs])
-            else:
-                results = [program]
-            for x, (name, places, update) in zip(results, outputs, strict=True):
-                if update == ADD:
-                    found[name][places] += x
-                elif update == ADD_ONE_BY_ONE:
-                    np.add.at(found[name], places, x)
-                else:
-                    found[name][places] = x
-        return found
-
-
-def _places(address: Address, table: np.ndarray) -> np.ndarray:
-    """Return the indices of a number in its array, one for each row of a table."""
-    return address.offset + (np.zeros(len(table), int) if address.base is None else table[:, address.base])

@@ -6,7 +6,7 @@ floats it is evaluated at once, which is how a scene is analysed without compili
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -231,34 +231,27 @@ def _evaluate(node: Node, values: list[Value]) -> Value:
 
 def _function_of_floats(node: Node) -> Callable:
     """Return what computes a node of Python's floats: chosen once, since many programs run thousands of times."""
-    if node.kind in _OPERATORS:
-        return _OPERATORS[node.kind][0]
-    if node.kind == "sqrt":
-        return math.sqrt
-    name = node.detail.primitive.name if node.kind == "apply" else ""
-    if name == "integer_pow":
-        exponent = node.detail.parameters["y"]
-        return lambda x: x**exponent
-    if name in _LIBRARY_FUNCTIONS:
-        return getattr(math, name)
-    return _NUMBER_FUNCTIONS.get(name) or (lambda *values: _evaluate(node, list(values)))
+    return _plain_function(node, math, _NUMBER_FUNCTIONS) or (lambda *values: _evaluate(node, list(values)))
 
 
 def _function_of_arrays(node: Node) -> Callable:
     """Return what computes a node of NumPy's arrays, or of floats, as constants are."""
+    if node.kind == "constant":
+        return lambda: np.float64(node.detail) if isinstance(node.detail, float) else node.detail
+    return _plain_function(node, np, _ARRAY_FUNCTIONS) or (lambda *values: _evaluate_by_jax(node, values))
+
+
+def _plain_function(node: Node, library: ModuleType, others: Mapping[str, Callable]) -> Callable | None:
+    """Return the operator, or the function of a library or of a table, that computes a node; None where there is none."""
     if node.kind in _OPERATORS:
         return _OPERATORS[node.kind][0]
     if node.kind == "sqrt":
-        return np.sqrt
+        return library.sqrt
     name = node.detail.primitive.name if node.kind == "apply" else ""
     if name == "integer_pow":
         exponent = node.detail.parameters["y"]
-        return lambda x: np.power(x, exponent)
-    if name in _LIBRARY_FUNCTIONS:
-        return getattr(np, name)
-    if node.kind == "constant":
-        return lambda: np.float64(node.detail) if isinstance(node.detail, float) else node.detail
-    return _ARRAY_FUNCTIONS.get(name) or (lambda *values: _evaluate_by_jax(node, values))
+        return lambda x: x**exponent
+    return getattr(library, name) if name in _LIBRARY_FUNCTIONS else others.get(name)
 
 
 def _evaluate_by_jax(node: Node, values: Sequence[np.ndarray]) -> np.ndarray | list[np.ndarray]:

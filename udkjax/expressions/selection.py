@@ -7,17 +7,17 @@ from udkjax.expressions.graph import Scalar
 
 
 def absolute(a: Scalar) -> Scalar:
-    """|a|."""
+    """Return |a|."""
     return a.graph.apply(lax.abs_p, {}, (a,), a.node.dtype, np.abs)
 
 
 def greater(a: Scalar, b: Scalar) -> Scalar:
-    """a > b."""
+    """Return a > b."""
     return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
 
 
 def maximum(a: Scalar, b: Scalar) -> Scalar:
-    """max(a, b)."""
+    """Return max(a, b)."""
     return a.graph.apply(lax.max_p, {}, (a, b), a.node.dtype, np.maximum)
 
 

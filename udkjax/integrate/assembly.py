@@ -278,7 +278,6 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
             yield f"assembly moved {name} by {amount}"
 
 
-@cached_by_identity
 def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
     """Return a warning where assembly moved a body of a mechanism of known numbers far, to the `Closure` at time t (s)."""
     if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:

@@ -1,6 +1,7 @@
 """Decisions on a mechanism before it runs: its equations, and the operation of machine code, or why there is none."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -22,9 +23,10 @@ from udkjax.integrate.packing import SampleRows
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
 from udkjax.native.formulations import FormulationCode, formulation_code
-from udkjax.native.operations import Accelerate, RunStates, Tableau
+from udkjax.native.operations import Accelerate
 from udkjax.native.primitive import unsupported
 from udkjax.native.pseudoinverses import dense_method
+from udkjax.native.runs import RunStates, Tableau
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.identity_cache import cached_by_identity
@@ -45,10 +47,16 @@ class RunPlan:
     why_not_native: str  # why there is none, or it is not taken; empty where it is
     independent_rows: int = 0  # the number of rows that the method takes
 
-    @property
+    @cached_property
     def is_native(self) -> bool:
         """True if machine code integrates."""
         return not self.why_not_native
+
+    @cached_property
+    def marks_rows(self) -> bool:
+        """True if machine code takes marks of the rows of Psi that are independent."""
+        operation = self.operation or self.evaluation
+        return operation is not None and operation.code.marks_rows
 
 
 @jax.tree_util.register_dataclass
@@ -68,10 +76,10 @@ class CompiledMechanism:
         """The rows of all that has samples."""
         return SampleRows(self.textbook.mechanism, self.breakpoints)
 
-    @property
+    @cached_property
     def textbook(self) -> TextbookEquations:
         """The equations of a mechanism, whatever formulation is around them."""
-        return _textbook(self.equations)
+        return textbook_of(self.equations)
 
 
 def compile_mechanism(
@@ -98,7 +106,7 @@ def compile_mechanism(
     why = "it was asked for" if engine == "diffrax" else _reason_for_diffrax(equations, solver, adjoint, meter)
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
-        textbook = _textbook(equations)
+        textbook = textbook_of(equations)
         rows = len(textbook.scales.rows) - len((textbook.redundant or ()) if eliminates(textbook.method) else ())
         missing = unsupported(operation.code)
         why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
@@ -156,7 +164,7 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
     return ""
 
 
-def _textbook(equations: AbstractSystem) -> TextbookEquations:
+def textbook_of(equations: AbstractSystem) -> TextbookEquations:
     """Return the equations of a mechanism, whatever formulation is around them."""
     inner = equations.equations if isinstance(equations, WrappedSystem) else equations
     assert isinstance(inner, TextbookEquations)  # a user's own system has textbook equations
@@ -169,7 +177,7 @@ def eliminates(method: Pseudoinverse) -> bool:
 
 
 def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> RunStates:
-    textbook = _textbook(equations)
+    textbook = textbook_of(equations)
     mechanism = textbook.mechanism
     elements = (*mechanism.constraints.values(), *mechanism.forces.values())
     return RunStates(
@@ -192,7 +200,7 @@ def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
     """Return the operation that evaluates equations at single states; None where machine code cannot."""
     if not equations.constrained or _reason_for_equations(equations):
         return None
-    inner = _textbook(equations)
+    inner = textbook_of(equations)
     operation = Accelerate(_programs(inner), dense_method(inner.method), _formulation(equations))
     return None if unsupported(operation.code) else operation
 

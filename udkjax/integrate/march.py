@@ -12,7 +12,6 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.integrate.packing import pack
 from udkjax.native import operations
 from udkjax.native.primitive import call_known, native_p, unsupported
 from udkjax.scene.held import row_size, with_row
@@ -80,7 +79,7 @@ def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q
     ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
     numbers = [*_of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers, DEPENDENT, 0.0]
     at_rest = xp.zeros(analysis.coordinates)
-    return pack(_operation(mechanism, analysis), numbers, ts, q, at_rest, settings, scales.rows, xp.zeros(0), xp)
+    return _operation(mechanism, analysis).pack(numbers, ts, q, at_rest, settings, scales.rows, xp=xp)
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
+from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents
 from udkjax.native.operations import Close, CloseCotangents, CloseSecondTangents, CloseTangents
 from udkjax.native.primitive import call_known, native_p, unsupported
 from udkjax.scene.mechanism import Mechanism
@@ -80,7 +80,7 @@ def _inputs(
 ) -> list[Any]:
     settings, ts = {"length": scales.length, "fallback_tol": tol}, numbers_as_vector([t, t])
     numbers = [*mechanism.numbers, tol**2, 0.0]
-    return pack(_close(mechanism), numbers, ts, q, v, settings, scales.rows, xp.zeros(0), xp)
+    return _close(mechanism).pack(numbers, ts, q, v, settings, scales.rows, xp=xp)
 
 
 def _close(mechanism: Mechanism) -> Close:

@@ -15,32 +15,31 @@ from udkjax.equations.formulations import FormulatedSystem
 from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates
-from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents, pack
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
+from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.formulations import formulation_tol
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
-from udkjax.native.operations import MarkRows, RunStates
+from udkjax.native.operations import MarkRows
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
+from udkjax.native.runs import RunStates
 from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
-from udkjax.pinv import Auto, OneOf, Pseudoinverse
+from udkjax.pinv import Auto, OneOf
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.scene.mechanism import Mechanism
 
 
-def packed(problem: Problem) -> tuple[RunStates, list[np.ndarray]]:
-    """Return the operation of a problem whose numbers are all known, and its inputs."""
-    operation = problem.compiled.plan.operation
-    assert operation is not None  # checked by the caller
-    return operation, run_inputs(problem, operation, np)
+def packed(problem: Problem) -> list[np.ndarray]:
+    """Return the inputs of the run of a problem whose numbers are all known."""
+    return run_inputs(problem, _operation(problem), np)
 
 
 def integrate_known(problem: Problem) -> IntegratorOutput:
     """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
-    operation, inputs = packed(problem)
-    return _output(call_known(operation, inputs, len(problem.ts)))
+    operation = _operation(problem)
+    return _output(call_known(operation, run_inputs(problem, operation, np), len(problem.ts)))
 
 
 def integrate(problem: Problem) -> IntegratorOutput:
@@ -82,9 +81,7 @@ def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, t
 
 def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
     """Return the second derivatives of positions, velocities and the end along two changes, each of what is active in it."""
-    run = problem.compiled.plan.operation
-    assert run is not None  # checked by the caller
-    operation = run.with_second_tangents(active_numbers(_numbers_of(problem), _active_of(problem, active)))
+    operation = _operation(problem).with_second_tangents(active_numbers(_numbers_of(problem), _active_of(problem, active)))
     return _integrate_along(problem, changes, operation)[1]
 
 
@@ -140,38 +137,67 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
 def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
     """Return the arrays that machine code takes, for one member."""
     compiled = problem.compiled
-    scene = _known_scene_inputs(compiled) if xp is np else _scene_inputs(compiled, operation.code.policy)
-    settings = {
+    scene = _known_inputs_of_run(compiled) if xp is np else _inputs_of_run(compiled, operation.code.policy)
+    settings = scene.settings | {
         "rtol": problem.rtol,
         "atol": problem.atol,
         "smallest": problem.smallest,
         "first": 0.0 if problem.h is None else problem.h,
         "length": problem.length,
         "omega": problem.rate,
-        "fallback_tol": scene.fallback_tol,
         "max_steps": problem.max_steps,
-        **formulation_settings(compiled.equations),
-        "method": method_number(compiled.textbook.method, xp),
     }
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
-    return pack(operation, numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
+    return operation.pack(numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
 
 
 class SceneInputs(NamedTuple):
-    """The inputs of machine code that a mechanism decides on, whatever its states are."""
+    """The inputs of machine code that the equations of a mechanism decide on, whatever its states are."""
 
     numbers: list[Any]  # all numbers of the scene, and the gains
     thresholds: list[Any]  # two, of pivots
     rows: Any  # the scales of the rows of Psi
-    breaks: Any  # times (s) where the motion is not smooth, in their order
-    samples: list[Any]  # the rows of all that has samples
-    fallback_tol: Any
+    settings: dict[str, Any]  # the unit of lengths, and what the method and the formulation are told
+    breaks: Any = ()  # times (s) where the motion is not smooth, in their order
+    samples: tuple[Any, ...] = ()  # the rows of all that has samples, if there is any
+
+
+def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
+    """Return the inputs that equations decide on, with the numbers of `mechanism`: without samples, or at a time."""
+    textbook = textbook_of(equations)
+    method: Any = textbook.method
+    rank_tol = method.rank_tol
+    # Elimination, by which derivatives of all methods are taken, has relative thresholds.
+    relative_tol = rank_tol if method.relative else rank_tolerance(textbook.mechanism)
+    safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
+    fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
+    drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
+    number = xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
+    settings = {"length": textbook.scales.length, "fallback_tol": fallback_tol, "method": number}
+    if isinstance(equations, FormulatedSystem):
+        told = formulation_tol(equations.formulation), textbook.scales.mass
+        settings |= zip(FORMULATION_SETTINGS, told, strict=True)
+    numbers = jax.tree.leaves((mechanism, textbook.baumgarte))
+    return SceneInputs(numbers, [drop_tol, safe_tol], textbook.scales.rows, settings)
+
+
+def _inputs_of_run(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
+    samples = compiled.samples
+    found = scene_inputs(compiled.equations, samples.stand_in(compiled.textbook.mechanism), policy, xp)
+    return found._replace(breaks=samples.breakpoints(xp), samples=(samples.rows(xp),) if samples.samples else ())
+
+
+@cached_by_identity
+def _known_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
+    """Return the inputs of a run of known numbers, which are one vector."""
+    assert compiled.plan.operation is not None  # a run by machine code has one
+    found = _inputs_of_run(compiled, compiled.plan.operation.code.policy, np)
+    return found._replace(numbers=[numbers_as_vector(found.numbers)])
 
 
 def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp) -> Any:
     """Return a mark for each row of Psi, one where it is independent near a state; None where that is known beforehand."""
-    operation = compiled.plan.operation or compiled.plan.evaluation
-    if operation is None or not operation.code.marks_rows:
+    if not compiled.plan.marks_rows:
         return None
     equations = compiled.textbook
     mechanism = equations.mechanism.at(t)
@@ -179,58 +205,9 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
     tol = rank_tolerance(mechanism)
     settings = {"length": length, "omega": rate}
     numbers = [*mechanism.numbers, tol**2, 0.0]
-    given = pack(finding, numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp.zeros(0), xp)
+    given = finding.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
     found = call_known(finding, given, 2) if xp is np else native_p.bind(*given, operation=finding, times=2)
     return found[0][0]
-
-
-def formulation_settings(equations: AbstractSystem) -> dict[str, Any]:
-    """Return what the machine code of a formulation is told; nothing without one."""
-    if not isinstance(equations, FormulatedSystem):
-        return {}
-    inner: Any = equations.equations
-    return dict(zip(FORMULATION_SETTINGS, (formulation_tol(equations.formulation), inner.scales.mass), strict=True))
-
-
-class Thresholds(NamedTuple):
-    """The thresholds of a method in machine code: two of pivots, and that of the method that reveals the rank."""
-
-    drop_tol: Any
-    safe_tol: Any
-    fallback_tol: Any
-
-
-def thresholds(equations: TextbookEquations, policy: RankPolicy) -> Thresholds:
-    """Return the thresholds of the method of some equations."""
-    method: Any = equations.method
-    rank_tol = method.rank_tol
-    # Elimination, by which derivatives of all methods are taken, has relative thresholds.
-    relative_tol = rank_tol if method.relative else rank_tolerance(equations.mechanism)
-    safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
-    fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
-    return Thresholds(fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol, safe_tol, fallback_tol)
-
-
-def method_number(method: Pseudoinverse, xp: ModuleType = jnp) -> Any:
-    """Return the number of the method that is chosen of several; zero where there is one alone."""
-    return xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
-
-
-def _scene_inputs(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
-    equations, samples = compiled.textbook, compiled.samples
-    drop_tol, safe_tol, fallback_tol = thresholds(equations, policy)
-    numbers = samples.stand_in(equations.mechanism), equations.baumgarte
-    further = [samples.rows(xp)] if samples.samples else []
-    rows, breaks = equations.scales.rows, samples.breakpoints(xp)
-    return SceneInputs(jax.tree.leaves(numbers), [drop_tol, safe_tol], rows, breaks, further, fallback_tol)
-
-
-@cached_by_identity
-def _known_scene_inputs(compiled: CompiledMechanism) -> SceneInputs:
-    """Return the inputs of a run of known numbers, which are one vector."""
-    assert compiled.plan.operation is not None  # a run by machine code has one
-    found = _scene_inputs(compiled, compiled.plan.operation.code.policy, np)
-    return found._replace(numbers=[numbers_as_vector(found.numbers)])
 
 
 def _output(found: Sequence[Any]) -> IntegratorOutput:

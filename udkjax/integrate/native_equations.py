@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -20,10 +21,9 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.compiled_mechanism import compile_known, evaluation_of
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_known, evaluation_of
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.native_engine import formulation_settings, mark_rows, method_number, thresholds
-from udkjax.integrate.packing import pack
+from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.layout import INPUTS
 from udkjax.native.operations import Accelerate, FindTangentPart, ProjectStates, StateOperation
@@ -37,8 +37,7 @@ class NativeEquations(WrappedSystem):
 
     equations: TextbookEquations
     marks: Float[Array, "m"] | None  # of independent rows; None: machine code knows them
-    formulated: AbstractSystem  # the same, or with the formulation around them
-    numbers: Float[Array, "k"]  # all that machine code takes, at the first time: packed once, not in every step
+    scene: SceneInputs  # at the first time: put together once, not in every step
     operation: Accelerate = eqx.field(static=True)
 
     @property
@@ -57,12 +56,13 @@ class NativeEquations(WrappedSystem):
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         return self.equations.is_finite(t, q, v)
 
-    def _find(self, kind: type[StateOperation], t: Time, q: Vector, v: Vector, further: list[Any] | None = None) -> Array:
+    def _find(self, kind: type[StateOperation], t: Time, q: Vector, v: Vector, further: Sequence[Any] = ()) -> Array:
         operation = kind(self.operation.code, self.operation.pseudoinverse, self.operation.formulation)
-        numbers = self.numbers
+        scene = self.scene
         if self.equations.mechanism.samples:
-            numbers = _numbers(self.equations, self.marks, operation, t)
-        given = _inputs(operation, self.formulated, self.equations, numbers, t, q, v, jnp, further or [])
+            numbers = [self.equations.mechanism.at(t), self.equations.baumgarte]
+            scene = scene._replace(numbers=jax.tree.leaves(numbers))
+        given = _pack(operation, scene, self.marks, t, q, v, jnp, further)
         return native_p.bind(*given, operation=operation, times=2)[0][0]
 
     @property
@@ -74,26 +74,19 @@ class NativeEquations(WrappedSystem):
         )
 
 
-def native_equations(
-    equations: TextbookEquations, marks: Float[Array, "m"] | None, formulated: AbstractSystem, operation: Accelerate
-) -> NativeEquations:
-    """Return equations evaluated by an operation, with marks of independent rows, or None where machine code knows them."""
-    return NativeEquations(equations, marks, formulated, _numbers(equations, marks, operation), operation)
+def native_equations(compiled: CompiledMechanism, marks: Float[Array, "m"] | None) -> NativeEquations:
+    """Return equations by machine code, with marks of independent rows, or None where it knows them."""
+    operation, textbook = compiled.plan.evaluation, compiled.textbook
+    assert operation is not None  # checked by the caller
+    scene = scene_inputs(compiled.equations, textbook.mechanism.at(0.0), operation.code.policy)
+    scene = scene._replace(numbers=[numbers_as_vector(scene.numbers)])
+    return NativeEquations(textbook, marks, stop_gradients(jax.tree.map(jnp.asarray, scene)), operation)
 
 
-def _numbers(equations: TextbookEquations, marks: Any, operation: StateOperation, t: Any = 0.0) -> Any:
-    """Return the numbers of a scene at a time, with gains, marks and thresholds, as one vector without derivatives."""
-    drop_tol, safe_tol, _ = thresholds(equations, operation.code.policy)
-    gains = [] if equations.baumgarte is None else [equations.baumgarte.alpha, equations.baumgarte.beta]
-    numbers = [*equations.mechanism.at(t).numbers, *gains, *([] if marks is None else [marks]), drop_tol, safe_tol]
-    return stop_gradients(numbers_as_vector(numbers))
-
-
-def _inputs(
+def _pack(
     operation: StateOperation,
-    formulated: AbstractSystem,
-    equations: TextbookEquations,
-    numbers: Any,
+    scene: SceneInputs,
+    marks: Any,
     t: Any,
     q: Any,
     v: Any,
@@ -101,10 +94,8 @@ def _inputs(
     further: Sequence[Any] = (),
 ) -> list[Any]:
     """Return the arrays that machine code takes to evaluate equations at a state."""
-    scales, fallback_tol = equations.scales, thresholds(equations, operation.code.policy).fallback_tol
-    settings = {"length": scales.length, "fallback_tol": fallback_tol, "method": method_number(equations.method, xp)}
-    settings |= formulation_settings(formulated)
-    return pack(operation, [numbers], xp.stack([t, t]), q, v, settings, scales.rows, xp.zeros(0), xp, further)
+    numbers = [*scene.numbers, *([] if marks is None else [marks]), *scene.thresholds]
+    return operation.pack(numbers, xp.stack([t, t]), q, v, scene.settings, scene.rows, xp=xp, further=further)
 
 
 class KnownRates:
@@ -116,11 +107,11 @@ class KnownRates:
 
     def __init__(self, mechanism: Mechanism, method: Pseudoinverse, baumgarte: Baumgarte | None = None):
         compiled = compile_known(mechanism, analyse(mechanism), method, baumgarte)
-        equations, operation, n = compiled.textbook, evaluation_of(compiled.equations), mechanism.q0.size
+        operation, n = evaluation_of(compiled.equations), mechanism.q0.size
         if operation is None or operation.code.marks_rows or mechanism.samples:
             raise ValueError(f"there is no machine code for {type(method).__name__} of this mechanism")
-        numbers = np.asarray(_numbers(equations, None, operation))
-        given = _inputs(operation, compiled.equations, equations, numbers, 0.0, np.zeros(n), np.zeros(n), np)
+        scene = scene_inputs(compiled.equations, compiled.textbook.mechanism, operation.code.policy, np)
+        given = _pack(operation, scene, None, 0.0, np.zeros(n), np.zeros(n), np)
         self._call = machine_code(operation, 1, 1).prepare(given, operation.shapes(given, 2))
         self._t, self._q, self._v = (self._call.inputs[INPUTS.index(name)][0] for name in ("ts", "q", "v"))
 
@@ -133,12 +124,10 @@ class KnownRates:
 
 def equations_for_diffrax(problem: Problem) -> AbstractSystem:
     """Return the equations of a problem as an integrator of diffrax's takes them: by machine code, where there is some."""
-    evaluation = problem.compiled.plan.evaluation
-    if evaluation is None:
+    if problem.compiled.plan.evaluation is None:
         return problem.equations
-    textbook = problem.compiled.textbook
     marks = mark_rows(problem.compiled, problem.ts[0], problem.q, problem.v, problem.length, problem.rate)
-    return native_equations(textbook, marks, problem.equations, evaluation)
+    return native_equations(problem.compiled, marks)
 
 
 @eqx.filter_custom_jvp

@@ -1,7 +1,6 @@
-"""Numbers as machine code takes them: its inputs, all numbers of a scene in one vector, their changes and cotangents."""
+"""Numbers as machine code takes them: all numbers of a scene in one vector, their changes and cotangents, and samples."""
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -9,49 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.gradients import stop_gradients
-from udkjax.native.operations import Operation
 from udkjax.scene.held import row_size, rows_of, with_row
 from udkjax.scene.mechanism import Mechanism
-
-
-def pack(
-    operation: Operation,
-    numbers: Sequence[ArrayLike],
-    ts: ArrayLike,
-    q: ArrayLike,
-    v: ArrayLike,
-    settings: Mapping[str, ArrayLike],
-    rows: ArrayLike,
-    breaks: ArrayLike,
-    xp: ModuleType,
-    further: Sequence[ArrayLike] = (),
-) -> list[Any]:
-    """Pack the inputs of an operation, of one member.
-
-    Args:
-        operation: The operation.
-        numbers: All numbers of the scene, and two thresholds of pivots.
-        ts: Times (s).
-        q: Positions (n,).
-        v: Velocities (n,).
-        settings: Settings by name; those of the operation are taken.
-        rows: The scales of the rows of Psi.
-        breaks: Times (s) where the motion is not smooth, in their order.
-        xp: jax.numpy, without derivatives, or NumPy, where all is known.
-        further: Further inputs.
-
-    Returns:
-        Arrays with the member first.
-    """
-    as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
-    values = [settings[name] for name in operation.all_settings]
-    given = (as_vector(numbers), ts, q, v, as_vector(values), rows, breaks, *further)
-    arrays = [xp.asarray(x, float)[None] for x in given]
-    return arrays if xp is np else stop_gradients(arrays)
 
 
 def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:

@@ -8,11 +8,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.analysis import Analysis
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
-from udkjax.equations.scales import Scales
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.assembly import Closure, State
+from udkjax.integrate.assembly import Closure, State, close, moves_from_guess
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import mark_rows
@@ -23,7 +22,9 @@ from udkjax.integrate.solvers import is_explicit
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.scene.checks import traced_numbers_hold
-from udkjax.scene.fields import make_module, number
+from udkjax.scene.fields import number
+from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
     import diffrax
@@ -81,6 +82,29 @@ class Choices(NamedTuple):
         )
 
 
+class Beginning(NamedTuple):
+    """The analysis of a mechanism that runs, and its assembled guess."""
+
+    analysis: Analysis
+    closure: Closure | None  # of the initial guess; None: the state is given
+    is_open: bool  # whether the closure is known to be open
+    moves: str  # of assembly, far from the guess, in words
+
+
+def begin(mechanism: Mechanism, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
+    """Analyse a mechanism, and assemble its guess at the time t (s), where that is not given."""
+    analysis = analyse(mechanism) if analysis is None else analysis
+    moves = ""
+    if state is None and closure is None:
+        closure = close(mechanism, t, analysis=analysis)
+        moves = moves_from_guess(mechanism, t, closure) if mechanism.is_concrete else ""
+    is_open = closure is not None and not isinstance(closure.is_closed, Tracer) and not closure.is_closed
+    return Beginning(analysis, closure, is_open, moves)
+
+
+begin_known = cached_by_identity(begin)
+
+
 class PreparedRun(NamedTuple):
     """A run before its first step."""
 
@@ -115,32 +139,26 @@ def prepare_run(
     Returns:
         The run. One that cannot be used, or is open, gets loose tolerances: as a member of a batch it would hold up others.
     """
-    if closure is not None:
-        state, closed = closure.state, xp.asarray(closure.is_closed)
-    else:
-        closed = xp.asarray(True)
-    assert state is not None  # one of them is given
-    q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
+    start = (_known_start if xp is np else _start)(compiled, analysis, state, closure)
     rtol, atol, good, given_ts = choices.rtol, choices.atol, xp.asarray(True), ts
     if xp is jnp:
-        numbers: Any = (q, v, rtol, atol, choices.drift_tol, choices.dt0)
-        good = usable(*stop_gradients(numbers)) | ~closed
+        numbers: Any = (start.q, start.v, rtol, atol, choices.drift_tol, choices.dt0)
+        good = usable(*stop_gradients(numbers)) | ~start.is_closed
         if analysis is not None:
             good = good & stop_gradients(traced_numbers_hold(compiled.textbook.mechanism.elements))
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))
         good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))
-    runs = good & closed
-    scales = None if analysis is None else analysis.scales
-    if scales is not None and xp is np:
-        scales = compiled.textbook.scales  # as arrays of NumPy
-    length, rate = _units(scales, ts, v, xp)
-    problem = make_module(
-        Problem,
+    runs, length, rate = good & start.is_closed, start.length, start.rate
+    if analysis is not None:
+        rate = xp.maximum(rate, 1 / (ts[-1] - ts[0]))
+    if xp is jnp:
+        length, rate = stop_gradients((length, rate))
+    problem = Problem(
         compiled=compiled,
         ts=ts,
-        q=q,
-        v=v,
+        q=start.q,
+        v=start.v,
         rtol=xp.where(runs, rtol, LOOSE_TOL),
         atol=xp.where(runs, xp.maximum(atol, LEAST_ATOL), LOOSE_TOL),
         smallest=SMALLEST_STEP * np.finfo(float).eps * xp.maximum(xp.abs(ts[0]), xp.abs(ts[-1])),
@@ -148,18 +166,42 @@ def prepare_run(
         length=length,
         rate=rate,
         max_steps=choices.max_steps,
-        marks=mark_rows(compiled, ts[0], q, v, length, rate, xp),
-        points=None,
+        marks=mark_rows(compiled, ts[0], start.q, start.v, length, rate, xp) if compiled.plan.marks_rows else None,
     )
-    missed = xp.asarray(False)
-    if closure is not None and compiled.plan.is_native:
-        missed = closed & (xp.asarray(closure.rank) > compiled.plan.independent_rows)
-    return PreparedRun(problem, given_ts, np.shape(state.q), good, closed, missed)
+    return PreparedRun(problem, given_ts, start.shape, good, start.is_closed, start.has_missed_rows)
 
 
-def _units(scales: Scales | None, ts: Array, v: Array, xp: ModuleType) -> tuple[Any, Any]:
-    """Return the length and the rate that `atol` is relative to."""
-    if scales is None:
-        return None, xp.ones(())
-    units = scales.length, xp.maximum(xp.maximum(scales.rate, scales.size(v, xp)), 1 / (ts[-1] - ts[0]))
-    return units if xp is np else stop_gradients(units)
+class RunStart(NamedTuple):
+    """The initial state of a run, and the units that follow from it."""
+
+    q: Float[Array, "n"]
+    v: Float[Array, "n"]
+    shape: tuple[int, ...]  # of the coordinates as they were given
+    is_closed: Bool[Array, ""]
+    has_missed_rows: Bool[Array, ""]
+    length: Any  # unit of `atol` (m); None: coordinates are of order one
+    rate: Any  # of the system and the initial velocities (1/s)
+
+
+def _start(
+    compiled: CompiledMechanism, analysis: Analysis | None, state: State | None, closure: Closure | None, xp: ModuleType = jnp
+) -> RunStart:
+    missed, closed, length, rate = xp.asarray(False), xp.asarray(True), None, xp.ones(())
+    if closure is not None:
+        state, closed = closure.state, xp.asarray(closure.is_closed)
+        if compiled.plan.is_native:
+            missed = closed & (xp.asarray(closure.rank) > compiled.plan.independent_rows)
+    assert state is not None  # one of them is given
+    q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
+    if analysis is not None:
+        scales = compiled.textbook.scales
+        length, rate = scales.length, xp.maximum(scales.rate, scales.size(v, xp))
+    return RunStart(q, v, np.shape(state.q), closed, missed, length, rate)
+
+
+@cached_by_identity
+def _known_start(
+    compiled: CompiledMechanism, analysis: Analysis | None, state: State | None, closure: Closure | None
+) -> RunStart:
+    """Return the start of a run of known numbers, by NumPy."""
+    return _start(compiled, analysis, state, closure, np)

@@ -18,22 +18,21 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import AssemblyWarning, Closure, State, close, moves_from_guess, require_closed
+from udkjax.integrate.assembly import AssemblyWarning, Closure, State, require_closed
 from udkjax.integrate.causes.find import explained
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import integrate_known
 from udkjax.integrate.outcome import FinishedRun, counts, outcome
-from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, prepare_run
+from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, begin, begin_known, prepare_run
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.put import put_arrays
-from udkjax.integrate.solution import SimulationError, Solution
+from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import is_traced, is_within_jit, make_module, number
+from udkjax.scene.fields import is_traced, is_within_jit, make_module, number, put_arrays
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 
@@ -140,17 +139,16 @@ def simulate(
         max_steps=max_steps,
         engine=engine,
     )
-    state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     is_known = isinstance(mechanism, Mechanism) and mechanism.is_concrete
+    state, closure = (None, state) if isinstance(state, Closure) else (state, None)
+    all_known = is_known and not is_traced((ts, analysis, state, closure, choices))
     if isinstance(mechanism, Mechanism):
         start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
-        if analysis is None:
-            analysis = analyse(mechanism)
-        if state is None and closure is None:
-            closure = close(mechanism, start, analysis=analysis)
-            if is_known and (moves := moves_from_guess(mechanism, start, closure)):
-                warnings.warn(moves, AssemblyWarning, stacklevel=3)
-        if throw and closure is not None:
+        begun = (begin_known if all_known else begin)(mechanism, start, analysis, state, closure)
+        analysis, closure = begun.analysis, begun.closure
+        if begun.moves:
+            warnings.warn(begun.moves, AssemblyWarning, stacklevel=3)
+        if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
     if events is not None:
@@ -166,12 +164,12 @@ def simulate(
             return _required(solution, throw)  # events may have changed what moved
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
 
-    solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices)
+    solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices, all_known)
     if not isinstance(mechanism, Mechanism) or not is_known or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:
         analysis = analyse(mechanism)  # the given analysis was of other numbers, of which a row was redundant
-        solution, _, end = _run(mechanism, analysis, ts, state, closure, choices)
+        solution, _, end = _run(mechanism, analysis, ts, state, closure, choices, all_known)
     if _has_failed(solution):
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
     return solution
@@ -179,7 +177,7 @@ def simulate(
 
 def _has_failed(solution: Solution) -> bool:
     """Return whether a single run, of known numbers, has not reached its end."""
-    return not isinstance(solution.code, Tracer) and not solution.result.is_success
+    return not isinstance(solution.code, Tracer) and int(solution.code) not in SUCCESSES
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
@@ -196,17 +194,17 @@ def _run(
     state: State | None,
     closure: Closure | None,
     choices: Choices,
+    all_known: bool,
 ) -> tuple[Solution, Any, Any]:
     """Return the solution, whether it takes rows that the method leaves out, and the last state (t, (q, v)) of the integrator.
 
     Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
     """
-    given = system, analysis, ts, state, closure, choices
-    if isinstance(system, Mechanism) and system.is_concrete and not is_traced(given[1:]):
+    if all_known and isinstance(system, Mechanism):
         with jax.ensure_compile_time_eval():  # while something else is traced
             compiled = compile_known(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
-                run = prepare_run(compiled, analysis, np.asarray(ts), state, closure, choices, np)
+                run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
                 return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
     given = bare, analysis, number(ts), state, closure, choices.arrays()

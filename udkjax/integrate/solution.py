@@ -44,11 +44,13 @@ class Result(PrintsWords):
     @property
     def is_success(self) -> bool:
         """True if the run went as far as it should: to its last time, or to an event that ends it."""
-        return self in (Result.successful, Result.event_stop, Result.at_rest)
+        return self in SUCCESSES
 
     def __str__(self) -> str:
         return self.label if self is Result.successful else f"{self.label}: {CAUSES[self]}"
 
+
+SUCCESSES = (Result.successful, Result.event_stop, Result.at_rest)
 
 # Causes that every run with the result shares. `Solution.cause` says more of a single run, where more is found.
 CAUSES = {

@@ -66,16 +66,10 @@ class Reverse(Recorded):
     # --- the way back
 
     def _accumulate_constants(self, f: Function, mask: Value):
-        """The cotangents of the constants that a program has found, to those of lanes in question."""
+        """Add the cotangents of the constants that a program has found to those of lanes in question."""
         with f.each(self.count) as i:
-            total = f.load(f.given["work"], i * f.width + self.start("total bar constants", "work"), f.width)
-            more = f.load(f.given["work"], i * f.width + self.start("bar constants", "work"), f.width)
-            f.store(
-                f.select(mask, total + more, total),
-                f.given["work"],
-                i * f.width + self.start("total bar constants", "work"),
-                f.width,
-            )
+            total, more = (self.entry(f, name, i) for name in ("total bar constants", "bar constants"))
+            self.put_entry(f, "total bar constants", i, f.select(mask, total + more, total))
 
     def _pull_projection(self, f: Function, mask: Value):
         """Pull `bar result` through the projection that led to the state, which has been evaluated, to `bar state`."""
@@ -164,10 +158,10 @@ class Reverse(Recorded):
             f.call("step_back", f.given["work"])
             self._move_back(f, s)
         # The remaining cotangent is that of the first state as it was given, which is the first output, too.
-        for k in self._each_lane(f, s.ready > 0.5):
+        with self.each_lane(f, s.ready > 0.5) as k:
             self._add_output(f, k, f.const(0, INT), "bar point3")
             for x in "qv":
-                self.copy_lane(f, self._result(f, call, f"{x}bar", k, self.n), 0, f"bar point3 {x}", k)
+                self.copy_lane(f, self._result(f, f"{x}bar", k, self.n), 0, f"bar point3 {x}", k)
             if self.count:
                 f.call("leave_row", f.given["work"], call, k)
             self.free_record(f, k)
@@ -177,38 +171,35 @@ class Reverse(Recorded):
         """Add cotangents of a state at an address to arrays of lane k."""
         for x, offset in (("q", 0), ("v", self.n)):
             with f.each(self.n) as i:
-                place = i * f.width + k + self.start(f"{to} {x}", "work")
-                f.store(f.load(f.given["work"], place) + f.load(bars, i + offset), f.given["work"], place)
+                self.put_lane_entry(f, f"{to} {x}", k, self.lane_entry(f, f"{to} {x}", k, i) + f.load(bars, i + offset), i)
 
     def _add_output(self, f: Function, k: Value, number: Value, to: str):
         """Add the cotangents of an output of the member in lane k to arrays of that lane."""
-        start = self.member_address(f, f.given["call"], "ysbar", self._lane(f, "member", k))
+        start = self.member_address(f, "ysbar", self.lane_entry(f, "member", k))
         self._add_state(f, k, f.at(start, number * (2 * self.n)), to)
 
     def _begin_walk(self, f: Function, s: Lane):
         """Clear all cotangents, and load the last points of the members that are `ready`, with the cotangents of their ends."""
-        call, n = f.given["call"], self.n
-        times = f.load(call, self.call_fields.index("times"), base=INT)
+        n, times = self.n, self.field(f, "times")
         s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
         zeros = [f"bar point{k} {x}" for k in range(POINTS) for x in "qva"] + [f"bar difference{k}" for k in range(3 * POINTS)]
         for names, length in ((zeros, n), (["total bar constants"], self.count)):
             with f.each(length) as i:
                 for name in names:
-                    f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], i * f.width + self.start(name, "work"), f.width)
-        for k in self._each_lane(f, s.ready > 0.5):
-            self._add_state(f, k, self.member_address(f, call, "endbar", self._lane(f, "member", k)), "bar point3")
-            with f.if_(self._lane(f, "code", k).is_(float(DONE))):
+                    self.put_entry(f, name, i, 0.0)
+        with self.each_lane(f, s.ready > 0.5) as k:
+            self._add_state(f, k, self.member_address(f, "endbar", self.lane_entry(f, "member", k)), "bar point3")
+            with f.if_(self.lane_entry(f, "code", k).is_(float(DONE))):
                 self._add_output(f, k, times - 1, "bar point3")
             for j in range(POINTS):
-                self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
+                self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
             self._load_head(f, k)
         cleared = [("numbersbar", f.const(self.code.number_count, INT))]
         if self.plan.sampled:
-            rows = f.load(call, self.call_fields.index("knots"), base=INT) + 1
-            cleared.append(("samplesbar", rows * len(self.plan.sampled)))
-        for k in self._each_lane(f, s.ready > 0.5):
+            cleared.append(("samplesbar", (self.field(f, "knots") + 1) * len(self.plan.sampled)))
+        with self.each_lane(f, s.ready > 0.5) as k:
             for name, length in cleared:
-                to = self._result(f, call, name, k, length)
+                to = self._result(f, name, k, length)
                 with f.each(length) as i:
                     f.store(0.0, to, i)
 
@@ -217,19 +208,18 @@ class Reverse(Recorded):
 
         q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the differences N_k and the products pi_k of differences of times.
         """
-        call, n, mask = f.given["call"], self.n, s.due > 0.5
+        n, mask = self.n, s.due > 0.5
         with f.each(n) as i:
             for x in "qv":
-                place = i * f.width + self.start(f"bar result {x}", "work")
-                f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], place, f.width)
-        for k in self._each_lane(f, mask):
-            number, member = self.to_int(f, self._lane(f, "written", k)), self._lane(f, "member", k)
-            self._put_lane(f, "next", k, self.input_number(f, call, "ts", member, number))
+                self.put_entry(f, f"bar result {x}", i, 0.0)
+        with self.each_lane(f, mask) as k:
+            number, member = self.to_int(f, self.lane_entry(f, "written", k)), self.lane_entry(f, "member", k)
+            self.put_lane_entry(f, "next", k, self.input_number(f, "ts", member, number))
             self._add_output(f, k, number, "bar result")
             for x in "qv":
-                state = f.at(self.member_address(f, call, f"given {x}s", member), number * n)
+                state = f.at(self.member_address(f, f"given {x}s", member), number * n)
                 with f.each(n) as i:
-                    f.store(f.load(state, i), f.given["work"], i * f.width + k + self.start(f"state {x}", "work"))
+                    self.put_lane_entry(f, f"state {x}", k, f.load(state, i), i)
         setattr(s, "state t", s.next)
         self._evaluate_projection(f)
         self._pull_projection(f, mask)
@@ -257,18 +247,18 @@ class Reverse(Recorded):
         for k in reversed(range(1, POINTS)):
             s.where(active, **{f"point{k}_t": getattr(s, f"point{k - 1}_t")})
         s.where(active, at=s.at - 1.0)
-        for k in self._each_lane(f, active):
-            self._load_point(f, k, self._lane(f, "at", k) - float(POINTS - 1), "point0")
+        with self.each_lane(f, active) as k:
+            self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1), "point0")
             self._load_head(f, k)
 
     def _write_find_rows(self):
         """`find_rows(work, call)`: the rows of samples that hold where lanes are, each with its constants."""
         f, s = self.function("find_rows", ARGUMENTS[:2])
         work, call = f.given["work"], f.given["call"]
-        for k in self._each_lane(f, s.at > 0.5):
-            knot = count_breakpoints(self, f, self.to_int(f, self._lane(f, "member", k)), self._lane(f, "point3_t", k))
-            self._put_lane(f, "knot", k, f.like(knot, DOUBLE, 1))
-            with f.if_(self._lane(f, "knot", k).is_not(self._lane(f, "row", k))):
+        with self.each_lane(f, s.at > 0.5) as k:
+            knot = count_breakpoints(self, f, self.to_int(f, self.lane_entry(f, "member", k)), self.lane_entry(f, "point3_t", k))
+            self.put_lane_entry(f, "knot", k, knot)
+            with f.if_(self.lane_entry(f, "knot", k).is_not(self.lane_entry(f, "row", k))):
                 if self.count:
                     f.call("leave_row", work, call, k)
                 f.call("enter", work, call, k)
@@ -278,26 +268,25 @@ class Reverse(Recorded):
         if not self.count:
             return
         f, _ = self.function("leave_row", ARGUMENTS)
-        call, k, count = f.given["call"], f.given["lane"], self.code.number_count
+        k, count = f.given["lane"], self.code.number_count
         constants, bars, found = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count))
         self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
         self.copy_lane(f, bars, 0, "total bar constants", k, count=self.count)
-        member, row = self.to_int(f, self._lane(f, "member", k)), self._lane(f, "row", k)
+        member, row = self.to_int(f, self.lane_entry(f, "member", k)), self.lane_entry(f, "row", k)
         sampled = self.plan.sampled
-        numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, call, "numbers", member)
+        numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, "numbers", member)
         f.call(PROLOGUE[REVERSE], numbers, constants, bars, found)
         if sampled:
-            rows = (f.load(call, self.call_fields.index("knots"), base=INT) + 1) * len(sampled)
-            to = f.at(self._result(f, call, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))
+            rows = (self.field(f, "knots") + 1) * len(sampled)
+            to = f.at(self._result(f, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))
             for column, place in self.active_samples.items():
                 f.store(f.load(to, column) + f.load(found, place), to, column)
-        to = self._result(f, call, "numbersbar", k, count)
+        to = self._result(f, "numbersbar", k, count)
         with f.each(count) as i:
             f.store(f.load(to, i) + f.load(found, i), to, i)
         with f.each(self.count) as i:
-            f.store(0.0, f.given["work"], (i + self.places["total bar constants"]) * f.width + k)
+            self.put_lane_entry(f, "total bar constants", k, 0.0, i)
 
-    def _result(self, f: Function, call: Value, name: str, k: Value, length: Operand) -> Value:
+    def _result(self, f: Function, name: str, k: Value, length: Operand) -> Value:
         """Return the address of an output of the member in lane k, of `length` numbers for each member."""
-        number = self.to_int(f, self._lane(f, "member", k))
-        return f.at(f.load(call, self.call_fields.index(name), base=POINTER), number * length)
+        return self.result_address(f, name, self.to_int(f, self.lane_entry(f, "member", k)), length)

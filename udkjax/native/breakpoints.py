@@ -46,13 +46,13 @@ def aim(module: Module, f: Function, s: Lane):
 
 
 def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
-    """The end of a step: in the middle of what is left, where little would be left behind it."""
+    """Return the end of a step: in the middle of what is left, where little would be left behind it."""
     short = (s.end - t1 < s.h * SHORTEST_LAST) & ~otherwise
     return f.select(short, s.point3_t + (s.end - s.point3_t) * 0.5, t1)
 
 
 def next_breakpoint(module: Module, f: Function, s: Lane, here: Value):
-    """t1: just before the next breakpoint; behind: just behind all of those that are here."""
+    """Set t1 just before the next breakpoint, and behind just behind all of those that are here."""
     work, call = f.given["work"], f.given["call"]
     f.call("next_breakpoint", work, call)
     with f.while_(lambda: f.any_of(s.due <= here + s.smallest)):

@@ -61,40 +61,40 @@ class Closing(Module):
     def _close(self):
         """`close(work, call)`: the member in the one lane."""
         f, s = self.function("close", [(POINTER, "work"), (POINTER, "call")])
-        work, n, m, p = f.given["work"], self.n, self.m, self.places
+        n, m = self.n, self.m
 
         def size() -> Value:
-            """|Psi|, each row over its scale; not a number where a row is none."""
+            """Return |Psi|, each row over its scale; not a number where a row is none."""
             self.invoke(f, "psi")
             total = f.variable(0.0)
             with f.each(m) as i:
-                part = f.load(work, i + p["psi"]) / f.load(work, i + p["rows"])
+                part = self.entry(f, "psi", i) / self.entry(f, "rows", i)
                 total.value = f.fma(part, part, total.value)
             return f.intrinsic("sqrt", total.value)
 
         def moved(scale: Value):
             with f.each(n) as i:
-                q = f.fma(scale, f.load(work, i + p["state dq"]), f.load(work, i + p["corrected q"]))
-                f.store(q, work, i + p["state q"])
+                q = f.fma(scale, self.entry(f, "state dq", i), self.entry(f, "corrected q", i))
+                self.put_entry(f, "state q", i, q)
 
         setattr(s, "state t", s.start)
         with f.each(n) as i:
             for name in "qv":
-                f.store(f.load(work, i + p[f"point3 {name}"]), work, i + p[f"state {name}"])
+                self.put_entry(f, f"state {name}", i, self.entry(f, f"point3 {name}", i))
         better, steps = f.variable(1.0), f.variable(0, INT)
         with f.while_(lambda: (better.value > 0.5) & (steps.value < CLOSURE_ITERATIONS)):
             steps.value = steps.value + 1
             before = size()
             largest, longest = f.variable(1.0), f.variable(0.0)
             with f.each(n) as i:
-                q = f.load(work, i + p["state q"])
-                largest.value = f.max(f.abs(q) * f.load(work, i + p["inverse unit"]), largest.value)
-                f.store(q, work, i + p["corrected q"])
+                q = self.entry(f, "state q", i)
+                largest.value = f.max(f.abs(q) * self.entry(f, "inverse unit", i), largest.value)
+                self.put_entry(f, "corrected q", i, q)
             better.value = f.select(before > largest.value * (ROUNDING_UNITS * np.finfo(float).eps), f.const(1.0), 0.0)
             with f.if_(better.value > 0.5):
                 self._correct(f, "q")
                 with f.each(n) as i:
-                    step = f.abs(f.load(work, i + p["state dq"])) * f.load(work, i + p["inverse unit"])
+                    step = f.abs(self.entry(f, "state dq", i)) * self.entry(f, "inverse unit", i)
                     longest.value = f.max(step, longest.value)
                 scale = f.variable(f.select(longest.value > LONGEST_STEP, LONGEST_STEP / longest.value, f.const(1.0)))
                 halvings, better.value = f.variable(0, INT), 0.0
@@ -115,25 +115,21 @@ class Closing(Module):
             self._record_correction(f, "v", f.const(1.0), f.const(0.0))
             self._correct(f, "v")
             with f.each(n) as i:
-                f.store(f.load(work, i + p["state v"]) + f.load(work, i + p["state dv"]), work, i + p["state v"])
+                self.put_entry(f, "state v", i, self.entry(f, "state v", i) + self.entry(f, "state dv", i))
         self._write_result(f, s)
 
     def _write_result(self, f: Function, s: Lane):
-        """The state, Psi and Psi_dot there, and the rank of D."""
-        member, work = self.to_int(f, s.member), f.given["work"]
-
-        def address(name: str, length: int) -> Value:
-            return f.at(f.load(f.given["call"], self.call_fields.index(name), base=POINTER), member * length)
-
-        state, residuals = address("state", 2 * self.n), address("residuals", 2 * self.m)
+        """Write the state, Psi and Psi_dot there, and the rank of D."""
+        member = self.to_int(f, s.member)
+        state, residuals = (self.result_address(f, x, member, 2 * size) for x, size in (("state", self.n), ("residuals", self.m)))
         self.copy_lane(f, state, 0, "state q", f.const(0, INT))
         self.copy_lane(f, state, self.n, "state v", f.const(0, INT))
         for name, offset in (("psi", 0), ("psi_dot", self.m)):
             self.invoke(f, name)
             with f.each(self.m) as i:
-                f.store(f.load(work, i + self.places["psi"]), residuals, i + offset)
+                f.store(self.entry(f, "psi", i), residuals, i + offset)
         self.corrections["v"].find_rank(f)
-        f.store(s.rank, address("rank", 1))
+        f.store(s.rank, self.result_address(f, "rank", member, 1))
         self._finish_closing(f, member)
 
     def _evaluate(self, f: Function, x: str):
@@ -141,15 +137,15 @@ class Closing(Module):
         f.call(f"evaluation_newton_{x}", f.given["work"], f.given["work"], self.address(f, "correction"))
 
     def change(self, f: Function, x: str, i: Value) -> Value:
-        """A coordinate of the whole correction."""
+        """Return a coordinate of the whole correction."""
         place = self.places["correction"] + self.corrections[x].place(f"{x}1")
-        return f.load(f.given["work"], i + place) - f.load(f.given["work"], i + self.places[f"state {x}"])
+        return f.load(f.given["work"], i + place) - self.entry(f, f"state {x}", i)
 
     def _correct(self, f: Function, x: str):
         """Compute the whole correction of q or v, in `state dq` or `state dv`."""
         self._evaluate(f, x)
         with f.each(self.n) as i:
-            f.store(self.change(f, x, i), f.given["work"], i + self.places[f"state d{x}"])
+            self.put_entry(f, f"state d{x}", i, self.change(f, x, i))
 
     # --- hooks for derivatives (closing_derivatives.py)
 
@@ -161,14 +157,13 @@ class Closing(Module):
 
     def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
         """Do something at the state before a step, which lies in `corrected q`, in place of the one that it led to."""
-        p, work = self.places, f.given["work"]
         with f.each(self.n) as i:
-            current, before = f.load(work, i + p[f"state {x}"]), f.load(work, i + p["corrected q"])
-            f.store(current, work, i + p["corrected q"])
-            f.store(before, work, i + p[f"state {x}"])
+            current, before = self.entry(f, f"state {x}", i), self.entry(f, "corrected q", i)
+            self.put_entry(f, "corrected q", i, current)
+            self.put_entry(f, f"state {x}", i, before)
         do()
         with f.each(self.n) as i:
-            f.store(f.load(work, i + p["corrected q"]), work, i + p[f"state {x}"])
+            self.put_entry(f, f"state {x}", i, self.entry(f, "corrected q", i))
 
     def step_all(self, f: Function, s: Lane, fill):
         f.call("close", f.given["work"], f.given["call"])

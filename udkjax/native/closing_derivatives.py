@@ -20,24 +20,16 @@ from udkjax.native.prologue import PROLOGUE, write_prologue_derivative
 
 
 class ClosingDerivative(Closing):
-    """Access to arrays, for both modes."""
-
-    def _at(self, f: Function, name: str, i: Value | int, pointer: str = "work") -> Value:
-        places = self.places if pointer == "work" else self.tangents
-        return f.load(f.given[pointer], f.like(i, INT, 1) + places[name])
-
-    def _set(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
-        places = self.places if pointer == "work" else self.tangents
-        f.store(x, f.given[pointer], f.like(i, INT, 1) + places[name])
+    """The base of both modes."""
 
     def _increase(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
-        self._set(f, name, i, self._at(f, name, i, pointer) + x, pointer)
+        self.put_entry(f, name, i, self.entry(f, name, i, pointer) + x, pointer)
 
     def _longest(self, f: Function, x: str) -> tuple[Value, Value]:
-        """The largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
+        """Return the largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
         longest, which = f.variable(0.0), f.variable(0, INT)
         with f.each(self.n) as i:
-            size = f.abs(self.change(f, x, i)) * self._at(f, "inverse unit", i)
+            size = f.abs(self.change(f, x, i)) * self.entry(f, "inverse unit", i)
             which.value = f.select(size > longest.value, i, which.value)
             longest.value = f.max(size, longest.value)
         return longest.value, which.value
@@ -86,13 +78,12 @@ class ClosingForward(ClosingDerivative):
             f.call(f"{self.mode}_newton_{x}", f.given["work"], known, f.given["d"], f.given["d"])
             for way in self.ways:
                 with f.each(self.n) as i:
-                    self._increase(f, f"result {x}", i, -self._at(f, f"state {x}", i, way), way)
+                    self._increase(f, f"result {x}", i, -self.entry(f, f"state {x}", i, way), way)
             # Of the longest step, over its length: with it the limit changes.
-            shares = {
-                way: f.select(limits, self._at(f, f"result {x}", which, way) / self.change(f, x, which), 0.0) for way in self.ways
-            }
+            steps = {way: self.entry(f, f"result {x}", which, way) for way in self.ways}
+            shares = {way: f.select(limits, step / self.change(f, x, which), 0.0) for way, step in steps.items()}
             with f.each(self.n) as i:
-                steps = {way: self._at(f, f"result {x}", i, way) for way in self.ways}
+                steps = {way: self.entry(f, f"result {x}", i, way) for way in self.ways}
                 for way, step in self._limited(steps, shares, self.change(f, x, i)).items():
                     self._increase(f, f"state {x}", i, f.given["scale"] * step, way)
 
@@ -103,9 +94,8 @@ class ClosingForward(ClosingDerivative):
     @contextmanager
     def _each_direction(self, f: Function) -> Iterator[Value]:
         """Run the block for every direction, with the addresses of its tangents by their names."""
-        call = f.load(f.given["work"], self.places["call"], base=POINTER)
         first = f.load(f.given["work"], self.places["tangents"], base=POINTER)
-        with f.each(f.load(call, self.call_fields.index("directions"), base=INT)) as p:
+        with f.each(self.field(f, "directions")) as p:
             for k, way in enumerate(self.ways):
                 f.given[way] = f.at(first, p * (len(self.ways) * self.tangents.size) + k * self.tangents.size)
             yield p
@@ -115,7 +105,7 @@ class ClosingForward(ClosingDerivative):
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
-        call, constants = self.call_record(f), self.address(f, "constants")
+        constants = self.address(f, "constants")
         with self._each_direction(f) as p:
             for way in self.ways:
                 for name, to, count in (
@@ -123,23 +113,22 @@ class ClosingForward(ClosingDerivative):
                     ("q", "state q", self.n),
                     ("v", "state v", self.n),
                 ):
-                    start = self.member_address(f, call, f"{way}{name}", member) if way in GIVEN else None
+                    start = self.member_address(f, f"{way}{name}", member) if way in GIVEN else None
                     with f.each(count) as i:
-                        self._set(f, to, i, f.load(start, p * count + i) if start else f.const(0.0), way)
+                        self.put_entry(f, to, i, f.load(start, p * count + i) if start else f.const(0.0), way)
             changes = [f.at(f.given[way], self.tangents[x]) for x in ("numbers", "constants") for way in self.ways]
-            f.call(PROLOGUE[self.mode], self.member_address(f, call, "numbers", member), constants, *changes)
+            f.call(PROLOGUE[self.mode], self.member_address(f, "numbers", member), constants, *changes)
 
     def _finish_closing(self, f: Function, member: Value):
-        call = self.call_record(f)
-        directions = f.load(call, self.call_fields.index("directions"), base=INT)
+        directions = self.field(f, "directions")
         with self._each_direction(f) as p:
-            to = f.at(f.load(call, self.call_fields.index("dstate"), base=POINTER), (member * directions + p) * (2 * self.n))
+            to = self.result_address(f, "dstate", member * directions + p, 2 * self.n)
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
-                    f.store(self._at(f, f"state {x}", i, self.ways[-1]), to, i + k * self.n)
+                    f.store(self.entry(f, f"state {x}", i, self.ways[-1]), to, i + k * self.n)
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
-        size = f.load(call, self.call_fields.index("directions"), base=INT) * (len(self.ways) * self.tangents.size)
+        size = self.field(f, "directions") * (len(self.ways) * self.tangents.size)
         block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
@@ -216,67 +205,65 @@ class ClosingReverse(ClosingDerivative):
         longest, which = self._longest(f, x)
         along = f.variable(0.0)
         with f.each(self.n) as i:
-            bar = f.given["scale"] * self._at(f, f"bar iterate {x}", i)
+            bar = f.given["scale"] * self.entry(f, f"bar iterate {x}", i)
             along.value = f.fma(bar, self.change(f, x, i), along.value)
-            self._set(f, f"bar result {x}", i, bar)
+            self.put_entry(f, f"bar result {x}", i, bar)
         with f.if_((f.given["limited"] > 0.5) & (longest > 0.0)):
             self._increase(f, f"bar result {x}", which, -(along.value / self.change(f, x, which)))
         with f.each(self.n) as i:
-            self._increase(f, f"bar iterate {x}", i, -self._at(f, f"bar result {x}", i))
+            self._increase(f, f"bar iterate {x}", i, -self.entry(f, f"bar result {x}", i))
         f.call(f"reverse_newton_{x}", f.given["work"], self.address(f, "correction"), f.given["work"])
         self._accumulate(f)
 
     def _accumulate(self, f: Function):
         """Add the cotangents that a correction's derivative has left in `bar state`."""
         with f.each(self.constants) as i:
-            self._increase(f, "total bar constants", i, self._at(f, "bar constants", i))
+            self._increase(f, "total bar constants", i, self.entry(f, "bar constants", i))
         with f.each(self.n) as i:
             for x in "qv":
-                self._increase(f, f"bar iterate {x}", i, self._at(f, f"bar state {x}", i))
+                self._increase(f, f"bar iterate {x}", i, self.entry(f, f"bar state {x}", i))
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
-        number = self.to_int(f, self._at(f, "records", 0))
+        number = self.to_int(f, self.entry(f, "records", 0))
         row = f.at(f.given["work"], number * self.row + self.places["record"])
         for k, value in enumerate((f.const(float(CORRECTED.index(x))), scale, limited)):
             f.store(value, row, k)
         self.copy_lane(f, row, 3, "state q", f.const(0, INT))
         self.copy_lane(f, row, 3 + self.n, "state v", f.const(0, INT))
-        self._set(f, "records", 0, self._at(f, "records", 0) + 1.0)
+        self.put_entry(f, "records", 0, self.entry(f, "records", 0) + 1.0)
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         del lane
-        self._set(f, "records", 0, f.const(0.0))
+        self.put_entry(f, "records", 0, f.const(0.0))
         with f.each(self.constants) as i:
-            self._set(f, "total bar constants", i, f.const(0.0))
-        bars = self.member_address(f, self.call_record(f), "statebar", member)
+            self.put_entry(f, "total bar constants", i, f.const(0.0))
+        bars = self.member_address(f, "statebar", member)
         for k, x in enumerate("qv"):
             with f.each(self.n) as i:
-                self._set(f, f"bar iterate {x}", i, f.load(bars, i + k * self.n))
+                self.put_entry(f, f"bar iterate {x}", i, f.load(bars, i + k * self.n))
 
     def _finish_closing(self, f: Function, member: Value):
-        call = self.call_record(f)
-
         def left() -> Value:
-            return self._at(f, "records", 0) > 0.5
+            return self.entry(f, "records", 0) > 0.5
 
         with f.while_(left):
-            self._set(f, "records", 0, self._at(f, "records", 0) - 1.0)
-            row = f.at(f.given["work"], self.to_int(f, self._at(f, "records", 0)) * self.row + self.places["record"])
+            self.put_entry(f, "records", 0, self.entry(f, "records", 0) - 1.0)
+            row = f.at(f.given["work"], self.to_int(f, self.entry(f, "records", 0)) * self.row + self.places["record"])
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
-                    self._set(f, f"state {x}", i, f.load(row, i + (3 + k * self.n)))
+                    self.put_entry(f, f"state {x}", i, f.load(row, i + (3 + k * self.n)))
 
             def pull(name: str) -> Callable[[], None]:
                 return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_v"), pull("pull_q"))
         constants, bars, to = (self.address(f, x) for x in ("constants", "total bar constants", "numbersbar"))
-        f.call(PROLOGUE[REVERSE], self.member_address(f, call, "numbers", member), constants, bars, to)
+        f.call(PROLOGUE[REVERSE], self.member_address(f, "numbers", member), constants, bars, to)
         for name, place, count in (
             ("numbersbar", "numbersbar", self.code.number_count),
             ("qbar", "bar iterate q", self.n),
             ("vbar", "bar iterate v", self.n),
         ):
-            to = f.at(f.load(call, self.call_fields.index(name), base=POINTER), member * count)
+            to = self.result_address(f, name, member, count)
             with f.each(count) as i:
-                f.store(self._at(f, place, i), to, i)
+                f.store(self.entry(f, place, i), to, i)

@@ -37,7 +37,7 @@ class EliminationCorrection(ProgramDerivative):
         module = self._module
         with f.each(module.code.scratch["factors"]) as i:
             x = f.load(f.given["work"], i + (module.places["correction"] + self.place("factors")))
-            f.store(x, f.given["work"], i + module.places["factors"])
+            module.put_entry(f, "factors", i, x)
         module.invoke(f, "rank")
 
 

@@ -1,6 +1,6 @@
 """States between steps: Newton's divided differences of the last four states with their velocities and accelerations."""
 
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.layout import Lane, Layout
 from udkjax.native.manifold import project_output
 from udkjax.native.module import Module
@@ -79,7 +79,7 @@ def write_differences_back(module: Module):
 
 
 def write_between(module: Module, name: str = "between", to: tuple[str, Layout] | None = None):
-    """The polynomial at the time `next`."""
+    """Write the polynomial at the time `next`."""
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     ahead = [module.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
@@ -98,8 +98,7 @@ def write_between(module: Module, name: str = "between", to: tuple[str, Layout] 
 def write_outputs(module: Module):
     """Write the states at output times up to `until`."""
     f, s = module.function("outputs", [(POINTER, "work"), (POINTER, "call")])
-    call = f.given["call"]
-    inner = f.load(call, module.call_fields.index("times"), base=INT) - 1
+    inner = module.field(f, "times") - 1
 
     def due() -> Value:
         s.due = f.select((s.next <= s.until) & (s.written + 1.0 < inner), f.const(1.0, DOUBLE, f.width), 0.0)
@@ -111,12 +110,8 @@ def write_outputs(module: Module):
             f.call("between", f.given["work"])
             project_output(module, f, s, "due")
             module.record_output(f, s)
-            with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
+            with module.each_lane(f, s.due) as k:
                 number = module.to_int(f, f.lane(s.written, k)) + 1
-                module.write_state(f, s, call, k, number, "state q", "result v")
-                f.store(
-                    module.input_number(f, call, "ts", f.lane(s.member, k), number + 1),
-                    f.given["work"],
-                    k + module.places["next"] * f.width,
-                )
+                module.write_state(f, s, k, number, "state q", "result v")
+                module.put_lane_entry(f, "next", k, module.input_number(f, "ts", f.lane(s.member, k), number + 1))
             s.where(s.due > 0.5, written=s.written + 1.0)

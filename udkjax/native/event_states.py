@@ -12,7 +12,7 @@ that W_ij = g_q,i d_j.
 """
 
 from udkjax.native.conditions import Conditions
-from udkjax.native.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.ir import Function, Value
 from udkjax.native.layout import Lane
 from udkjax.native.program import write
 from udkjax.native.state_functions import StateAccelerations, StateTangentPart
@@ -42,13 +42,13 @@ class EventStates(StateTangentPart, StateAccelerations):
         return ["accelerations", *(["tangent_part"] if self.impacts else [])]
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        given = self.member_address(f, self.call_record(f), "event_numbers", member)
+        given = self.member_address(f, "event_numbers", member)
         for name, start, count in (
             ("event numbers", 0, self.conditions.number_count),
             ("inverse mass", self.conditions.number_count, self.n),
         ):
             with f.each(count) as i:
-                f.store(f.load(given, i + start), f.given["work"], (i + self.places[name]) * f.width + lane)
+                self.put_lane_entry(f, name, lane, f.load(given, i + start), i)
 
     def write_programs(self):
         super().write_programs()
@@ -66,16 +66,12 @@ class EventStates(StateTangentPart, StateAccelerations):
         count = self.conditions.own_count
         for k, event in enumerate(self.impacts):
             with f.each(self.n) as i:
-                normal = f.load(
-                    f.given["work"], (i + (self.places["event values"] + 4 * count + event * self.n)) * f.width, f.width
-                )
-                mobility = f.load(f.given["work"], (i + self.places["inverse mass"]) * f.width, f.width)
-                f.store(normal * mobility, f.given["work"], (i + self.places["state dq"]) * f.width, f.width)
-                f.store(f.const(0.0, DOUBLE, f.width), f.given["work"], (i + self.places["state dv"]) * f.width, f.width)
+                normal = self.entry(f, "event values", i + (4 * count + event * self.n))
+                self.put_entry(f, "state dq", i, normal * self.entry(f, "inverse mass", i))
+                self.put_entry(f, "state dv", i, 0.0)
             StateTangentPart._evaluate(self, f, s)
             with f.each(self.n) as i:
-                found = f.load(f.given["work"], (i + self.places["result dq"]) * f.width, f.width)
-                f.store(found, f.given["work"], (i + (self.places["directions"] + k * self.n)) * f.width, f.width)
+                self.put_entry(f, "directions", i + k * self.n, self.entry(f, "result dq", i))
 
     def write_found(self, f: Function, s: Lane):
         counts = {
@@ -83,9 +79,9 @@ class EventStates(StateTangentPart, StateAccelerations):
             "event values": len(self.conditions.at_state.outputs),
             "directions": len(self.impacts) * self.n,
         }
-        to, size = f.load(f.given["call"], self.call_fields.index("found"), base=POINTER), sum(counts.values())
-        with f.each(f.width) as k, f.if_(f.lane(s.active, k) > 0.5):
-            member, start = self.to_int(f, f.lane(s.member, k)) * size, 0
+        with self.each_lane(f, s.active) as k:
+            to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))
+            start = 0
             for name, count in counts.items():
-                self.copy_lane(f, f.at(to, member), start, name, k, count=count)
+                self.copy_lane(f, to, start, name, k, count=count)
                 start += count

@@ -107,7 +107,7 @@ def _write_singular_values(module: Module):
         module.invoke(f, "rows_and_loads")
 
         def each_lane(f: Function = f, s: Lane = s, name: str = name):
-            with f.each(f.width) as k, f.if_(f.lane(s.wanted, k) > 0.5):
+            with module.each_lane(f, s.wanted) as k:
                 f.call(f"{name}_of_lane", f.given["work"], k)
 
         if threshold is None:

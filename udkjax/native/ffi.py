@@ -118,9 +118,9 @@ def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:
     return f.op(f"atomicrmw add ptr {f.at(work, word, 'i64').name}, i64 {number.name} seq_cst", INT)
 
 
-def _leave(f: Function, work: Value, users: Value | int = 1):
+def _leave(f: Function, work: Value):
     """Look at shared work no more: who does so last frees it."""
-    with f.if_(_add(f, work, USERS, f.like(0, INT, 1) - users).is_(users)):
+    with f.if_(_add(f, work, USERS, -1).is_(1)):
         f.line(f"call void @free(ptr {work.name})")
 
 

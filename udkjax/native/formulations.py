@@ -59,8 +59,8 @@ class FormulatedAccelerations(ABC):
         """Write how x is found of Psi_q, M^(-1/2) and b at hand; return the row that holds it."""
 
     def _array(self, f: Function, name: str, i: Operand = 0) -> Value:
-        """One number of an array, in all lanes."""
-        return f.load(f.given["work"], f.like(i, INT, 1) * f.width + self._in.start(name, "work"), f.width)
+        """Return one number of an array, in all lanes."""
+        return self._in.entry(f, name, i)
 
     def _unit(self, f: Function, i: Operand) -> Value:
         return 1.0 / self._array(f, "inverse unit", i)

@@ -76,7 +76,7 @@ class Function:
         return name
 
     def text(self) -> str:
-        """The definition; what it calls of LLVM's own is in `declared`."""
+        """Return the definition; what it calls of LLVM's own is in `declared`."""
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
@@ -90,7 +90,7 @@ class Function:
         return Value(self, one if width == 1 else f"<{', '.join([f'{base} {one}'] * width)}>", base, width)
 
     def like(self, x: Operand, base: str, width: int) -> Value:
-        """A value or a number as so many lanes of a type."""
+        """Return a value or a number as so many lanes of a type."""
         if not isinstance(x, Value):
             return self.const(x, base, width)
         if x.base == INT and base == DOUBLE:
@@ -103,7 +103,7 @@ class Function:
         return x if x.width == width else self.repeat(x, width)
 
     def repeat(self, x: Value, width: int) -> Value:
-        """The same number in all lanes."""
+        """Repeat a number in all lanes."""
         if x.width != 1:
             raise TypeError(f"{x.width} lanes for {width}")
         kind = llvm_type(x.base, width)
@@ -157,7 +157,7 @@ class Function:
         return self.op(f"select {mask.type} {mask.name}, {a.type} {a.name}, {b.type} {b.name}", base, width)
 
     def intrinsic(self, name: str, *arguments: Operand) -> Value:
-        """An intrinsic function of LLVM on numbers, lane by lane: fmuladd, sqrt, fabs, maximum, floor, exp, log, pow, ..."""
+        """Call an intrinsic function of LLVM on numbers, lane by lane: fmuladd, sqrt, fabs, maximum, floor, exp, log, pow, ..."""
         width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
         values = [self.like(x, DOUBLE, width) for x in arguments]
         kind = llvm_type(DOUBLE, width)
@@ -166,19 +166,19 @@ class Function:
         return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
 
     def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
-        """a b + c, rounded once where the processor has an instruction for it; a call of a library nowhere."""
+        """Return a b + c, rounded once where the processor has an instruction for it; a call of a library nowhere."""
         return self.intrinsic("fmuladd", a, b, c)
 
     def abs(self, a: Value) -> Value:
         return self.intrinsic("fabs", a)
 
     def max(self, a: Operand, b: Operand) -> Value:
-        """The larger of two numbers; b where one is none: one instruction."""
+        """Return the larger of two numbers; b where one is none: one instruction."""
         x, y = self.both(a, b)
         return self.select(x > y, x, y)
 
     def min(self, a: Operand, b: Operand) -> Value:
-        """The smaller of two numbers; b where one is none."""
+        """Return the smaller of two numbers; b where one is none."""
         x, y = self.both(a, b)
         return self.select(x < y, x, y)
 
@@ -186,7 +186,7 @@ class Function:
         return self.abs(a) < float("inf")
 
     def largest_of(self, x: Value) -> Value:
-        """The largest of all lanes, none of which may be not a number."""
+        """Return the largest of all lanes, none of which may be not a number."""
         while x.width > 1:
             half, lanes = x.width // 2, range(x.width)
             take = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
@@ -198,7 +198,7 @@ class Function:
         return x
 
     def reduce(self, name: str, x: Value) -> Value:
-        """All lanes together: `or` and `and` of conditions."""
+        """Reduce all lanes to one value: `or` and `and` of conditions."""
         if x.width == 1:
             return x
         full = f"llvm.vector.reduce.{name}.v{x.width}{'f64' if x.base == DOUBLE else x.base}"
@@ -206,7 +206,7 @@ class Function:
         return self.op(f"call {x.base} @{full}({x.type} {x.name})", x.base)
 
     def total(self, x: Value) -> Value:
-        """The sum of all lanes, in any order."""
+        """Return the sum of all lanes, in any order."""
         if x.width == 1:
             return x
         full = f"llvm.vector.reduce.fadd.v{x.width}f64"
@@ -220,13 +220,13 @@ class Function:
         return self.reduce("and", mask)
 
     def lane(self, x: Value, k: Value) -> Value:
-        """The number in one lane."""
+        """Return the number in one lane."""
         if x.width == 1:
             return x
         return self.op(f"extractelement {x.type} {x.name}, i64 {k.name}", x.base)
 
     def only(self, k: Value) -> Value:
-        """The mask of one lane alone."""
+        """Return the mask of one lane alone."""
         if self.width == 1:
             return self.const(True, BOOL)
         lanes = Value(self, f"<{', '.join(f'i64 {j}' for j in range(self.width))}>", INT, self.width)
@@ -235,7 +235,7 @@ class Function:
     # --- memory
 
     def at(self, pointer: Value | str, k: Operand, base: str = DOUBLE) -> Value:
-        """The address of the k-th number from a pointer. Of pointers as well each takes 8 bytes, whatever size it has."""
+        """Return the address of the k-th number from a pointer. Of pointers as well each takes 8 bytes, whatever size it has."""
         name = pointer.name if isinstance(pointer, Value) else pointer
         index, stored = self.like(k, INT, 1), INT if base == POINTER else base
         return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
@@ -274,7 +274,7 @@ class Function:
         self.line(f"{end}:")
 
     def choose(self, condition: Value, then: Callable[[], None], otherwise: Callable[[], None]):
-        """One of two things to do."""
+        """Do one of two things."""
         yes, no, end = self._label("then"), self._label("else"), self._label("end")
         self.line(f"br i1 {condition.name}, label %{yes}, label %{no}")
         for label, do in ((yes, then), (no, otherwise)):

@@ -62,7 +62,7 @@ class Layout:
     size: int = 0
 
     def add(self, name: str, count: int = 1) -> int:
-        """A new array, from a register's boundary on."""
+        """Add an array, from a register's boundary on."""
         step = max(self.vector // self.width, 1)
         self.places[name] = self.size
         self.size += -(-count // step) * step

@@ -35,7 +35,7 @@ def _llvm() -> Any:
 
 
 def _target_machine(level: int) -> Any:
-    """A compiler for the processor that runs this."""
+    """Return a compiler for the processor that runs this."""
     llvm = _llvm()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=_features(), opt=level, reloc="pic", codemodel="small", jit=True
@@ -72,7 +72,7 @@ def _compiler() -> str:
 
 @cache
 def _linker() -> Any:
-    """The loader of object code: JITLink lays code and constants side by side, wherever in a process there is room for both."""
+    """Return the loader of object code: JITLink lays code and constants side by side, wherever there is room for both."""
     llvm = _llvm()
     machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
     return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
@@ -97,7 +97,7 @@ class Library:
 
 
 def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
-    """The code of a module, with the functions of these names: from disk, or compiled and put there."""
+    """Return the code of a module, with the functions of these names: from disk, or compiled and put there."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         codes, levels = zip(*pool.map(lambda part: _stored_code(part, level), split_module(text)), strict=True)
     return Library(codes, names, is_optimized=min(levels) == LEVEL)
@@ -182,5 +182,5 @@ def _emission() -> Callable:
 
 
 def function(address: int, *arguments: Any) -> Any:
-    """A function at an address, to be called without Python's lock."""
+    """Return a function at an address, to be called without Python's lock."""
     return ctypes.CFUNCTYPE(None, *arguments)(address)

@@ -9,7 +9,7 @@ from udkjax.native.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PI
 
 
 def newton(module: Module, f: Function, s: Lane):
-    """Newton's method to Psi = 0 of lanes that are `stepping`, until it moves nothing but rounding errors."""
+    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until they move nothing but rounding errors."""
 
     def closer(active: Value):
         module.invoke(f, "newton_q")
@@ -19,7 +19,7 @@ def newton(module: Module, f: Function, s: Lane):
 
 
 def iterate_newton(module: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
-    """Newton's method of some lanes: `closer` leaves `corrected q`, nearer to the manifold than `state q`."""
+    """Take Newton steps in some lanes: `closer` leaves `corrected q`, nearer to the manifold than `state q`."""
     s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
@@ -94,10 +94,9 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
 
 
 def largest_violation(module: Module, f: Function) -> Value:
-    """The largest of Psi, each row over its scale; not a number where a row is none."""
+    """Return the largest of Psi, each row over its scale; not a number where a row is none."""
     worst = f.variable(0.0)
     with f.each(module.m) as i:
-        psi = f.load(f.given["work"], i * f.width + module.places["psi"] * f.width, f.width)
-        x = f.abs(psi) / f.load(f.given["work"], i * f.width + module.places["rows"] * f.width, f.width)
+        x = f.abs(module.entry(f, "psi", i)) / module.entry(f, "rows", i)
         worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)
     return worst.value

@@ -13,7 +13,7 @@ import numpy as np
 
 from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.manifold import largest_violation
 from udkjax.native.members import write_begin, write_run
@@ -68,55 +68,47 @@ class Marching(Module):
         named = ("psi_q", "root") if self._rows else ()
         return super().arrays | {name: ("work", self.places[name]) for name in named}
 
-    def _get(self, f: Function, name: str, i: Value) -> Value:
-        return f.load(f.given["work"], i * f.width + self.places[name] * f.width, f.width)
-
-    def _put(self, f: Function, name: str, i: Value, x: Value):
-        f.store(x, f.given["work"], i * f.width + self.places[name] * f.width, f.width)
-
     def _march(self):
         """`march(work, call)`: the members in all lanes, over all values."""
         f, s = self.function("march", [(POINTER, "work"), (POINTER, "call")])
-        work, call, width = f.given["work"], f.given["call"], self.plan.width
-        zero = f.const(0.0, DOUBLE, width)
-        times = f.load(call, self.call_fields.index("times"), base=INT)
+        zero, times = f.const(0.0, DOUBLE, f.width), self.field(f, "times")
         trusted, good, before = f.variable(0.0), f.variable(1.0), f.variable(s.start)
         with f.each(self.n) as i:
-            self._put(f, "state q", i, self._get(f, "point3 q", i))
+            self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
             for name in ("result dq", "result dv", "third derivative"):
-                self._put(f, name, i, zero)
+                self.put_entry(f, name, i, zero)
         with f.each(times) as k:
-            with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
-                f.store(self.input_number(f, call, "ts", f.lane(s.member, lane), k), work, lane + self.places["state t"] * width)
-            now = self._get(f, "state t", f.const(0, INT))
+            with self.each_lane(f, s.active) as lane:
+                self.put_lane_entry(f, "state t", lane, self.input_number(f, "ts", f.lane(s.member, lane), k))
+            now = self.entry(f, "state t")
             h, begins = now - before.value, f.compare("lt", k, 1)
             self._step_on(f, h)
             good.value = f.select(self._is_sound(f, s, h, begins), good.value, zero)
             trusted.value = trusted.value + good.value
             with f.if_(begins), f.each(self.n) as i:  # there was no step: nothing is known of the third derivative
-                self._put(f, "third derivative", i, zero)
+                self.put_entry(f, "third derivative", i, zero)
             before.value, side = now, self._side(f)
-            with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
+            with self.each_lane(f, s.active) as lane:
                 row = self.to_int(f, f.lane(s.member, lane)) * times + k
-                f.store(f.lane(side, lane), f.load(call, self.call_fields.index("sides"), base=POINTER), row)
+                f.store(f.lane(side, lane), self.field(f, "sides", POINTER), row)
                 for name, x in (("qs", "state q"), ("dqs", "result dq"), ("ddqs", "result dv")):
-                    self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, lane)
-        with f.each(width) as lane, f.if_(f.lane(s.active, lane) > 0.5):
-            to = f.load(call, self.call_fields.index("trusted"), base=POINTER)
-            f.store(f.lane(trusted.value, lane), to, self.to_int(f, f.lane(s.member, lane)))
+                    self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, lane)
+        with self.each_lane(f, s.active) as lane:
+            member = self.to_int(f, f.lane(s.member, lane))
+            f.store(f.lane(trusted.value, lane), self.field(f, "trusted", POINTER), member)
 
     def _step_on(self, f: Function, h: Value):
         """Predict the positions a step ahead, correct them, and compute q' and q'' there."""
         with f.each(self.n) as i:
-            first, second = self._get(f, "result dq", i), self._get(f, "result dv", i)
-            bend = f.fma(h * (1 / 6), self._get(f, "third derivative", i), second * 0.5)
-            ahead = f.fma(f.fma(bend, h, first), h, self._get(f, "state q", i))
+            first, second = self.entry(f, "result dq", i), self.entry(f, "result dv", i)
+            bend = f.fma(h * (1 / 6), self.entry(f, "third derivative", i), second * 0.5)
+            ahead = f.fma(f.fma(bend, h, first), h, self.entry(f, "state q", i))
             for name, x in (("previous dq", first), ("previous ddq", second), ("state q", ahead), ("prediction", ahead)):
-                self._put(f, name, i, x)
+                self.put_entry(f, name, i, x)
         for _ in range(CORRECTIONS):
             self.invoke(f, "newton_q")
             with f.each(self.n) as i:
-                self._put(f, "state q", i, self._get(f, "corrected q", i))
+                self.put_entry(f, "state q", i, self.entry(f, "corrected q", i))
         self.invoke(f, "value_derivatives")
 
     def _side(self, f: Function) -> Value:
@@ -135,15 +127,15 @@ class Marching(Module):
         moves_on = h.is_not(0.0)
         per_h = f.select(moves_on, one / f.select(moves_on, h, one), zero)
         with f.each(self.n) as i:
-            unit, q = self._get(f, "inverse unit", i), self._get(f, "state q", i)
+            unit, q = self.entry(f, "inverse unit", i), self.entry(f, "state q", i)
             largest.value = f.max(f.abs(q) * unit, largest.value)
-            off.value = f.max(f.abs(q - self._get(f, "prediction", i)) * unit, off.value)
-            old, new = self._get(f, "previous dq", i) * unit, self._get(f, "result dq", i) * unit
+            off.value = f.max(f.abs(q - self.entry(f, "prediction", i)) * unit, off.value)
+            old, new = self.entry(f, "previous dq", i) * unit, self.entry(f, "result dq", i) * unit
             product.value = f.fma(old, new, product.value)
             old_square.value = f.fma(old, old, old_square.value)
             new_square.value = f.fma(new, new, new_square.value)
-            change = self._get(f, "result dv", i) - self._get(f, "previous ddq", i)
-            self._put(f, "third derivative", i, change * per_h)
+            change = self.entry(f, "result dv", i) - self.entry(f, "previous ddq", i)
+            self.put_entry(f, "third derivative", i, change * per_h)
         violated, per_unit = largest_violation(self, f), one / (s.omega * s.omega)
         old_length2, new_length2 = old_square.value + per_unit, new_square.value + per_unit
         straight = product.value + per_unit > f.intrinsic("sqrt", old_length2 * new_length2) * STRAIGHT

@@ -17,20 +17,20 @@ def write_begin(module: Module):
     write_enter(module)
     arguments = [(POINTER, "work"), (POINTER, "call"), (INT, "lane"), (INT, "member")]
     f, _ = module.function("begin", arguments)
-    p, width, call, k, member = module.places, module.plan.width, f.given["call"], f.given["lane"], f.given["member"]
+    call, k, member = f.given["call"], f.given["lane"], f.given["member"]
     work = f.given["work"]
 
     def put(name: str, value: Any, i: Any = 0):
-        f.store(value, work, f.like(i, INT, 1) * width + p[name] * width + k)
+        module.put_lane_entry(f, name, k, value, i)
 
     for name in LANE_NUMBERS:
         if name not in SETTINGS and name not in ("stepping", "call", "tangents"):
             put(name, 0.0)
-    given = module.member_address(f, call, "settings", member)
+    given = module.member_address(f, "settings", member)
     settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given, j) for j, name in enumerate(module.settings)}
     for name, value in settings.items():
         put(name, value)
-    q, v = module.member_address(f, call, "q", member), module.member_address(f, call, "v", member)
+    q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
     with f.each(module.n) as i:
         angle = f.arithmetic("sub", i, f.arithmetic("div", i, 3) * 3).is_(2)
         unit = f.select(angle, f.const(1.0), settings["length"])
@@ -42,12 +42,12 @@ def write_begin(module: Module):
             put(f"point{j} v", f.load(v, i), i)
             put(f"point{j} a", 0.0, i)
     if module.m:
-        rows = module.member_address(f, call, "rows", member)
+        rows = module.member_address(f, "rows", member)
         with f.each(module.m) as i:
             put("rows", f.load(rows, i), i)
         module.begin_rows(f, k, settings["length"])
-    ts = module.member_address(f, call, "ts", member)
-    times = f.load(call, module.call_fields.index("times"), base=INT)
+    ts = module.member_address(f, "ts", member)
+    times = module.field(f, "times")
     start, end = f.load(ts), f.load(ts, times - 1)
     first = {"start": start, "end": end, "next": f.load(ts, 1), "rate": np.inf, "crossing": np.inf, "passed": -np.inf}
     for name, value in first.items():
@@ -71,8 +71,7 @@ def write_begin(module: Module):
 def write_finish(module: Module):
     """Write what is left of the members whose lanes are marked in `due`: their first and last states, and how they ended."""
     f, s = module.function("finish_members", [(POINTER, "work"), (POINTER, "call")])
-    p, width, call, work = module.places, module.plan.width, f.given["call"], f.given["work"]
-    times = f.load(call, module.call_fields.index("times"), base=INT)
+    times = module.field(f, "times")
     # Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else.
     stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT)) & (s.code < float(CROSSED))
     with f.if_(f.any_of(stopped)):
@@ -86,13 +85,11 @@ def write_finish(module: Module):
             module.invoke(f, "equation_terms")
             total = f.variable(0.0)
             with f.each(module.code.term_count) as i:
-                x = f.load(work, i * width + p["terms"] * width, width)
-                total.value = f.fma(x, 0.0, total.value)
+                total.value = f.fma(module.entry(f, "terms", i), 0.0, total.value)
             if module.is_formulated:
                 module.accelerate(f, "result a")
                 with f.each(module.n) as i:
-                    a = f.load(work, (i + p["result a"]) * width, width)
-                    total.value = f.fma(a, 0.0, total.value)
+                    total.value = f.fma(module.entry(f, "result a", i), 0.0, total.value)
             s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
     # The last state, once more to the manifold; and then the first, which is taken as it is.
     with f.each(module.rowcount) as r:
@@ -100,20 +97,20 @@ def write_finish(module: Module):
             module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
     setattr(s, "state t", s.point3_t)
     project_output(module, f, s, "due")
-    with f.each(width) as k, f.if_(f.lane(s.due, k) > 0.5):
+    with module.each_lane(f, s.due) as k:
         member = module.to_int(f, f.lane(s.member, k))
         with f.if_(f.lane(s.code, k).is_(float(DONE))):
-            module.write_state(f, s, call, k, times - 1, "state q", "result v")
-        info = f.at(f.load(call, module.call_fields.index("info"), base=POINTER), member * (len(INFO) + 2 * module.n))
+            module.write_state(f, s, k, times - 1, "state q", "result v")
+        info = module.result_address(f, "info", member, len(INFO) + 2 * module.n)
         values = {"t": s.point3_t}
         for j, name in enumerate(INFO):
             f.store(f.lane(values.get(name, getattr(s, name) if name != "t" else s.point3_t), k), info, j)
         module.copy_lane(f, info, len(INFO), "point3 q", k)
         module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
-        q, v = module.member_address(f, call, "q", member), module.member_address(f, call, "v", member)
+        q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
         with f.each(module.n) as i:
-            f.store(f.load(q, i), work, (i + p["state q"]) * width + k)
-            f.store(f.load(v, i), work, (i + p["result v"]) * width + k)
+            for name, x in (("state q", q), ("result v", v)):
+                module.put_lane_entry(f, name, k, f.load(x, i), i)
         if module.plan.sampled:
             enter_first_row(module, f, k, member)
     setattr(s, "state t", s.start)
@@ -121,8 +118,8 @@ def write_finish(module: Module):
         module.put(f, "state v", r, module.vector(f, "result v", r))
     module.invoke(f, "psi")
     s.violated = largest_violation(module, f)
-    with f.each(width) as k, f.if_(f.lane(s.due, k) > 0.5):
-        module.write_state(f, s, call, k, f.const(0, INT), "state q", "result v")
+    with module.each_lane(f, s.due) as k:
+        module.write_state(f, s, k, f.const(0, INT), "state q", "result v")
     module.end_members(f, s)
 
 
@@ -136,16 +133,15 @@ def write_run(module: Module):
     f.given["work"], s = work, Lane(f, module.places)
     with f.each(size) as i:
         f.store(0.0, work, i)
-    f.store(call, work, module.places["call"] * width, base=POINTER)
+    f.store(call, work, module.start("call", "work"), base=POINTER)
     module.begin_memory(f)
     blocks = [block, *module.allocate_memory(f, call)]
     for name in ("length", "omega", "rtol", "atol", "smallest"):  # of lanes that stay empty
         setattr(s, name, f.const(1.0, DOUBLE, width))
     with f.each(-(-module.n // max(module.plan.vector // width, 1)) * max(module.plan.vector // width, 1)) as i:
         for name in ("scale q", "scale v"):
-            f.store(f.const(1.0, DOUBLE, width), work, (i + module.places[name]) * width, width)
-    members = f.load(call, module.call_fields.index("members"), base=INT)
-    following = f.load(call, module.call_fields.index("next"), base=POINTER)
+            module.put_entry(f, name, i, 1.0)
+    members, following = module.field(f, "members"), module.field(f, "next", POINTER)
 
     def fill():
         with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):

@@ -1,10 +1,11 @@
 """Access of a run's code to its memory, its inputs and its outputs."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
-from udkjax.native.ir import INT, POINTER, Function, Operand, Value
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, Plan
 
 
@@ -54,18 +55,18 @@ class Memory:
         return -(-self.n * self.layout(pointer).width // self.plan.vector)
 
     def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
-        """One register of an array of coordinates."""
+        """Return one register of an array of coordinates."""
         return f.load(f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
 
     def put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
         f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
 
     def broadcast(self, f: Function, x: Value) -> Value:
-        """A number of each lane, to go with registers of coordinates."""
+        """Repeat a number of each lane, to go with registers of coordinates."""
         return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
 
     def largest(self, f: Function, values: Callable[[Value], Iterable[Value]]) -> Value:
-        """The largest, in each lane, of `values(r)` of each register; without what is not a number."""
+        """Return the largest, in each lane, of `values(r)` of each register; without what is not a number."""
         worst = f.variable(0.0, width=self.plan.vector)
         with f.each(self.rowcount) as r:
             for x in values(r):
@@ -82,7 +83,7 @@ class Memory:
     def weighted_sum(
         self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
     ) -> Value | None:
-        """sum_j row_j a_j of one register of coordinates; None where all are zero."""
+        """Return sum_j row_j a_j of one register of coordinates; None where all are zero."""
         total = None
         for weight, name in zip(row, names or self.stage_accelerations, strict=False):
             if weight != 0:
@@ -91,7 +92,7 @@ class Memory:
         return total
 
     def copy(self, f: Function, source: str, to: str, mask: Value | None = None):
-        """An array of coordinates, or that of some lanes, in another one, or at the pointer `out`."""
+        """Copy an array of coordinates, or that of some lanes, to another one, or to the pointer `out`."""
         pointer, start = f.given["out" if to == "out" else "work"], 0 if to == "out" else self.start(to, "work")
         with f.each(self.rowcount) as r:
             place, new = r * self.plan.vector + start, self.vector(f, source, r)
@@ -104,45 +105,75 @@ class Memory:
             for name, x in zip(sources, "qva", strict=True):
                 self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
 
-    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
-        """The coordinates of lane k to an address, or the first numbers of another array."""
-        with f.each(self.n if count is None else count) as i:
-            place = i * self.layout(pointer).width + k + self.start(name, pointer)
-            f.store(f.load(f.given[pointer], place), to, i + start)
+    # --- single numbers of arrays, in all lanes or of one
 
-    def lane_number(self, f: Function, name: str, k: Value, i: Operand) -> Value:
-        """The i-th number of an array, of lane k."""
-        return f.load(f.given["work"], f.like(i, INT, 1) * f.width + self.places[name] * f.width + k)
+    def place(self, name: str, i: Operand = 0, pointer: str = "work") -> Operand:
+        """Return the place of the i-th number of an array, in numbers from a pointer: that of the first lane."""
+        return i * self.layout(pointer).width + self.start(name, pointer)
+
+    def entry(self, f: Function, name: str, i: Operand = 0, pointer: str = "work") -> Value:
+        """Return the i-th number of an array, in all lanes."""
+        return f.load(f.given[pointer], self.place(name, i, pointer), self.layout(pointer).width)
+
+    def put_entry(self, f: Function, name: str, i: Operand, x: Operand, pointer: str = "work"):
+        f.store(x, f.given[pointer], self.place(name, i, pointer), self.layout(pointer).width)
+
+    def lane_entry(self, f: Function, name: str, k: Value, i: Operand = 0, pointer: str = "work", base: str = DOUBLE) -> Value:
+        """Return the i-th number of an array, of lane k."""
+        return f.load(f.given[pointer], k + self.place(name, i, pointer), base=base)
+
+    def put_lane_entry(
+        self, f: Function, name: str, k: Value, x: Operand, i: Operand = 0, pointer: str = "work", base: str = DOUBLE
+    ):
+        f.store(x, f.given[pointer], k + self.place(name, i, pointer), base=base)
+
+    @contextmanager
+    def each_lane(self, f: Function, mask: Value) -> Iterator[Value]:
+        """Run the block for every lane in which a condition holds, or a number is one, with the number of the lane."""
+        marks = mask if mask.base == DOUBLE else f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+        with f.each(f.width) as k, f.if_(f.lane(marks, k) > 0.5):
+            yield k
+
+    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
+        """Copy the coordinates of lane k to an address, or the first numbers of another array."""
+        with f.each(self.n if count is None else count) as i:
+            f.store(self.lane_entry(f, name, k, i, pointer), to, i + start)
 
     def to_int(self, f: Function, x: Value) -> Value:
         return f.op(f"fptosi double {x.name} to i64", INT)
 
+    # --- what `run` is called with
+
     def call_record(self, f: Function) -> Value:
         """Return the pointer to the call record of `run`."""
-        return f.load(f.given["work"], self.places["call"] * f.width, base=POINTER)
+        return f.given["call"] if "call" in f.given else f.load(f.given["work"], self.start("call", "work"), base=POINTER)
 
-    def input_number(self, f: Function, call: Value, name: str, member: Value, k: Value) -> Value:
-        """The k-th number of an input of a member (one lane)."""
-        return f.load(self.member_address(f, call, name, member), k)
+    def field(self, f: Function, name: str, base: str = INT) -> Value:
+        """Return a field of the call record: a count, or an address."""
+        return f.load(self.call_record(f), self.call_fields.index(name), base=base)
 
-    def member_address(self, f: Function, call: Value, name: str, member: Value) -> Value:
-        """The address of what an input holds of a member (one lane)."""
+    def input_number(self, f: Function, name: str, member: Value, k: Value) -> Value:
+        """Return the k-th number of an input of a member (one lane)."""
+        return f.load(self.member_address(f, name, member), k)
+
+    def member_address(self, f: Function, name: str, member: Value) -> Value:
+        """Return the address of what an input holds of a member (one lane)."""
         number = member if member.base == INT else self.to_int(f, member)
-        stride = f.load(call, self.call_fields.index(f"{name} stride"), base=INT)
-        pointer = f.load(call, self.call_fields.index(name), base=POINTER)
-        return f.at(pointer, number * stride)
+        return f.at(self.field(f, name, POINTER), number * self.field(f, f"{name} stride"))
 
-    def write_state(self, f: Function, s: Lane, call: Value, k: Value, number: Value, q: str, v: str):
-        """State number `number` of lane k into the outputs."""
-        member = self.to_int(f, f.lane(s.member, k))
-        times = f.load(call, self.call_fields.index("times"), base=INT)
-        row = member * times + number
+    def result_address(self, f: Function, name: str, number: Value, length: Operand) -> Value:
+        """Return the address of row `number` of an output, which has so many numbers in each."""
+        return f.at(self.field(f, name, POINTER), number * length)
+
+    def write_state(self, f: Function, s: Lane, k: Value, number: Value, q: str, v: str):
+        """Write state number `number` of lane k into the outputs."""
+        row = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number
         for name, x in (("qs", q), ("vs", v)):
-            self.copy_lane(f, f.at(f.load(call, self.call_fields.index(name), base=POINTER), row * self.n), 0, x, k)
-        f.store(f.lane(s.violated, k), f.load(call, self.call_fields.index("violation"), base=POINTER), row)
+            self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, k)
+        f.store(f.lane(s.violated, k), self.field(f, "violation", POINTER), row)
 
     def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
-        """So many numbers: what to free, and where they begin, at a register's boundary."""
+        """Reserve so many numbers: return what to free, and where they begin, at a register's boundary."""
         size = count * 8 + 64
         block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
         address = f.op(f"ptrtoint ptr {block.name} to i64", INT)

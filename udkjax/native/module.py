@@ -140,7 +140,7 @@ class Module(Memory):
         return ["accelerations", "newton_q", *of_step, "newton_v_and_psi", "project"]
 
     def program_names(self) -> list[str]:
-        """The names of the scene's programs that the module calls."""
+        """Return the names of the scene's programs that the module calls."""
         names = ["equation_terms", "psi"]
         if self.pieces:
             names.append("pieces")
@@ -259,9 +259,7 @@ class Module(Memory):
         """Store the weights of the rows of a member, whose scales are in its lane."""
         if "weights" in self.places.places:
             with f.each(self.m) as i:
-                place = i * self.plan.width + lane
-                scale = f.load(f.given["work"], place + self.start("rows", "work"))
-                f.store(length / scale, f.given["work"], place + self.start("weights", "work"))
+                self.put_lane_entry(f, "weights", lane, length / self.lane_entry(f, "rows", lane, i), i)
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         """Hook: called with a member that is taken into a lane; does nothing by default."""
@@ -281,7 +279,7 @@ class Module(Memory):
         raise NotImplementedError
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """One step of all lanes, and what becomes of those that are done."""
+        """Take one step in all lanes, and finish those that are done."""
         raise NotImplementedError
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):

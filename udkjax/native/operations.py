@@ -1,50 +1,36 @@
-"""The operations of machine code: a class for each, with its module and the shapes of its outputs.
+"""The operations of machine code: a class for each, with its module and the shapes of its inputs and outputs.
 
 An operation is all that its code depends on but the number of lanes. Inputs and outputs have the members first; an input that
-all members share has only one.
+all members share has only one. Those that integrate are in runs.py.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
 from typing import Any, ClassVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native.backpropagation import Reverse
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.native.closing import Closing
 from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
 from udkjax.native.conditions import Conditions
 from udkjax.native.event_states import EventStates
 from udkjax.native.formulations import FormulationCode
-from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, OUTPUTS, SETTINGS, SHARE, Plan
+from udkjax.native.layout import FORMULATION_SETTINGS, OUTPUTS, SETTINGS, SHARE
 from udkjax.native.marching import Marching
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.record import STORED, record_length
 from udkjax.native.row_marks import RowMarks
 from udkjax.native.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
-from udkjax.native.tableau import Method
-from udkjax.native.tangents import Forward, ForwardTwice
-from udkjax.native.trajectory import Trajectory
-from udkjax.native.watching import Watching
 
 Shape = tuple[int, ...]
-
-
-class Tableau:
-    """A method, to be looked up by its numbers."""
-
-    def __init__(self, method: Method):
-        self.method = method
-        self._key = tuple(np.asarray(x).tobytes() for x in method)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Tableau) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
 
 
 @dataclass(frozen=True)
@@ -80,142 +66,47 @@ class Operation(ABC):
         """
 
     @abstractmethod
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        """Return the shapes of the outputs."""
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        """Return the shapes of the outputs, of one member."""
 
     def shapes(self, inputs: Sequence[Any], times: int) -> list[Shape]:
         """Return the shapes of the outputs, from inputs."""
-        return self.outputs(inputs, max([x.shape[0] for x in inputs]), times)
+        members = max([x.shape[0] for x in inputs])
+        return [(members, *shape) for shape in self.outputs(inputs, times)]
 
-    @property
-    def coordinates(self) -> int:
-        """The number of coordinates n."""
-        return self.code.coordinate_count
+    def pack(
+        self,
+        numbers: Sequence[ArrayLike],
+        ts: ArrayLike,
+        q: ArrayLike,
+        v: ArrayLike,
+        settings: Mapping[str, ArrayLike],
+        rows: ArrayLike,
+        breaks: ArrayLike | tuple[()] = (),
+        xp: ModuleType = jnp,
+        further: Sequence[ArrayLike] = (),
+    ) -> list[Any]:
+        """Pack the inputs of one member.
 
+        Args:
+            numbers: All numbers of the scene, and two thresholds of pivots.
+            ts: Times (s).
+            q: Positions (n,).
+            v: Velocities (n,).
+            settings: Settings by name; those of the operation are taken.
+            rows: The scales of the rows of Psi.
+            breaks: Times (s) where the motion is not smooth, in their order.
+            xp: jax.numpy, without derivatives, or NumPy, where all is known.
+            further: Further inputs.
 
-@dataclass(frozen=True)
-class RunStates(Operation):
-    """Integrate: q, v, the violation of Psi, and how the run ended."""
-
-    method: Tableau
-    projected: bool
-    breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
-    sampled: tuple[int, ...] = ()  # places of the numbers that have samples
-    pseudoinverse: DenseMethod | None = None  # None: elimination
-    formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
-
-    @property
-    def all_settings(self) -> tuple[str, ...]:
-        return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
-
-    def plan(self, width: int, vector: int) -> Plan:
-        """Return what the module's code depends on."""
-        return Plan(
-            code=self.code,
-            method=self.method.method,
-            projected=self.projected,
-            breaks=self.breaks,
-            width=width,
-            vector=vector,
-            written_out=self.code.is_small,
-            sampled=self.sampled,
-            pseudoinverse=self.pseudoinverse,
-            formulation=self.formulation,
-        )
-
-    def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
-        """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
-        return RunTangents(**self._for_derivatives, active=active)
-
-    def with_second_tangents(self, active: tuple[bool, ...]) -> "RunSecondTangents":
-        """Return the operation that finds second derivatives along pairs of directions of what is active."""
-        return RunSecondTangents(**self._for_derivatives, active=active)
-
-    def with_cotangents(self, active: tuple[bool, ...], points: int) -> "RunCotangents":
-        """Return the operation that walks back to the numbers that are active, by a record of so many points."""
-        return RunCotangents(**self._for_derivatives, active=active, points=points)
-
-    def watching(self, conditions: Conditions) -> "RunWatched":
-        """Return the operation that integrates up to the first crossing of conditions."""
-        return RunWatched(**{each.name: getattr(self, each.name) for each in fields(self)}, conditions=conditions)
-
-    @property
-    def _for_derivatives(self) -> dict[str, Any]:
-        """The fields of the same operation with derivatives."""
-        return {each.name: getattr(self, each.name) for each in fields(self)} | {"code": self.code.for_derivatives}
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return Trajectory(self.plan(width, vector))
-
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        n = self.coordinates
-        return [(members, times, n), (members, times, n), (members, times), (members, len(INFO) + 2 * n)]
-
-
-@dataclass(frozen=True)
-class RunWatched(RunStates):
-    """Integrate up to the first crossing of conditions, or to where one cannot be ruled out."""
-
-    conditions: Conditions | None = None
-
-    def module(self, width: int, several: bool, vector: int) -> Module:
-        assert self.conditions is not None
-        return Watching(self.plan(width, vector), self.conditions)
-
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        assert self.conditions is not None
-        return [*super().outputs(inputs, members, times), (members, self.conditions.output_count(self.coordinates))]
-
-
-@dataclass(frozen=True)
-class RunTangents(RunStates):
-    """Integrate, with the changes of the states and of the end along directions."""
-
-    active: tuple[bool, ...] = ()  # of the numbers of the scene: along which there are derivatives
-
-    @property
-    def tangents(self) -> int:
-        return 4 if self.sampled else 3
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return Forward(self.plan(width, vector), self.active, max(width, beside))
-
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        directions, n = inputs[-1].shape[1], self.coordinates
-        changes = [(members, directions, times, 2 * n), (members, directions, 2 * n)]
-        return [*super().outputs(inputs, members, times), *changes]
-
-
-@dataclass(frozen=True)
-class RunSecondTangents(RunTangents):
-    """Integrate, with the second derivatives of the states and of the end along pairs of directions."""
-
-    @property
-    def tangents(self) -> int:
-        return 2 * super().tangents
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return ForwardTwice(self.plan(width, vector), self.active, max(width, beside))
-
-
-@dataclass(frozen=True)
-class RunCotangents(RunStates):
-    """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
-
-    active: tuple[bool, ...] = ()
-    points: int = STORED  # capacity of the record of a run
-    is_reverse: ClassVar[bool] = True
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return Reverse(self.plan(width, vector), self.active)
-
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        n, is_first = self.coordinates, not inputs[-1].shape[0]  # without cotangents
-        bars: list[Shape] = [(members, self.code.number_count), (members, n), (members, n)]
-        if self.sampled:
-            bars.append((members, 0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
-        record = (members, record_length(n, self.points) if is_first else 0)
-        return [*super().outputs(inputs, members, times), *bars, record]
+        Returns:
+            Arrays with the member first.
+        """
+        as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
+        values = [settings[name] for name in self.all_settings]
+        given = (as_vector(numbers), ts, q, v, as_vector(values), rows, breaks, *further)
+        arrays = [xp.asarray(x, float)[None] for x in given]
+        return arrays if xp is np else jax.lax.stop_gradient(arrays)
 
 
 @dataclass(frozen=True)
@@ -229,8 +120,8 @@ class Close(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Closing(self.code, vector)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        return [(members, 2 * self.coordinates), (members, 2 * self.code.row_count), (members, 1)]
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [(2 * self.code.coordinate_count,), (2 * self.code.row_count,), (1,)]
 
 
 @dataclass(frozen=True)
@@ -246,8 +137,8 @@ class CloseTangents(Close):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingForward(self.code, vector, self.active)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        return [*super().outputs(inputs, members, times), (members, inputs[-1].shape[1], 2 * self.coordinates)]
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [*super().outputs(inputs, times), (inputs[-1].shape[1], 2 * self.code.coordinate_count)]
 
 
 @dataclass(frozen=True)
@@ -271,9 +162,9 @@ class CloseCotangents(Close):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingReverse(self.code, vector, self.active)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        n = self.coordinates
-        return [*super().outputs(inputs, members, times), (members, self.code.number_count), (members, n), (members, n)]
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        n = self.code.coordinate_count
+        return [*super().outputs(inputs, times), (self.code.number_count,), (n,), (n,)]
 
 
 @dataclass(frozen=True)
@@ -294,8 +185,8 @@ class StateOperation(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        return [(members, len(self.function.found) * self.coordinates)]
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [(len(self.function.found) * self.code.coordinate_count,)]
 
 
 class Accelerate(StateOperation):
@@ -328,10 +219,10 @@ class EvaluateEvents(StateOperation):
         plan = self.pseudoinverse, self.formulation, width, vector
         return EventStates(self.code, self.conditions, self.impacts, *plan)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
         assert self.conditions is not None
-        directions = len(self.impacts) * self.coordinates
-        return [(members, self.coordinates + len(self.conditions.at_state.outputs) + directions)]
+        directions = len(self.impacts) * self.code.coordinate_count
+        return [(self.code.coordinate_count + len(self.conditions.at_state.outputs) + directions,)]
 
 
 @dataclass(frozen=True)
@@ -343,8 +234,8 @@ class MarkRows(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return RowMarks(self.code, width, vector)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        return [(members, self.code.row_count)]
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [(self.code.row_count,)]
 
 
 @dataclass(frozen=True)
@@ -356,5 +247,5 @@ class March(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Marching(self.code, width, vector)
 
-    def outputs(self, inputs: Sequence[Any], members: int, times: int) -> list[Shape]:
-        return [*[(members, times, self.coordinates)] * 3, (members, times), (members, 1)]
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [*[(times, self.code.coordinate_count)] * 3, (times,), (1,)]

@@ -28,9 +28,7 @@ def write_leave(module: Module):
     def moved() -> Value:
         found = f.variable(f.const(False, BOOL, f.width), BOOL)
         with f.each(module.pieces) as k:
-            one, other = (
-                f.load(f.given["work"], k * f.width + module.start(x, "work"), f.width) for x in ("pieces", "pieces before")
-            )
+            one, other = (module.entry(f, x, k) for x in ("pieces", "pieces before"))
             found.value = found.value | one.is_not(other)
         return found.value
 
@@ -38,12 +36,7 @@ def write_leave(module: Module):
         module.put(f, "corrected q", r, module.vector(f, "state q", r))
     find_pieces(s.point3_t, lambda r: (module.vector(f, "point3 q", r), module.vector(f, "point3 v", r)))
     with f.each(module.pieces) as k:
-        f.store(
-            f.load(f.given["work"], k * f.width + module.start("pieces", "work"), f.width),
-            f.given["work"],
-            k * f.width + module.start("pieces before", "work"),
-            f.width,
-        )
+        module.put_entry(f, "pieces before", k, module.entry(f, "pieces", k))
     find_pieces(s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
     stepping, step = s.again > 0.5, s.t1 - s.point3_t
     leaves = stepping & (s.begin < 0.5) & moved() & f.is_finite(s.error)
@@ -77,7 +70,7 @@ def write_leave(module: Module):
 
 
 def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
-    """q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
+    """Return q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
     x, h = module.broadcast(f, share), module.broadcast(f, step)
 
     def along(*coefficients: float) -> Value:

@@ -9,7 +9,7 @@ BIAS, FRACTION = 1023, 52  # of float64
 
 
 def power(f: Function, x: Value, exponent: float, whole: bool = False) -> Value:
-    """x^exponent of positive x; `whole`: by multiplications."""
+    """Return x^exponent of positive x; `whole`: by multiplications."""
     if whole:
         return _whole(f, x, int(exponent))
     return _exp2(f, _log2(f, x) * exponent)
@@ -56,7 +56,7 @@ def _exp2(f: Function, x: Value) -> Value:
 
 
 def _as_double(f: Function, k: Value) -> Value:
-    """A small whole number, not negative, as a number: by its digits."""
+    """Return a small whole number, not negative, as a number: by its digits."""
     whole, T = llvm_type(INT, k.width), llvm_type(DOUBLE, k.width)
     magic = 2.0**52
     import struct

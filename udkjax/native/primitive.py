@@ -38,7 +38,7 @@ FEW = 2  # members up to which one follows another: eight lanes take as long as 
 
 @lru_cache(maxsize=256)
 def generate(operation: Operation, width: int, beside: int) -> Module:
-    """The module of an operation in so many lanes, with its text; raises `UnsupportedError` where there is no instruction for it.
+    """Write the module of an operation in so many lanes; raise `UnsupportedError` where there is no instruction for it.
 
     `beside`: how many directions of a single member are side by side.
     """
@@ -74,7 +74,7 @@ class LoadedCode:
 
     def __init__(self, operation: Operation, width: int, beside: int):
         self._module, self._in_passes = generate(operation, width, beside), operation.is_reverse
-        self._fields, self._share = self._module.call_fields, operation.share
+        self._field_count, self._share = len(self._module.call_fields), operation.share
         settings = operation.all_settings
         self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
         self._seconds = QUICK_SECONDS_OF_LINE * self._module.written_text.count("\n") if operation.code.is_small else 0.0
@@ -94,7 +94,7 @@ class LoadedCode:
         return load(self._module.written_text, machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-        """Outputs of these shapes, on as many threads as there are cores."""
+        """Return outputs of these shapes, found on as many threads as there are cores."""
         if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and not self._quick.library.is_optimized:
             found = self._call_quickly(inputs, shapes)
             if found is not None:
@@ -122,21 +122,23 @@ class LoadedCode:
     ) -> "PreparedCall":
         """Return a call, which may be repeated with other numbers in its inputs: those given, where they are float64."""
         code = code or self._optimized
-        names, fields = self._module, {}
-        inputs = [np.ascontiguousarray(x, np.float64) for x in inputs]
+        module, inputs = self._module, [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Of the two passes of reverse mode each leaves out what the other finds: zeros, since NaN would alarm jax.debug_nans.
         found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
-        for name, x in zip((*INPUTS, *names.inputs), inputs, strict=True):
-            fields[name] = x.ctypes.data
-            fields[f"{name} stride"] = math.prod(x.shape[1:]) if len(x) > 1 else 0
-        fields |= {name: x.ctypes.data for name, x in zip((*names.results, *names.outputs), found, strict=True)}
-        arrays = dict(zip((*INPUTS, *names.inputs, *names.results, *names.outputs), (*inputs, *found), strict=True))
-        fields |= {f"{name} length": arrays[name].shape[1] for name in names.lengths}
-        members, times = shapes[0][0], inputs[INPUTS.index("ts")].shape[1]
+        members, times, knots = shapes[0][0], *(inputs[INPUTS.index(name)].shape[1] for name in ("ts", "breaks"))
+        names = (*INPUTS, *module.inputs, *module.results, *module.outputs)
+        lengths = [(*inputs, *found)[names.index(name)].shape[1] for name in module.lengths]
         following = ctypes.c_int64(0)
-        fields |= {"members": members, "times": times, "knots": inputs[INPUTS.index("breaks")].shape[1]}
-        fields |= {"directions": inputs[-1].shape[names.directions_in], "next": ctypes.addressof(following)}
-        call = (ctypes.c_int64 * len(self._fields))(*[fields[name] for name in self._fields])
+        record = (  # the fields in the order of `Memory.call_fields`
+            *(members, times, knots, inputs[-1].shape[module.directions_in]),
+            *(x.ctypes.data for x in inputs),
+            *(math.prod(x.shape[1:]) if len(x) > 1 else 0 for x in inputs),
+            *(x.ctypes.data for x in found),
+            *lengths,
+            ctypes.addressof(following),
+        )
+        assert len(record) == self._field_count
+        call = (ctypes.c_int64 * len(record))(*record)
         threads = max(1, min(members // self._share, os.cpu_count() or 1))
         return PreparedCall(code.run, call, following, threads, inputs, found)
 
@@ -200,7 +202,7 @@ def load(text: str, level: int = machine.LEVEL) -> Code:
 
 @lru_cache(maxsize=256)
 def machine_code(operation: Operation, width: int, beside: int) -> LoadedCode:
-    """The machine code of an operation."""
+    """Return the machine code of an operation."""
     return LoadedCode(operation, width, beside)
 
 
@@ -247,7 +249,7 @@ def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
 def _batch(
     inputs: Sequence[Any], axes: Sequence[int | None], operation: Operation, times: int
 ) -> tuple[list[Any], list[int | None]]:
-    """A batch is more members; but one of directions alone, more directions."""
+    """Bind a batch as more members; but one of directions alone as more directions."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
     shared, results = len(inputs) - operation.tangents, operation.results

@@ -32,7 +32,7 @@ Place = tuple[str, int]  # the name of a pointer, and an index from there
 
 
 def consecutive(pointer: str, count: int) -> list[Place]:
-    """So many numbers from a pointer on."""
+    """Return the places of so many numbers from a pointer on."""
     return [(pointer, k) for k in range(count)]
 
 
@@ -46,7 +46,7 @@ def write(
     cold: bool = False,
     lanes: Mapping[str, int] | None = None,
 ) -> Function:
-    """A function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
+    """Return a function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
 
     `lanes` are those of pointers to numbers of another width: results of single numbers alone are computed once for all.
     """
@@ -62,7 +62,7 @@ def write(
 
 
 def from_memory(f: Function, x: Value, dtype: Any) -> Value:
-    """A number from memory as what it is in the graph."""
+    """Return a number from memory as what it is in the graph."""
     if dtype.kind == "b":
         return x.is_not(0.0)
     return f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
@@ -110,7 +110,7 @@ class Writer:
 
 
 def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value], pair: Any) -> Value:
-    """One of JAX's primitives on numbers."""
+    """Apply one of JAX's primitives to numbers."""
     match name:
         case "sin" | "cos":
             return pair(a[0])[name == "cos"]
@@ -172,7 +172,7 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
 
 
 def _expm1(f: Function, x: Value) -> Value:
-    """e^x - 1 (Kahan): exact also where x is small."""
+    """Return e^x - 1 (Kahan): exact also where x is small."""
     u = f.intrinsic("exp", x)
     small, gone = u.is_(1.0), (u - 1.0).is_(-1.0)
     exact = (u - 1.0) * x / f.intrinsic("log", f.select(small | gone | ~f.is_finite(u), 2.0, u))
@@ -180,14 +180,14 @@ def _expm1(f: Function, x: Value) -> Value:
 
 
 def _log1p(f: Function, x: Value) -> Value:
-    """log(1 + x) (Kahan)."""
+    """Return log(1 + x) (Kahan)."""
     u = x + 1.0
     small = u.is_(1.0)
     return f.select(small | ~(u < math.inf), x, f.intrinsic("log", u) * x / f.select(small, 1.0, u - 1.0))
 
 
 def integer_power(a: Value, n: int) -> Value:
-    """a^n by squares."""
+    """Return a^n by squares."""
     f = a.f
     if n < 0:
         return 1.0 / integer_power(a, -n)

@@ -7,7 +7,7 @@ record and walks back at once; a member whose record was too long for its place 
 from collections.abc import Callable
 
 from udkjax.native.differentiated import Differentiated
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.ir import POINTER, Function, Value
 from udkjax.native.layout import Lane, Plan
 
 FIRST = 32  # points that a record has room for while a member runs, before it grows
@@ -35,47 +35,42 @@ class Recorded(Differentiated):
 
     def walks_back(self, f: Function) -> Value:
         """Return whether there are cotangents."""
-        return f.load(self.call_record(f), self.call_fields.index("directions"), base=INT) > 0
+        return self.field(f, "directions") > 0
 
     def _leaves_record(self, f: Function) -> Value:
-        return f.load(self.call_record(f), self.call_fields.index("record length"), base=INT) > 0
+        return self.field(f, "record length") > 0
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        call = self.call_record(f)
-        self._put_lane(f, "given", lane, f.const(0.0))
-        with f.if_(f.load(call, self.call_fields.index("given record length"), base=INT) > 0):
-            given = self.member_address(f, call, "given record", member)
+        self.put_lane_entry(f, "given", lane, 0.0)
+        with f.if_(self.field(f, "given record length") > 0):
+            given = self.member_address(f, "given record", member)
             with f.if_(f.load(given) > 0.0):
                 for k, name in enumerate(("points", "code", "written")):
-                    self._put_lane(f, name, lane, f.load(given, k))
-                self._put_lane(f, "record", lane, f.at(given, TITLE), POINTER)
+                    self.put_lane_entry(f, name, lane, f.load(given, k))
+                self.put_lane_entry(f, "record", lane, f.at(given, TITLE), base=POINTER)
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
-                    self._put_lane(f, name, lane, f.const(x))
-        with f.if_((self._lane(f, "given", lane) < 0.5) & (self.walks_back(f) | self._leaves_record(f))):
+                    self.put_lane_entry(f, name, lane, x)
+        with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.walks_back(f) | self._leaves_record(f))):
             self._new_record(f, lane)
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        with f.if_(self.walks_back(f) | self._leaves_record(f)):
-            for k in self._each_lane(f, accept):
-                self._store_point(f, s, k)
+        with f.if_(self.walks_back(f) | self._leaves_record(f)), self.each_lane(f, accept) as k:
+            self._store_point(f, s, k)
 
     def end_members(self, f: Function, s: Lane):
         with f.if_(self.walks_back(f)):
             s.where(s.due > 0.5, ready=1.0)
-        with f.if_(self._leaves_record(f)):
-            for k in self._each_lane(f, s.due > 0.5):
-                self._leave_record(f, k)
+        with f.if_(self._leaves_record(f)), self.each_lane(f, s.due) as k:
+            self._leave_record(f, k)
 
     def _leave_record(self, f: Function, k: Value):
         """Write the record of lane k, or none where it is too long: no points."""
-        call = self.call_record(f)
-        length = f.load(call, self.call_fields.index("record length"), base=INT)
-        member = self.to_int(f, self._lane(f, "member", k))
-        to = f.at(f.load(call, self.call_fields.index("record"), base=POINTER), member * length)
-        points, record = self._lane(f, "points", k), self._lane(f, "record", k, POINTER)
+        length = self.field(f, "record length")
+        to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
+        points, record = self.lane_entry(f, "points", k), self._record(f, k)
         count = self.to_int(f, points) * self.row
         fits = count + TITLE <= length
-        for j, x in enumerate((f.select(fits, points, 0.0), self._lane(f, "code", k), self._lane(f, "written", k))):
+        for j, x in enumerate((f.select(fits, points, 0.0), self.lane_entry(f, "code", k), self.lane_entry(f, "written", k))):
             f.store(x, to, j)
         with f.if_(fits), f.each(count) as i:
             f.store(f.load(record, i), to, i + TITLE)
@@ -83,8 +78,8 @@ class Recorded(Differentiated):
 
     def free_record(self, f: Function, k: Value):
         """Free what lane k took for its record."""
-        with f.if_(self._lane(f, "given", k) < 0.5):
-            f.line(f"call void @free(ptr {self._lane(f, 'record', k, POINTER).name})")
+        with f.if_(self.lane_entry(f, "given", k) < 0.5):
+            f.line(f"call void @free(ptr {self._record(f, k).name})")
 
     # --- which members are next
 
@@ -96,7 +91,7 @@ class Recorded(Differentiated):
             fill()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """The members in the lanes walk back side by side when all have run, and the next ones follow."""
+        """Walk back with the members in the lanes side by side when all have run; the next ones follow."""
         with f.if_(f.any_of(s.active > 0.5)):
             super().step_all(f, s, fill)
         with f.if_(self.walks_back(f) & ~f.any_of(s.active > 0.5)):
@@ -108,50 +103,42 @@ class Recorded(Differentiated):
     def _new_record(self, f: Function, lane: Value):
         s = Lane(f, self.places)
         record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
-        self._put_lane(f, "record", lane, record, POINTER)
-        self._put_lane(f, "capacity", lane, f.const(float(FIRST)))
-        self._put_lane(f, "points", lane, f.const(0.0))
+        self.put_lane_entry(f, "record", lane, record, base=POINTER)
+        self.put_lane_entry(f, "capacity", lane, float(FIRST))
+        self.put_lane_entry(f, "points", lane, 0.0)
         self._store_point(f, s, lane)
 
-    def _put_lane(self, f: Function, name: str, k: Value, x: Value, base: str = DOUBLE):
-        f.store(x, f.given["work"], k + self.places[name] * f.width, base=base)
-
-    def _lane(self, f: Function, name: str, k: Value, base: str = DOUBLE) -> Value:
-        return f.load(f.given["work"], k + self.places[name] * f.width, base=base)
+    def _record(self, f: Function, k: Value) -> Value:
+        """Return the address of the record of lane k."""
+        return self.lane_entry(f, "record", k, base=POINTER)
 
     def _store_point(self, f: Function, s: Lane, k: Value):
         """Append point 3 to the record of lane k."""
-        points, capacity = self._lane(f, "points", k), self._lane(f, "capacity", k)
+        points, capacity = self.lane_entry(f, "points", k), self.lane_entry(f, "capacity", k)
         with f.if_(points >= capacity):
-            self._put_lane(f, "capacity", k, capacity * 2.0)
+            self.put_lane_entry(f, "capacity", k, capacity * 2.0)
             size = self.to_int(f, capacity * 2.0) * (self.row * 8)
-            old = self._lane(f, "record", k, POINTER)
+            old = self._record(f, k)
             new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
             f.declared.add("declare ptr @realloc(ptr, i64)")
-            self._put_lane(f, "record", k, new, POINTER)
-        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, points) * self.row)
+            self.put_lane_entry(f, "record", k, new, base=POINTER)
+        row = f.at(self._record(f, k), self.to_int(f, points) * self.row)
         for j, name in enumerate(("point3_t", "written", "begin")):
-            f.store(self._lane(f, name, k), row, j)
+            f.store(self.lane_entry(f, name, k), row, j)
         for j, x in enumerate("qva"):
             self.copy_lane(f, row, HEAD + j * self.n, f"point3 {x}", k)
-        self._put_lane(f, "points", k, points + 1.0)
+        self.put_lane_entry(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
-        """A point of lane k from its record; before the first one there is the first."""
-        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, f.max(number, 0.0)) * self.row)
-        self._put_lane(f, f"{point}_t", k, f.load(row, 0))
+        """Load a point of lane k from its record; before the first one there is the first."""
+        row = f.at(self._record(f, k), self.to_int(f, f.max(number, 0.0)) * self.row)
+        self.put_lane_entry(f, f"{point}_t", k, f.load(row, 0))
         for j, x in enumerate("qva"):
             with f.each(self.n) as i:
-                place = i * f.width + k + self.start(f"{point} {x}", "work")
-                f.store(f.load(row, i + (HEAD + j * self.n)), f.given["work"], place)
+                self.put_lane_entry(f, f"{point} {x}", k, f.load(row, i + (HEAD + j * self.n)), i)
 
     def _load_head(self, f: Function, k: Value):
         """Load the head of lane k's point: outputs written `before` its step, and `begin`."""
-        row = f.at(self._lane(f, "record", k, POINTER), self.to_int(f, self._lane(f, "at", k)) * self.row)
-        self._put_lane(f, "before", k, f.load(row, 1))
-        self._put_lane(f, "begin", k, f.load(row, 2))
-
-    def _each_lane(self, f: Function, mask: Value):
-        marked = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
-        with f.each(f.width) as k, f.if_(f.lane(marked, k) > 0.5):
-            yield k
+        row = f.at(self._record(f, k), self.to_int(f, self.lane_entry(f, "at", k)) * self.row)
+        self.put_lane_entry(f, "before", k, f.load(row, 1))
+        self.put_lane_entry(f, "begin", k, f.load(row, 2))

@@ -59,37 +59,31 @@ class RowMarks(Module):
     def _find(self):
         """`find(work, call)`: the members in all lanes."""
         f, s = self.function("find", [(POINTER, "work"), (POINTER, "call")])
-        work, width = f.given["work"], self.plan.width
+        width = self.plan.width
         direction = np.random.default_rng(0).uniform(-1.0, 1.0, self.n)
         self.loops.globals.append(
             f"@direction = private constant [{self.n} x double] [{', '.join(f'double {x!r}' for x in direction.tolist())}]"
         )
 
-        def get(name: str, i: Value) -> Value:
-            return f.load(work, i * width + self.places[name] * width, width)
-
-        def put(name: str, i: Value, x: Value):
-            f.store(x, work, i * width + self.places[name] * width, width)
-
         setattr(s, "state t", s.start)
         with f.each(self.n) as i:
-            put("state q", i, get("point3 q", i))
+            self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
             zero = f.const(0.0, DOUBLE, width)
-            put("state v", i, zero)
-            put("state dv", i, zero)
-            put("state dq", i, get("point3 v", i))
+            self.put_entry(f, "state v", i, zero)
+            self.put_entry(f, "state dv", i, zero)
+            self.put_entry(f, "state dq", i, self.entry(f, "point3 v", i))
         rate = self.largest(f, lambda r: [f.abs(self.vector(f, "state dq", r)) * self.vector(f, "inverse unit", r)])
         moves = f.like(rate > s.omega * FREE, BOOL, width)
         with f.each(self.n) as i:
-            along = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / get("inverse unit", i)
-            put("state dq", i, f.select(moves, get("state dq", i) / s.omega, along))
+            along = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / self.entry(f, "inverse unit", i)
+            self.put_entry(f, "state dq", i, f.select(moves, self.entry(f, "state dq", i) / s.omega, along))
         self.invoke(f, "tangent_part")
         size = self.largest(f, lambda r: [f.abs(self.vector(f, "result dq", r)) * self.vector(f, "inverse unit", r)])
         is_free = size > FREE
         scale = f.select(is_free, STEP / f.select(is_free, size, 1.0), 0.0)
         scale = f.like(scale, DOUBLE, width)
         with f.each(self.n) as i:
-            put("state q", i, f.fma(get("result dq", i), scale, get("state q", i)))
+            self.put_entry(f, "state q", i, f.fma(self.entry(f, "result dq", i), scale, self.entry(f, "state q", i)))
         setattr(s, "state t", s.start + STEP / s.omega)
         everyone = s.active > 0.5
         iterate_newton(self, f, s, everyone, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
@@ -99,14 +93,13 @@ class RowMarks(Module):
         closed = closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
         self.invoke(f, "independent_rows")
         with f.each(self.m) as i:
-            put("independent", i, f.select(closed, get("independent", i), 1.0))
-        marks = f.load(f.given["call"], self.call_fields.index("marks"), base=POINTER)
-        with f.each(width) as k, f.if_(f.lane(s.active, k) > 0.5):
-            member = self.to_int(f, f.lane(s.member, k))
-            self.copy_lane(f, f.at(marks, member * self.m), 0, "independent", k, count=self.m)
+            self.put_entry(f, "independent", i, f.select(closed, self.entry(f, "independent", i), 1.0))
+        with self.each_lane(f, s.active) as k:
+            to = self.result_address(f, "marks", self.to_int(f, f.lane(s.member, k)), self.m)
+            self.copy_lane(f, to, 0, "independent", k, count=self.m)
 
     def _distance(self, f: Function) -> Callable[[Value], list[Value]]:
-        """The distance of each coordinate from the initial position, in its unit."""
+        """Return the distance of each coordinate from the initial position, in its unit."""
 
         def of_register(r: Value) -> list[Value]:
             moved = self.vector(f, "state q", r) - self.vector(f, "point3 q", r)

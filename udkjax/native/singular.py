@@ -12,7 +12,7 @@ def is_clear(module: Module, f: Function, s: Lane, distance: Value) -> Value:
 
 
 def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
-    """The time that is left until a singular configuration: a root of the parabola through three distances."""
+    """Return the time that is left until a singular configuration: a root of the parabola through three distances."""
     t2, t1, t0, d2, d1, d0 = s.point1_t, s.point2_t, s.point3_t, s.distance0, s.distance1, s.distance2
     slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
     curve = (slope - before) / (t0 - t2)

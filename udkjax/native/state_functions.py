@@ -54,8 +54,7 @@ class StateFunction(Trajectory):
         f, s = self.function("evaluate_states", [(POINTER, "work"), (POINTER, "call")])
         with f.each(self.n) as i:
             for x in "qv":
-                state = f.load(f.given["work"], i * f.width + self.start(f"point3 {x}", "work"), f.width)
-                f.store(state, f.given["work"], i * f.width + self.start(f"state {x}", "work"), f.width)
+                self.put_entry(f, f"state {x}", i, self.entry(f, f"point3 {x}", i))
         setattr(s, "state t", s.start)
         self._evaluate(f, s)
         self.write_found(f, s)
@@ -64,11 +63,10 @@ class StateFunction(Trajectory):
 
     def write_found(self, f: Function, s: Lane):
         """Write what was found of the members in all lanes to the output."""
-        to = f.load(f.given["call"], self.call_fields.index("found"), base=POINTER)
-        with f.each(f.width) as k, f.if_(f.lane(s.active, k) > 0.5):
-            member = self.to_int(f, f.lane(s.member, k)) * (self.n * len(self.found))
+        with self.each_lane(f, s.active) as k:
+            to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), self.n * len(self.found))
             for j, name in enumerate(self.found):
-                self.copy_lane(f, f.at(to, member), j * self.n, name, k)
+                self.copy_lane(f, to, j * self.n, name, k)
 
     @abstractmethod
     def _evaluate(self, f: Function, s: Lane):
@@ -125,11 +123,10 @@ class StateTangentPart(StateFunction):
         return ["tangent_part"]
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        call = self.call_record(f)
         for x in self.inputs:
-            given = self.member_address(f, call, x, member)
+            given = self.member_address(f, x, member)
             with f.each(self.n) as i:
-                f.store(f.load(given, i), f.given["work"], i * f.width + self.start(f"state {x}", "work") + lane)
+                self.put_lane_entry(f, f"state {x}", lane, f.load(given, i), i)
 
     def _evaluate(self, f: Function, s: Lane):
         threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)

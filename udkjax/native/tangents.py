@@ -73,8 +73,8 @@ class Forward(Differentiated):
     @contextmanager
     def _each_tangent(self, f: Function, step: int = 1) -> Iterator[Value]:
         """Run the block for every tangent of every group, or for the first of so many."""
-        first = f.load(f.given["work"], self.places["tangents"] * f.width, base=POINTER)
-        with f.each(self._groups(f, self.call_record(f)) * (len(self.ways) // step)) as p:
+        first = f.load(f.given["work"], self.start("tangents", "work"), base=POINTER)
+        with f.each(self._groups(f) * (len(self.ways) // step)) as p:
             f.given["tangent"] = f.at(first, p * (step * self.tangents.size * self.tangents.width))
             yield p
 
@@ -83,18 +83,15 @@ class Forward(Differentiated):
         """Run the block for every direction of a group, of the member in a lane: its number, and its lane in a tangent."""
         with f.each(self.group) as j:
             direction = p * self.group + j
-            with f.if_(direction < self._directions(f, self.call_record(f))):
+            with f.if_(direction < self.field(f, "directions")):
                 yield direction, lane if self.group == 1 else j
 
     def _way(self, f: Function, way: str) -> Value:
         """Return the address of one of the tangents of a group."""
         return f.at(f.given["tangent"], self.ways.index(way) * self.tangents.size * self.tangents.width)
 
-    def _directions(self, f: Function, call: Value) -> Value:
-        return f.load(call, self.call_fields.index("directions"), base=INT)
-
-    def _groups(self, f: Function, call: Value) -> Value:
-        return f.arithmetic("div", self._directions(f, call) + (self.group - 1), self.group)
+    def _groups(self, f: Function) -> Value:
+        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
 
     def _along(self, f: Function, name: str, stored: str, out: Value | None = None):
         tangent = f.given["tangent"]
@@ -185,21 +182,20 @@ class Forward(Differentiated):
         with self._each_group(f) as p:
             self._project_tangent(f)
             f.given["tangent"] = self._way(f, self.ways[-1])
-            with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
+            with self.each_lane(f, s.due) as k:
                 self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "result q", "result v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
-        """The changes of a state of the member in lane k along the directions of group p, of the last tangent of each."""
-        call, member = self.call_record(f), self.to_int(f, f.lane(s.member, k))
-        times = f.load(call, self.call_fields.index("times"), base=INT)
+        """Write the changes of a state of the member in lane k along the directions of group p, of the last tangent of each."""
+        member, times = self.to_int(f, f.lane(s.member, k)), self.field(f, "times")
         with self._each_direction(f, p, k) as (direction, lane):
-            row = (member * self._directions(f, call) + direction) * times + number
-            to = f.at(f.load(call, self.call_fields.index("dys"), base=POINTER), row * (2 * self.n))
+            row = (member * self.field(f, "directions") + direction) * times + number
+            to = self.result_address(f, "dys", row, 2 * self.n)
             self.copy_lane(f, to, 0, q, lane, "tangent")
             self.copy_lane(f, to, self.n, v, lane, "tangent")
 
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
-        """The changes of the constants along all directions."""
+        """Compute the changes of the constants along all directions."""
         if not self.count:
             return
         found = [Value(f, f.reserve(DOUBLE, self.count), POINTER) for _ in self.ways]
@@ -212,20 +208,19 @@ class Forward(Differentiated):
             f.call(PROLOGUE[self.mode], numbers, constants, *given, *found)
             for way, changes in zip(self.ways, found, strict=True):
                 with f.each(self.count) as i:
-                    f.store(f.load(changes, i), self._way(f, way), (i + self.tangents["constants"]) * self.tangents.width + place)
+                    f.store(f.load(changes, i), self._way(f, way), place + self.place("constants", i, "tangent"))
 
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
-        """The address of the changes of a member's numbers along a direction; of samples, those of their row."""
-        call, count = f.given["call"], self.code.number_count
-        given = f.at(self.member_address(f, call, f"{way}numbers", member), direction * count)
+        """Return the address of the changes of a member's numbers along a direction; of samples, those of their row."""
+        count = self.code.number_count
+        given = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
         places = self.active_samples
         if not places:
             return given
         copy = Value(f, f.reserve(DOUBLE, count), POINTER)
         with f.each(count) as i:
             f.store(f.load(given, i), copy, i)
-        rows = f.load(call, self.call_fields.index("knots"), base=INT) + 1
-        row = f.load(f.given["work"], f.given["lane"] + self.places["row"] * f.width)
+        rows, row = self.field(f, "knots") + 1, self.lane_entry(f, "row", f.given["lane"])
         samples = f.at(row_address(self, f, f"{way}samples", member, row), direction * rows * len(self.plan.sampled))
         for k, place in places.items():
             f.store(f.load(samples, k), copy, place)
@@ -238,29 +233,27 @@ class Forward(Differentiated):
                 self._read_state(f, way, member, direction, tangent, place, [f"point{k}" for k in range(POINTS)])
                 with f.each(self.n) as i:
                     for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.last))):
-                        f.store(0.0, tangent, (i + self.tangents[name]) * self.tangents.width + place)
+                        f.store(0.0, tangent, place + self.place(name, i, "tangent"))
 
     def _read_state(
         self, f: Function, way: str, member: Value, direction: Value, tangent: Value, place: Value, to: Sequence[str]
     ):
-        """The change of the first state of a member along a direction, into a lane of arrays of a tangent."""
+        """Read the change of the first state of a member along a direction, into a lane of arrays of a tangent."""
         for x in "qv":
-            start = self.member_address(f, self.call_record(f), f"{way}{x}", member) if way in GIVEN else None
+            start = self.member_address(f, f"{way}{x}", member) if way in GIVEN else None
             with f.each(self.n) as i:
                 change = f.load(start, direction * self.n + i) if start else f.const(0.0)
                 for array in to:
-                    f.store(change, tangent, (i + self.tangents[f"{array} {x}"]) * self.tangents.width + place)
+                    f.store(change, tangent, place + self.place(f"{array} {x}", i, "tangent"))
 
     def end_members(self, f: Function, s: Lane):
-        """The changes of the first state, which is taken as it is given, and of the last."""
-        call, way = self.call_record(f), self.ways[-1]
-        times = f.load(call, self.call_fields.index("times"), base=INT)
-        with self._each_group(f) as p, f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
+        """Write the changes of the first state, which is taken as it is given, and of the last."""
+        way, times = self.ways[-1], self.field(f, "times")
+        with self._each_group(f) as p, self.each_lane(f, s.due) as k:
             f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))
             with self._each_direction(f, p, k) as (direction, lane):
                 self._read_state(f, way, member, direction, f.given["tangent"], lane, ["state"])
-                row = (member * self._directions(f, call) + direction) * (2 * self.n)
-                to = f.at(f.load(call, self.call_fields.index("dend"), base=POINTER), row)
+                to = self.result_address(f, "dend", member * self.field(f, "directions") + direction, 2 * self.n)
                 self.copy_lane(f, to, 0, "point3 q", lane, "tangent")
                 self.copy_lane(f, to, self.n, "point3 v", lane, "tangent")
             self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
@@ -268,11 +261,11 @@ class Forward(Differentiated):
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
         """Memory for all directions."""
-        size = self._groups(f, call) * (len(self.ways) * self.tangents.size * self.tangents.width)
+        size = self._groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
         block, start = self.allocate(f, size)
         with f.each(size) as i:
             f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.places["tangents"] * f.width, base=POINTER)
+        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
         return [block]
 
 

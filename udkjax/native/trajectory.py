@@ -86,7 +86,7 @@ class Trajectory(Module):
         return self.module_text()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """One step of all lanes, and what becomes of those that are done."""
+        """Take one step in all lanes, and finish those that are done."""
         work, call, width = f.given["work"], f.given["call"], self.plan.width
         yes = f.const(1.0, DOUBLE, width)
         due_for_fallback = s.fallback_due > 0.5

@@ -8,7 +8,7 @@ Operand = Union["Value", float, int, bool]
 
 
 def literal(number: Any, base: str) -> str:
-    """A number as LLVM writes it."""
+    """Return a number as LLVM writes it."""
     if base == DOUBLE:
         return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
     return str(int(number)) if base != BOOL else str(bool(number)).lower()
@@ -78,7 +78,7 @@ class Value:
         return self.f.compare("ge", self, other)
 
     def is_(self, other: Operand) -> "Value":
-        """Equality; `==` is Python's own."""
+        """Compare for equality; `==` is Python's own."""
         return self.f.compare("eq", self, other)
 
     def is_not(self, other: Operand) -> "Value":
@@ -100,5 +100,5 @@ class Value:
 
 
 def llvm_type(base: str, width: int) -> str:
-    """The type of so many lanes."""
+    """Return the type of so many lanes."""
     return base if width == 1 else f"<{width} x {base}>"

@@ -1,7 +1,7 @@
 """The memory of runs that watch conditions (watching.py): what goes in and comes out, and how far the intervals go."""
 
 from udkjax.native.conditions import HEAD, MIDDLE, PER_TIME, SECOND, TURN, VARIES, Conditions
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.ir import DOUBLE, Function, Value
 from udkjax.native.layout import Lane, Plan
 from udkjax.native.steps import CROSSED, UNIT, UNSURE
 from udkjax.native.trajectory import Trajectory
@@ -56,54 +56,43 @@ class WatchMemory(Trajectory):
     # --- what goes in and comes out
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        given, start = self.member_address(f, self.call_record(f), "watch", member), 0
+        given, start = self.member_address(f, "watch", member), 0
         counts = {"numbers": self.conditions.number_count}
         counts |= dict.fromkeys(("side", "on", "floor", "direction"), self.conditions.count)
         for name, count in counts.items():
             with f.each(count) as i:
-                self._put_lane(f, f"condition {name}", lane, f.load(given, i + start), i)
+                self.put_lane_entry(f, f"condition {name}", lane, f.load(given, i + start), i)
             start += count
         for name in LANE_NUMBERS:
-            self._put_lane(f, name, lane, f.const(0.0))
-        first = f.load(f.given["work"], lane + self.places["start"] * f.width)
+            self.put_lane_entry(f, name, lane, f.const(0.0))
+        first = self.lane_entry(f, "start", lane)
         for name in ("node", "sure_t", "fresh"):
-            self._put_lane(f, name, lane, first)
-        self._put_lane(f, "event", lane, f.const(-1.0))
-        self._put_lane(f, "share", lane, f.const(1.0))
-        self._put_lane(f, "slowest", lane, f.load(given, start))
+            self.put_lane_entry(f, name, lane, first)
+        self.put_lane_entry(f, "event", lane, f.const(-1.0))
+        self.put_lane_entry(f, "share", lane, f.const(1.0))
+        self.put_lane_entry(f, "slowest", lane, f.load(given, start))
         for x in "qv":
             with f.each(self.n) as i:
-                self._put_lane(
-                    f, f"sure {x}", lane, f.load(f.given["work"], (i + self.places[f"point3 {x}"]) * f.width + lane), i
-                )
-
-    def _put_lane(self, f: Function, name: str, lane: Value, x: Value, i: Value | int = 0):
-        f.store(x, f.given["work"], f.like(i, INT, 1) * f.width + self.places[name] * f.width + lane)
+                self.put_lane_entry(f, f"sure {x}", lane, self.lane_entry(f, f"point3 {x}", lane, i), i)
 
     def end_members(self, f: Function, s: Lane):
-        call = self.call_record(f)
-        with f.each(f.width) as k, f.if_(f.lane(s.due, k) > 0.5):
+        with self.each_lane(f, s.due) as k:
             member = self.to_int(f, f.lane(s.member, k))
-            size = self.conditions.output_count(self.n)
-            to = f.at(f.load(call, self.call_fields.index("crossing"), base=POINTER), member * size)
+            to = self.result_address(f, "crossing", member, self.conditions.output_count(self.n))
             for j, x in enumerate((s.event, s.sure_t, s.worst)):
                 f.store(f.lane(x, k), to, j)
-            self.copy_lane_to(f, f.at(to, HEAD), "condition side", k, self.conditions.count)
+            self.copy_lane(f, to, HEAD, "condition side", k, count=self.conditions.count)
             for j, x in enumerate("qv"):
-                self.copy_lane_to(f, f.at(to, HEAD + self.conditions.count + j * self.n), f"sure {x}", k, self.n)
-
-    def copy_lane_to(self, f: Function, to: Value, name: str, k: Value, count: int):
-        with f.each(count) as i:
-            f.store(self.lane_number(f, name, k, i), to, i)
+                self.copy_lane(f, to, HEAD + self.conditions.count + j * self.n, f"sure {x}", k)
 
     # --- arrays of conditions, and states
 
     def condition(self, f: Function, name: str, c: Value) -> Value:
-        return f.load(f.given["work"], (c + self.places[f"condition {name}"]) * f.width, f.width)
+        return self.entry(f, f"condition {name}", c)
 
     def put_condition(self, f: Function, name: str, c: Value, x: Value, mask: Value | None = None):
         x = x if mask is None else f.select(mask, x, self.condition(f, name, c))
-        f.store(x, f.given["work"], (c + self.places[f"condition {name}"]) * f.width, f.width)
+        self.put_entry(f, f"condition {name}", c, x)
 
     def move_conditions(self, f: Function, mask: Value, **names: str):
         """Copy arrays of conditions to others, in some lanes."""

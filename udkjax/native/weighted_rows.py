@@ -77,7 +77,7 @@ class WeightedRows(RowEntries):
         return DenseMatrices(self._layout, f)
 
     def array(self, f: Function, name: str, i: Operand) -> Value:
-        """One number of an array, in all lanes of the function."""
+        """Return one number of an array, in all lanes of the function."""
         place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         return f.load(f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 

@@ -17,7 +17,7 @@ from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 def default_rank_tol(dtype: np.dtype) -> float:
-    """eps^(1/3): the relative length at or below which the remainder of a row is rounding, where rows are eliminated."""
+    """Return eps^(1/3): the relative length at or below which the remainder of a row is rounding, where rows are eliminated."""
     return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
@@ -67,7 +67,7 @@ class Elimination(Dense):
 def _cholesky(
     gram: Float[Array, "m m"], threshold: Float[Array, "m"]
 ) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
-    """L with L L^T = gram, always by the largest pivot left; which pivots exceed their thresholds; and the order of the rows.
+    """Return L with L L^T = gram, by the largest pivot left; which pivots exceed their thresholds; and the order of the rows.
 
     L[order] is a lower triangle. A pivot that does not count leaves a zero column.
     """

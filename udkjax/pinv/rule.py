@@ -93,11 +93,11 @@ class Pseudoinverse(PrintsLine):
 
     @abstractmethod
     def shape(self, D: Operator) -> tuple[int, int]:
-        """(m, n)."""
+        """Return (m, n)."""
 
     @abstractmethod
     def matvec(self, D: Operator, x: Float[Array, "n"]) -> Float[Array, "m"]:
-        """D x, bilinear in D and x."""
+        """Return D x, bilinear in D and x."""
 
     @abstractmethod
     def rmatvec(self, D: Operator, y: Float[Array, "m"]) -> Float[Array, "n"]:
@@ -113,7 +113,7 @@ class Pseudoinverse(PrintsLine):
 
     @abstractmethod
     def apply_transpose(self, factors: Any, c: Float[Array, "n"]) -> Float[Array, "m"]:
-        """(D^+)^T c."""
+        """Return (D^+)^T c."""
 
     # The functions that all methods share.
 
@@ -126,7 +126,7 @@ class Pseudoinverse(PrintsLine):
         return Plus(method, jax.lax.stop_gradient(method.factor(jax.lax.stop_gradient(D))), D)
 
     def solve(self, D: Operator, b: Float[ArrayLike, "m *k"]) -> LeastSquaresSolution:
-        """Minimum-norm least-squares solution x = D^+ b of D x = b, for one b (m,) or the columns of one (m, k); and rank(D)."""
+        """Solve D x = b by least squares of minimum norm, x = D^+ b, for one b (m,) or columns (m, k), and find rank(D)."""
         plus = self.plus(D)
         return LeastSquaresSolution(plus @ jnp.asarray(b), plus.rank)
 

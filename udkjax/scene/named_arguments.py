@@ -27,6 +27,7 @@ from udkjax.scene.requirements import (
     require_finite,
     require_history,
     require_number,
+    require_single,
     require_times,
 )
 
@@ -38,12 +39,6 @@ def _check_state(name: str, value: Any, given: Given) -> None:
     shapes = np.shape(value.q), np.shape(value.v)
     if shapes[0] != shapes[1]:
         raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
-
-
-def _check_mechanism(name: str, value: Any, given: Given) -> None:
-    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
-        cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
-        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
 
 
 def _check_thresholds(name: str, value: Any, given: Given) -> None:
@@ -147,7 +142,7 @@ CHECKS: dict[str, Check] = {
     ),
     "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
     "optimizer": _of_kind("be an optimizer of optax's, or None", lambda x: isinstance(x, str) or _has("update")(x)),
-    "mechanism": _check_mechanism,
+    "mechanism": require_single,
     "method": _check_thresholds,
     "stabilization": _check_thresholds,
     "t": require_number,

@@ -124,6 +124,13 @@ def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
     return f" ({COORDINATES[coordinate]} of {quote(names[body])})"
 
 
+def require_single(name: str, value: Any, given: Given) -> None:
+    """Require that a mechanism is no batch of them."""
+    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
+        cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
+        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
+
+
 def require_times(name: str, value: Any, given: Given = NOTHING) -> None:
     """Require a vector of finite times; of a traced one, the shape alone."""
     found = array(name, value)

@@ -24,9 +24,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from udkjax.equations.control_flow import sequential
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.printing import PrintsWords
-from udkjax.study.control_flow import sequential
 from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing
 from udkjax.study.curve import AbstractCurve
 

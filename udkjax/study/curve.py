@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.constraints import gamma, psi
+from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.study.drive import Driven
 
 NEWTON_STEPS = 8  # corrections; three are usual

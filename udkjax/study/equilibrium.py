@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.equations.load_scale import LoadScale, load_scale
 from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.integrate.assembly import State, close
@@ -22,7 +23,6 @@ from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.branches import distinct_positions, random_positions
-from udkjax.study.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Driven
 from udkjax.study.linearization import Linearization, linearize, with_unit_mass

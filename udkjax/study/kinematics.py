@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.integrate.assembly import State, assemble
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.march import MarchResult, can_march, march, march_at_once
@@ -24,7 +25,6 @@ from udkjax.scene.fields import Numbers, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.branches import SAME_POSITION
 from udkjax.study.continuation import Points, Reached, follow, no_points
-from udkjax.study.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
 from udkjax.study.drive import Drive, Driven, drive
 from udkjax.study.position_derivatives import with_derivative, with_derivatives

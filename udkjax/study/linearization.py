@@ -20,10 +20,10 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.control_flow import BY_JAX, ControlFlow
 from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.control_flow import BY_JAX, ControlFlow
 
 
 class Linearization(NamedTuple):

@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.control_flow import ControlFlow, solve
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.integrate.assembly import State
 from udkjax.integrate.gradients import stop_gradients
@@ -16,7 +17,6 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.control_flow import ControlFlow, solve
 from udkjax.study.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.study.linearization import linearize, solver_of_mass, with_unit_mass
 

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from udkjax.equations.control_flow import sequential
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.study.continuation import Points
-from udkjax.study.control_flow import sequential
 from udkjax.study.crossing import FARTHEST_NODE, nodes, weights
 from udkjax.study.curve import Curve
 

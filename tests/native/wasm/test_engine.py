@@ -9,7 +9,8 @@ from tests.wasm_host import Host, run_without_contraction
 from udkjax.equations import analyse
 from udkjax.equations.scales import rank_tolerance
 from udkjax.integrate import march, native_closing, native_engine
-from udkjax.native import operations, primitive
+from udkjax.integrate.events import phase_code
+from udkjax.native import operations, primitive, runs
 from udkjax.native.wasm import wasm_module
 
 SCENES = sorted(udk.library.__all__)
@@ -27,7 +28,7 @@ def both(operation, inputs, times):
     return host.run(made.module, inputs, shapes), run_without_contraction(made.module, inputs, shapes)
 
 
-def known_call(monkeypatch, module, do, which=0):
+def known_call(monkeypatch, module, do):
     """The operation and the inputs with which `do()` first calls machine code, by way of a module of the package."""
     seen = []
 
@@ -37,7 +38,7 @@ def known_call(monkeypatch, module, do, which=0):
 
     monkeypatch.setattr(module, "call_known", call)
     do()
-    return seen[which]
+    return seen[0]
 
 
 @every_scene
@@ -62,15 +63,19 @@ def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
     k = int(np.argmax(np.ptp(path, axis=0)))
     middle, coordinate = float(path[:, k].min() + path[:, k].max()) / 2, ("x", "y", "angle")[k]
     event = udk.Event(lambda t, at: getattr(at[body], coordinate) - middle, udk.Stop())
-    found = []
-    operation, inputs, times = known_call(
-        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, ts, events=[event])), which=-1
-    )
-    assert isinstance(operation, operations.RunWatched)
+    seen = []
+
+    def call(*inputs, operation, times):
+        seen.append((operation, inputs, times))
+        return primitive.call_members(*inputs, operation=operation, times=times)
+
+    monkeypatch.setattr(phase_code, "call_members", call)
+    events = udk.simulate(mechanism, ts, events=[event]).events
+    operation, inputs, times = [x for x in seen if isinstance(x[0], runs.RunWatched)][-1]
     wasm, native = both(operation, inputs, times)
     for x, y in zip(wasm, native, strict=True):
         assert_array_equal(x, y)
-    events = found[0].events
+    assert events is not None
     crossing, t = wasm[-1][0], float(events.time[0])
     assert crossing[0] == 0.0 and crossing[1] == pytest.approx(t, rel=1e-7)  # rounding, and what the tolerance makes of it
     assert crossing[4 + k] == pytest.approx(middle, abs=1e-9)  # behind three numbers and one side: q

@@ -17,8 +17,9 @@ from udkjax.integrate.native_engine import run_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.conditions import HEAD, Conditions
 from udkjax.native.layout import INFO, INPUTS
-from udkjax.native.operations import EvaluateEvents, MarkRows, ProjectStates, RunWatched
+from udkjax.native.operations import EvaluateEvents, MarkRows, ProjectStates
 from udkjax.native.primitive import call_members
+from udkjax.native.runs import RunWatched
 
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # of the inputs of a run: times and the initial state
 PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # of a phase, as arrays; then its samples, if there are some

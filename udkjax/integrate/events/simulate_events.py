@@ -27,11 +27,10 @@ from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import violation
-from udkjax.integrate.put import put_arrays
 from udkjax.integrate.solution import Result, Solution
 from udkjax.native.conditions import Conditions
 from udkjax.scene.checks import quote
-from udkjax.scene.fields import is_traced, is_within_jit, number
+from udkjax.scene.fields import is_traced, is_within_jit, number, put_arrays
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 

@@ -168,7 +168,8 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
 
 def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
     """Return the module of runs; its inputs go into the data."""
-    operation, inputs = packed(problem)
+    operation, inputs = problem.compiled.plan.operation, packed(problem)
+    assert operation is not None  # such a page runs machine code
     given = dict(zip(INPUTS, inputs, strict=False))
     data |= {
         "thresholds": given["numbers"][0, -2:].tolist(),

@@ -94,7 +94,7 @@ class MatrixRow:
         d.f.store(x, self.address, d.f.like(r, INT, 1) * d.vector if isinstance(r, Value) else r * d.vector, d.vector)
 
     def entry(self, j: Operand) -> Value:
-        """One entry, in all lanes."""
+        """Return one entry, in all lanes."""
         f = self._d.f
         return f.load(self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
@@ -104,7 +104,7 @@ class MatrixRow:
         f.store(x, self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
     def at(self, places: Value) -> Value:
-        """The entries at places that differ from lane to lane."""
+        """Return the entries at places that differ from lane to lane."""
         f = self._d.f
         if f.width == 1:
             return f.load(self.address, places)
@@ -145,19 +145,19 @@ class DenseMatrices:
     # --- numbers of each lane
 
     def wide(self, x: float) -> Value:
-        """The same number in all lanes."""
+        """Return the same number in all lanes."""
         return self.f.const(x, DOUBLE, self.f.width)
 
     def register(self, x: float) -> Value:
-        """A register of the same number."""
+        """Return a register of the same number."""
         return self.f.const(x, DOUBLE, self.vector)
 
     def spread(self, x: Value) -> Value:
-        """A number of each lane, to go with registers."""
+        """Repeat a number of each lane, to go with registers."""
         return self.module.broadcast(self.f, x)
 
     def number(self, k: Value) -> Value:
-        """A whole number as a number in all lanes."""
+        """Return a whole number as a number in all lanes."""
         return self.f.like(k, DOUBLE, self.f.width)
 
     def whole(self, x: Value) -> Value:
@@ -255,7 +255,7 @@ class DenseMatrices:
         return totals[0] if f.width > 1 else f.total(totals[0])
 
     def dot(self, a: MatrixRow, b: MatrixRow) -> Value:
-        """The scalar product of two rows, of each lane."""
+        """Return the scalar product of two rows, of each lane."""
         return self.sum(a.registers, lambda r, total: self.f.fma(a[r], b[r], total))
 
     def axpy(self, factor: Value, x: MatrixRow, y: MatrixRow):
@@ -268,7 +268,7 @@ class DenseMatrices:
         self.over_registers(min(x.registers, y.registers), add)
 
     def largest(self, row: MatrixRow, count: int) -> Value:
-        """The largest of the first entries of a row."""
+        """Return the largest of the first entries of a row."""
         worst = self.f.variable(0.0)
         with self.f.each(count) as j:
             worst.value = self.f.max(row.entry(j), worst.value)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from udkjax.native.ir import BOOL, Operand
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
-from udkjax.native.pseudoinverses.qr import choose_pivot, start_pivoting, use_column
+from udkjax.native.pseudoinverses.qr import add_to_rows, choose_pivot, combine_rows, start_pivoting, use_column
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class GramSchmidtCode(DenseMethod):
         self._orthogonalize_rows(d)
 
     def _orthogonalize_columns(self, d: DenseMatrices):
-        """D = Q R: rows of `q` are the columns of Q, and D is what remains of it."""
+        """Write D = Q R: rows of `q` are the columns of Q, and D is what remains of it."""
         f, column, above = d.f, d.row("column"), d.row("above")
         threshold = f.variable(d.threshold(self, start_pivoting(d)))
         going, rank = f.variable(d.yes(), BOOL), f.variable(0.0)
@@ -66,19 +66,9 @@ class GramSchmidtCode(DenseMethod):
             row = d.row("r", k)
 
             def take_out(r: Operand):
-                total = f.variable(0.0, width=d.vector)
-                with f.each(d.m) as i:
-                    total.value = f.fma(d.spread(q.entry(i)), d.row("D", i)[r], total.value)
                 is_left = (d.row("unused")[r] > 0.5) & d.row("index")[r].is_not(d.spread(pivot))
-                along = f.select(is_left, total.value, 0.0)
-                row[r] = along
-                square = f.variable(0.0, width=d.vector)
-                with f.each(d.m) as i:
-                    rest = d.row("D", i)
-                    x = f.fma(-d.spread(q.entry(i)), along, rest[r])
-                    rest[r] = x
-                    square.value = f.fma(x, x, square.value)
-                use_column(d, used, r, square.value)
+                row[r] = along = f.select(is_left, combine_rows(d, q, r), 0.0)
+                use_column(d, used, r, add_to_rows(d, q, -along, r))
 
             d.over_registers(row.registers, take_out)
             with f.if_(f.any_of(goes_on)):
@@ -91,7 +81,7 @@ class GramSchmidtCode(DenseMethod):
         d.row("rank").put(0, rank.value)
 
     def _orthogonalize_rows(self, d: DenseMatrices):
-        """R = L Z^T: rows of `r` become the columns of Z."""
+        """Write R = L Z^T: rows of `r` become the columns of Z."""
         f, above = d.f, d.row("above")
         rank = f.variable(d.row("rank").entry(0))
         with f.each(d.steps) as k:

@@ -79,7 +79,7 @@ class HouseholderCode(DenseMethod):
             reflect_row(d, "null", k, is_there, "z", "tau_z")
 
     def _count(self, d: DenseMatrices) -> Value:
-        """The largest number of free columns of any lane."""
+        """Return the largest number of free columns of any lane."""
         found = d.row("free").entry(0)
         return d.whole(found if d.f.width == 1 else d.f.reduce("fmax", found))
 

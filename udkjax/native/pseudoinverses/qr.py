@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from udkjax.native.ir import BOOL, INT, Operand, Value
-from udkjax.native.pseudoinverses.dense import DenseMatrices
+from udkjax.native.pseudoinverses.dense import DenseMatrices, MatrixRow
 
 
 def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
-    """The matrices of `pivoted_qr`: reflectors, their factors, the diagonal of R, pivot columns, and lengths of columns."""
+    """Return the matrices of `pivoted_qr`: reflectors, their factors, the diagonal of R, pivots, and lengths of columns."""
     steps = min(m, n)
     return {
         "v": (steps, m),
@@ -58,6 +58,24 @@ def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
     squares[r] = f.select(left > 0.5, square, -1.0)
 
 
+def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operand = 0) -> Value:
+    """Return the sum of the rows of D from `start` on, each with its weight, of a register of columns."""
+    total = d.f.variable(0.0, width=d.vector)
+    with d.f.each(d.m, start) as i:
+        total.value = d.f.fma(d.spread(weights.entry(i)), d.row("D", i)[r], total.value)
+    return total.value
+
+
+def add_to_rows(d: DenseMatrices, weights: MatrixRow, change: Value, r: Operand, start: Operand = 0) -> Value:
+    """Add a change to the rows of D from `start` on, each times its weight; return the squares of the columns' lengths there."""
+    square = d.f.variable(0.0, width=d.vector)
+    with d.f.each(d.m, start) as i:
+        row = d.row("D", i)
+        row[r] = x = d.f.fma(d.spread(weights.entry(i)), change, row[r])
+        square.value = d.f.fma(x, x, square.value)
+    return square.value
+
+
 def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
     """Write D = Q R, its columns in their places: D becomes R; each step takes the longest column that is left.
 
@@ -86,19 +104,10 @@ def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
         wide_tau = d.spread(tau)
 
         def reflect(r: Operand):
-            total = f.variable(0.0, width=d.vector)
-            with f.each(d.m, k) as i:
-                total.value = f.fma(d.spread(v.entry(i)), d.row("D", i)[r], total.value)
-            change = -(total.value * wide_tau)
+            change = -(combine_rows(d, v, r, k) * wide_tau)
             first = d.row("D", k)
             first[r] = f.fma(d.spread(v.entry(k)), change, first[r])
-            square = f.variable(0.0, width=d.vector)
-            with f.each(d.m, k + 1) as i:
-                row = d.row("D", i)
-                x = f.fma(d.spread(v.entry(i)), change, row[r])
-                row[r] = x
-                square.value = f.fma(x, x, square.value)
-            use_column(d, used, r, square.value)
+            use_column(d, used, r, add_to_rows(d, v, change, r, k + 1))
 
         d.over_registers(d.row("D", 0).registers, reflect)
     d.row("rank").put(0, rank.value)

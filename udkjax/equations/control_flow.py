@@ -95,6 +95,11 @@ BY_JAX = ControlFlow(jnp, jax.lax.while_loop, jax.lax.cond, jax.lax.scan, jax.la
 BY_NUMPY = ControlFlow(np, _while_loop, _cond, _scan, _map, _vmap, _put, _call_compiled)
 
 
+def control_flow(xp: ArrayLibrary) -> ControlFlow:
+    """Return the loops of an array library."""
+    return BY_NUMPY if xp is np else BY_JAX
+
+
 def solve(function: Callable[..., Result], *given: Any) -> Result:
     """Return function(*given, by), where `by` is NumPy's control flow if all is known, else JAX's in one compiled program."""
     if is_traced(given):

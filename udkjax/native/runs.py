@@ -1,0 +1,159 @@
+"""The operations of machine code that integrate: a run, up to an event, and with its derivatives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+
+from udkjax.native.backpropagation import Reverse
+from udkjax.native.conditions import Conditions
+from udkjax.native.formulations import FormulationCode
+from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
+from udkjax.native.module import Module
+from udkjax.native.operations import Operation, Shape
+from udkjax.native.pseudoinverses.dense import DenseMethod
+from udkjax.native.record import STORED, record_length
+from udkjax.native.tableau import Method
+from udkjax.native.tangents import Forward, ForwardTwice
+from udkjax.native.trajectory import Trajectory
+from udkjax.native.watching import Watching
+
+
+class Tableau:
+    """A method, to be looked up by its numbers."""
+
+    def __init__(self, method: Method):
+        self.method = method
+        self._key = tuple(np.asarray(x).tobytes() for x in method)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tableau) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@dataclass(frozen=True)
+class RunStates(Operation):
+    """Integrate: q, v, the violation of Psi, and how the run ended."""
+
+    method: Tableau
+    projected: bool
+    breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
+    sampled: tuple[int, ...] = ()  # places of the numbers that have samples
+    pseudoinverse: DenseMethod | None = None  # None: elimination
+    formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
+
+    @property
+    def all_settings(self) -> tuple[str, ...]:
+        return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
+
+    def plan(self, width: int, vector: int) -> Plan:
+        """Return what the module's code depends on."""
+        return Plan(
+            code=self.code,
+            method=self.method.method,
+            projected=self.projected,
+            breaks=self.breaks,
+            width=width,
+            vector=vector,
+            written_out=self.code.is_small,
+            sampled=self.sampled,
+            pseudoinverse=self.pseudoinverse,
+            formulation=self.formulation,
+        )
+
+    def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
+        """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
+        return RunTangents(**self._for_derivatives, active=active)
+
+    def with_second_tangents(self, active: tuple[bool, ...]) -> "RunSecondTangents":
+        """Return the operation that finds second derivatives along pairs of directions of what is active."""
+        return RunSecondTangents(**self._for_derivatives, active=active)
+
+    def with_cotangents(self, active: tuple[bool, ...], points: int) -> "RunCotangents":
+        """Return the operation that walks back to the numbers that are active, by a record of so many points."""
+        return RunCotangents(**self._for_derivatives, active=active, points=points)
+
+    def watching(self, conditions: Conditions) -> "RunWatched":
+        """Return the operation that integrates up to the first crossing of conditions."""
+        return RunWatched(**{each.name: getattr(self, each.name) for each in fields(self)}, conditions=conditions)
+
+    @property
+    def _for_derivatives(self) -> dict[str, Any]:
+        """The fields of the same operation with derivatives."""
+        return {each.name: getattr(self, each.name) for each in fields(self)} | {"code": self.code.for_derivatives}
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return Trajectory(self.plan(width, vector))
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        n = self.code.coordinate_count
+        return [(times, n), (times, n), (times,), (len(INFO) + 2 * n,)]
+
+
+@dataclass(frozen=True)
+class RunWatched(RunStates):
+    """Integrate up to the first crossing of conditions, or to where one cannot be ruled out."""
+
+    conditions: Conditions | None = None
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        assert self.conditions is not None
+        return Watching(self.plan(width, vector), self.conditions)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        assert self.conditions is not None
+        return [*super().outputs(inputs, times), (self.conditions.output_count(self.code.coordinate_count),)]
+
+
+@dataclass(frozen=True)
+class RunTangents(RunStates):
+    """Integrate, with the changes of the states and of the end along directions."""
+
+    active: tuple[bool, ...] = ()  # of the numbers of the scene: along which there are derivatives
+
+    @property
+    def tangents(self) -> int:
+        return 4 if self.sampled else 3
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return Forward(self.plan(width, vector), self.active, max(width, beside))
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        directions, n = inputs[-1].shape[1], self.code.coordinate_count
+        changes = [(directions, times, 2 * n), (directions, 2 * n)]
+        return [*super().outputs(inputs, times), *changes]
+
+
+@dataclass(frozen=True)
+class RunSecondTangents(RunTangents):
+    """Integrate, with the second derivatives of the states and of the end along pairs of directions."""
+
+    @property
+    def tangents(self) -> int:
+        return 2 * super().tangents
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return ForwardTwice(self.plan(width, vector), self.active, max(width, beside))
+
+
+@dataclass(frozen=True)
+class RunCotangents(RunStates):
+    """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
+
+    active: tuple[bool, ...] = ()
+    points: int = STORED  # capacity of the record of a run
+    is_reverse: ClassVar[bool] = True
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return Reverse(self.plan(width, vector), self.active)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        n, is_first = self.code.coordinate_count, not inputs[-1].shape[0]  # without cotangents
+        bars: list[Shape] = [(self.code.number_count,), (n,), (n,)]
+        if self.sampled:
+            bars.append((0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
+        record = (record_length(n, self.points) if is_first else 0,)
+        return [*super().outputs(inputs, times), *bars, record]
