@@ -1018,7 +1018,12 @@ class Hand {
     const {live, state, held, spring, target} = this, t = state.t + step;
     const pull = {body: held.body, point: held.point, target, ...spring};
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
-    if (!run.done) return live.live.say(`the pull is too much: ${run.words}`, true);
+    if (!run.done) {
+      this.isBlocked = true;
+      return live.live.say(`the pull is too much: ${run.words}`, true);
+    }
+    if (this.isBlocked) live.live.greet();  // what was said is over
+    this.isBlocked = false;
     this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch};
     live.append(this.state, run.violation[1], run.events);
     return null;

@@ -279,6 +279,21 @@ def test_what_a_contact_does_that_is_no_program_yet_is_said(opened):
             assert words in note(page) and "no program of a page yet" in note(page) and page.locator(".note.bad").count() == 1
 
 
+def test_a_hand_that_presses_on_a_stop_waits_there_until_it_draws_back(opened):
+    events = [udk.JointLimit("A", -2.4, 0.5, restitution=0.5)]
+    run = udk.simulate(PENDULUM, TS, events=events, max_events=300)
+    with opened(udk.animate(PENDULUM, run, live=["gravity"], events=events, measures=())) as page:
+        angle = lambda: page.evaluate(f"{LIVE}.runs[0].run.pose({PLAYER}.time)[2]")  # noqa: E731
+        first = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.pose(0)]"))
+        drag(page, on_screen(page, 0, first[:2]), on_screen(page, 0, (0.0, 0.5)), hold=0)
+        until(page, f"{LIVE}.runs[0].engine && document.getElementById('player').shadowRoot.querySelector('.note.bad') !== null")
+        assert "A.upper has come to rest" in note(page) and angle() == pytest.approx(0.5, abs=0.05)
+        page.mouse.move(*on_screen(page, 0, (0.1, -0.5)), steps=4)
+        until(page, f"{LIVE}.runs[0].run.pose({PLAYER}.time)[2] < 0.2")
+        assert page.locator(".note.bad").count() == 0
+        page.mouse.up()
+
+
 def test_a_hand_comes_by_events_and_is_not_stopped(opened, with_events):
     _, animation = with_events
     with opened(animation) as page:
