@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.expressions.deferred import deferred_p
+from udkjax.expressions.deferred import _trace, deferred_p
 from udkjax.native import primitive
 
 ROOT = Path(udk.__file__).parent
@@ -120,3 +120,27 @@ def test_a_first_event_and_its_derivative_take_few_programs(compilations):
 def test_eager_transformations_over_a_geometry_take_few_operations(simulated):
     """Each is some 0.1 ms of every call outside jit; geometry and scales are one operation each, whatever the mechanism."""
     assert len(jax.make_jaxpr(lambda a: simulated(a).q)(1.0).eqns) < 300
+
+
+@pytest.mark.skipif(deferred_p is None, reason="this JAX has another cache")
+def test_an_event_that_is_written_in_the_function_it_serves_is_traced_once():
+    """Its condition is a new function in each call; one that compares with another level is another condition."""
+    mechanism, ts = pendulums(1), np.linspace(0.0, 1.0, 5)
+
+    def crossed(inertia, level):
+        changed = mechanism.with_parameters({"body.b0.inertia": inertia})
+        event = udk.Event(lambda t, frames: frames["b0"].angle - level, udk.Log())
+        events = udk.simulate(changed, ts, events=event, max_events=2).events
+        assert events is not None
+        return events.time[0]
+
+    start = float(udk.assemble(mechanism).q[0, 2])
+    slopes = [float(jax.grad(crossed)(0.1, start - 0.01)) for _ in range(2)]
+    traced = _trace.cache_info().misses
+    slopes.append(float(jax.grad(crossed)(0.1, start - 0.01)))
+    assert _trace.cache_info().misses == traced and len(set(slopes)) == 1
+    other = float(jax.grad(crossed)(0.1, start - 0.02))
+    assert other != slopes[0] and np.isfinite(other)
+    h = 1e-5
+    difference = (crossed(0.1 + h, start - 0.02) - crossed(0.1 - h, start - 0.02)) / (2 * h)
+    assert_allclose(other, difference, rtol=1e-6)

@@ -1,6 +1,8 @@
 """Conditions of events as programs of scalars, for machine code."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
+from functools import lru_cache
+from types import FunctionType
 
 import equinox as eqx
 import jax
@@ -63,6 +65,44 @@ def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
 
 
 _known_conditions = cached_by_identity(_conditions)
+
+
+class _Functions:
+    """The conditions of events that are plain functions, and None for others; equal where what they compute is and stays equal.
+
+    So their programs are the same, their code, and what it refers to: equal numbers and texts, or the very same objects.
+    """
+
+    def __init__(self, events: Sequence[Event], programs: Conditions):
+        self.functions = [e.condition if isinstance(e.condition, FunctionType) else None for e in events]
+        self._key = programs, tuple(f and _reference(f) for f in self.functions)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Functions) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def _reference(function: FunctionType) -> Hashable:
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    given = (*cells, *(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values())
+    is_plain = [isinstance(x, int | float | str) for x in given]
+    return function.__code__, id(function.__globals__), *(x if plain else id(x) for x, plain in zip(given, is_plain, strict=True))
+
+
+@lru_cache(maxsize=64)
+def _first_of_equals(functions: _Functions) -> _Functions:
+    return functions
+
+
+def with_known_functions(events: Sequence[Event], programs: Conditions) -> tuple[Event, ...]:
+    """Return events with functions of earlier ones that have the same programs: code that is compiled for those serves these.
+
+    A function that is written within another is a new one in each call.
+    """
+    first = _first_of_equals(_Functions(events, programs)).functions
+    return tuple(e if f is None else eqx.tree_at(lambda e: e.condition, e, f) for e, f in zip(events, first, strict=True))
 
 
 def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:

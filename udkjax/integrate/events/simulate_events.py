@@ -17,7 +17,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import Closure, State
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
-from udkjax.integrate.events.condition_program import watched_conditions
+from udkjax.integrate.events.condition_program import watched_conditions, with_known_functions
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events
 from udkjax.integrate.events.event_run import EventRun, RunInput
 from udkjax.integrate.events.hybrid import Hybrid
@@ -78,6 +78,8 @@ def simulate_events(
     listed, phases = _prepare(mechanism, events, analysis)
     has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax and jax.default_backend() == "cpu"
     conditions = watched_conditions(listed, phases.mechanisms[0]) if has_code else None
+    if conditions is not None:
+        listed = with_known_functions(listed, conditions)
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
     given = Given(phases, listed, ts, state, closure, choices, max_events, conditions)
     found = _run_at_once(mechanism, given)
