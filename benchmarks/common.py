@@ -120,7 +120,7 @@ def at_equal_error(times: dict[Any, list[float]], errors: dict[Any, float], targ
 
 
 def machine() -> dict[str, Any]:
-    """Describe what the figures belong to."""
+    """Describe the machine that the figures belong to."""
     load = os.getloadavg() if hasattr(os, "getloadavg") else None
     packages = {name: version(name) for name in ("jax", "jaxlib", "equinox", "diffrax", "numpy")}
     return {

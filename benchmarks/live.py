@@ -59,7 +59,7 @@ def busy_seconds(client: Any) -> float:
 
 
 def made(name: str, folder: Path) -> tuple[dict[str, Any], Path, Any]:
-    """Return what making the page of a scene takes, the page, and a run by the engine on this processor."""
+    """Return the size and time of making the page of a scene, the page, and a run by the engine on this processor."""
     mechanism, seen = getattr(udk.library, name)(), []
     run = native_engine.call_known
 

@@ -75,7 +75,7 @@ def by_pylinkage(values: np.ndarray) -> float | None:
 
 
 def timed(run: Callable[[], Any], least: float = 0.05) -> Callable[[], float]:
-    """Return what measures how long a call takes (CPU s) once it is compiled; JAX is waited for."""
+    """Return a function that measures a call once it is compiled (CPU s); JAX is waited for."""
     jax.block_until_ready(run())
     return lambda: cpu_seconds(lambda: jax.block_until_ready(run()), least)
 

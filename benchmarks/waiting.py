@@ -47,7 +47,7 @@ QUICK = (IMPORT, "travel")  # by themselves where nothing is measured
 
 
 def waits(name: str, code: str, bytecode: Path) -> dict[str, Any]:
-    """Return how long a process takes, wall and CPU (s), with nothing cached and again: medians."""
+    """Return the wall and CPU times of a process (s), with nothing cached and again: medians."""
     runs: dict[str, list[dict[str, float]]] = {"cold": [], "again": []}
     for _ in range(TIMES):
         with tempfile.TemporaryDirectory() as cache:
@@ -61,7 +61,7 @@ def waits(name: str, code: str, bytecode: Path) -> dict[str, Any]:
 
 
 def call_times(smoke: bool) -> list[dict[str, Any]]:
-    """Return how long calls with known numbers take, warm (ms of CPU): medians."""
+    """Return the times of calls with known numbers, warm (ms of CPU): medians."""
     import udkjax as udk
 
     mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, 5.0, 101)

@@ -14,7 +14,8 @@ from udkjax import equations, expressions, pinv, scene
 
 FLOORS = scene, pinv, expressions, equations
 NO_SUBJECT = re.compile("(What|Whatever|Whether|Which|Who|Whose|How|Where|When|As|Those|That)\\b")
-CLAUSE = re.compile("(what|whatever|which|who|whose|how|that|those)\\b", re.IGNORECASE)  # that begins no description, nor comment
+OBJECT = re.compile("(?:Return|Iterate over) (what|whatever|who|how many|how far|how much|how often|where)\\b")  # likewise
+CLAUSE = re.compile("(what|whatever|which|who|whose|how|that|those)\\b", re.IGNORECASE)  # begins no description, and no comment
 FUNCTIONS = {
     f"{floor.__name__}.{name}": found
     for floor in FLOORS
@@ -59,7 +60,7 @@ def without_subject(text: str) -> list[str]:
     """The first lines of docstrings that begin with a word that no sentence with a subject begins with."""
     kinds = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
     docs = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
-    return [doc.splitlines()[0] for doc in docs if NO_SUBJECT.match(doc)]
+    return [doc.splitlines()[0] for doc in docs if NO_SUBJECT.match(doc) or OBJECT.match(doc)]
 
 
 def clauses(text: str) -> list[str]:
@@ -81,7 +82,8 @@ def test_docstrings_are_sentences_with_a_subject():
 
 def test_a_docstring_without_a_subject_is_noticed():
     text = 'class One:\n    """Thosely."""\n    def f(self):\n        """As `g`."""\ndef g():\n    """Whether it is."""'
-    assert without_subject(text) == ["Whether it is.", "As `g`."]
+    text += '\ndef h():\n    """Return what it is."""\ndef i():\n    """Return it, whatever it is."""'
+    assert without_subject(text) == ["Whether it is.", "Return what it is.", "As `g`."]
 
 
 def test_a_clause_in_place_of_a_noun_is_noticed():

@@ -50,7 +50,7 @@ def require(*packages: str) -> None:
 
 
 def cure(error: ModuleNotFoundError) -> str:
-    """Say how to install what is missing; an empty text where no extra brings it."""
+    """Return the command that installs a missing package; an empty text where no extra brings it."""
     missing = (error.name or "").partition(".")[0]
     if missing not in EXTRAS:
         return ""

@@ -197,11 +197,11 @@ class PrintsTable(eqx.Module):
     _units: ClassVar[Mapping[str, str]] = units()  # of its fields
 
     def _table(self) -> PrintedTable:
-        """Return what is printed. By default a row for each field."""
+        """Return the table to print. By default a row for each field."""
         return fields_table(self, self._units)
 
     def _shapes(self) -> PrintedTable:
-        """Return what is printed where numbers cannot be read, as while they are traced."""
+        """Return the table to print if numbers cannot be read, as while they are traced."""
         return fields_table(self, self._units)
 
     def __repr__(self) -> str:

@@ -32,7 +32,7 @@ def missing() -> list[str]:
 
 
 def rows(module: str, smoke: bool = False) -> Iterator[dict]:
-    """Run what a module measures, here and now: {name, version, batch, start, end, knob, error, seconds}.
+    """Run the measurements of a module, here and now: {name, version, batch, start, end, knob, error, seconds}.
 
     `start` is in degrees, `error` the largest of any coordinate at outputs 0.05 s apart (m, rad), `seconds` the CPU time of one
     trajectory until `end` (s). In place of it, a batch has its `trajectories_per_second` of CPU time.

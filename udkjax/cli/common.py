@@ -86,7 +86,7 @@ def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":
 
 
 def show(results: Mapping[str, object], text: str, json: bool) -> None:
-    """Write what a command found to stdout: as text, or as one JSON object, and the text then to stderr.
+    """Write the results of a command to stdout: as text, or as one JSON object, and the text then to stderr.
 
     Args:
         results: results by names that scripts can rely on; arrays become lists, numbers that are not finite become null.

@@ -18,13 +18,13 @@ def say(text: str) -> None:
 
 
 def refuse(problem: object) -> NoReturn:
-    """Say what is wrong with the input, and exit."""
+    """Name the mistake in the input, and exit."""
     say(str(problem))
     sys.exit(BAD_INPUT)
 
 
 def fail(problem: object) -> NoReturn:
-    """Say why a run failed, and exit."""
+    """Name the cause of a failed run, and exit."""
     say(str(problem))
     sys.exit(BAD_RUN)
 

@@ -159,7 +159,7 @@ def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
 def efforts(
     mechanism: Mechanism, solution: StateHistory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
 ) -> dict[str, Float[Array, "T"]]:
-    """Return what each driver exerts along its coordinate on its second body: -lambda of its row.
+    """Return the effort of each driver along its coordinate on its second body: -lambda of its row.
 
     Args:
         mechanism: The scene.

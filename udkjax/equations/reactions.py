@@ -91,7 +91,7 @@ def unique_reactions(
     about: About = "centre",
     rank_tol: Scalar = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
-    """Decide which components of `reactions` equilibrium alone determines: those with c^T N = 0.
+    """Decide the components of `reactions` that equilibrium alone determines: those with c^T N = 0.
 
     A component is c^T lambda, and N the null space of Psi_q^T: a unique component does not depend on how redundant forces are
     shared.

@@ -98,7 +98,7 @@ class WrittenOut:
         return WrittenOutDerivative(evaluation, self._program(outputs, at | self._seeds))
 
     def evaluations(self, names: Sequence[str]) -> WrittenOutProgram:
-        """Return what the derivatives of several differentiable programs need of one state, as "stored" and a program's name."""
+        """Return the numbers that derivatives of several programs need of one state, as "stored" and a program's name."""
         found: dict[Place, Scalar] = {}
         for name in names:
             evaluation = self.derivative(name).evaluation

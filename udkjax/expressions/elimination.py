@@ -95,7 +95,7 @@ class SymbolicFactors:
         return y
 
     def _sparsest_constant(self) -> tuple[int, int] | None:
-        """Return where the known entry is that fills in least."""
+        """Return the place of the known entry that fills in least."""
         used = {r for r, _ in self._pivots}
         counts: dict[int, int] = {}
         left = [(r, row) for r, row in enumerate(self._rows) if r not in used]

@@ -230,12 +230,12 @@ def _evaluate(node: Node, values: list[Value]) -> Value:
 
 
 def _function_of_floats(node: Node) -> Callable:
-    """Return what computes a node of Python's floats: chosen once, since many programs run thousands of times."""
+    """Return the function that computes a node of Python's floats: chosen once, since many programs run thousands of times."""
     return _plain_function(node, math, _NUMBER_FUNCTIONS) or (lambda *values: _evaluate(node, list(values)))
 
 
 def _function_of_arrays(node: Node) -> Callable:
-    """Return what computes a node of NumPy's arrays, or of floats, as constants are."""
+    """Return the function that computes a node of NumPy's arrays, or of floats, as constants are."""
     if node.kind == "constant":
         return lambda: np.float64(node.detail) if isinstance(node.detail, float) else node.detail
     return _plain_function(node, np, _ARRAY_FUNCTIONS) or (lambda *values: _evaluate_by_jax(node, values))

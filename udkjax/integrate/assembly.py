@@ -229,7 +229,7 @@ def check(mechanism: Mechanism) -> Check:
 
 
 def check_lines(found: Check) -> dict[str, str]:
-    """Return what `check` found as texts by title."""
+    """Return the findings of `check` as texts by title."""
     lines = {
         "bodies": f"{found.bodies}",
         "coordinates": f"{found.coordinates}",

@@ -131,7 +131,7 @@ def _reason_for_diffrax(
     adjoint: "diffrax.AbstractAdjoint | None",
     meter: "diffrax.AbstractProgressMeter | None",
 ) -> str:
-    """Return why machine code cannot integrate equations, whatever the scene is; empty where it can."""
+    """Return the reason why machine code cannot integrate equations, whatever the scene is; empty where it can."""
     if adjoint is not None:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
@@ -142,7 +142,7 @@ def _reason_for_diffrax(
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
-    """Return why machine code cannot evaluate equations, whatever the scene is; empty where it can."""
+    """Return the reason why machine code cannot evaluate equations, whatever the scene is; empty where it can."""
     formulation = None
     if isinstance(equations, FormulatedSystem):
         equations, formulation = equations.equations, equations.formulation

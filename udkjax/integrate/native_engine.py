@@ -70,7 +70,7 @@ def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
 
 
 def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Tell which numbers are active."""
+    """Return a mask of the active numbers."""
     return problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
 
 

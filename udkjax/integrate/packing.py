@@ -16,7 +16,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:
-    """Tell which numbers of a tree, and of two thresholds behind them, are marked as active, that is have derivatives."""
+    """Return a mask of the numbers of a tree, and of two thresholds behind them, that are active: they have derivatives."""
     leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active)), strict=True)
     return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
@@ -70,7 +70,7 @@ class SampleRows:
         return mechanism.with_samples(found)
 
     def places(self, mechanism: Mechanism) -> tuple[int, ...]:
-        """Return where the numbers of a row are among all numbers of the mechanism that programs are made of."""
+        """Return the places of a row's numbers among all numbers of the mechanism that programs are made of."""
         if not self.samples:
             return ()
         blank = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), self.stand_in(mechanism))

@@ -169,7 +169,7 @@ class PathTracker:
 
 
 def _ends(p: _Points) -> np.ndarray:
-    """Return what became of paths that do not go on, by the power with which their fastest unknown changes."""
+    """Return the ends of paths that do not go on, by the power with which their fastest unknown changes."""
     left = 1.0 - p.t
     with np.errstate(invalid="ignore", divide="ignore"):
         power = np.max(np.abs(p.rate) / np.abs(p.z), axis=0) * left

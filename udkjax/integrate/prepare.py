@@ -70,7 +70,7 @@ class Choices(NamedTuple):
         return self._replace(rtol=number(self.rtol), atol=number(self.atol), drift_tol=number(self.drift_tol), dt0=dt0)
 
     def settings(self, why_not_native: str) -> tuple[tuple[str, str], ...]:
-        """Return what was chosen, in words, by name."""
+        """Return the choices of a run, in words, by name."""
         return (
             ("method", type(self.method).__name__),
             ("formulation", "UdwadiaKalaba" if self.formulation is None else type(self.formulation).__name__),

@@ -212,7 +212,7 @@ class Solution(PrintsTable):
 
 
 def format_work(stats: Mapping[str, ArrayLike]) -> str:
-    """Return what a run took as text; a count of -1 is not known."""
+    """Return the work of a run as text; a count of -1 is not known."""
     words = {name: name.replace("_", " ") for name in stats} | {"right_hand_sides": "right-hand sides"}
     counts = {name: int(np.asarray(count)) for name, count in stats.items() if name != "accepted"}
     return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_ORDER.find) if counts[name] >= 0)

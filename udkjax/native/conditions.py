@@ -66,5 +66,5 @@ class Conditions:
         return self.own_count + len(self.rows)
 
     def output_count(self, n: int) -> int:
-        """Return how many numbers a run of n coordinates tells of its end."""
+        """Return the count of numbers that a run of n coordinates returns about its end."""
         return HEAD + self.count + 2 * n

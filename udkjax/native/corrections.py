@@ -106,7 +106,7 @@ class LeastNormCorrection:
             f.store(y.entry(i), f.given["stored"], i + self.place("y"))
 
     def prepare_derivative(self, f: Function):
-        """Compute what derivatives need besides, behind an evaluation."""
+        """Compute the further numbers that derivatives need, behind an evaluation."""
         f.call(f"adjoint_{self._name}", f.given["work"], self._module.address(f, "correction"))
 
     def forward(self):

@@ -251,7 +251,7 @@ class Module(Memory):
             self.places.add("weights", self.m)
 
     def begin_memory(self, f: Function):
-        """Store what no member changes, once a run, with all memory zero."""
+        """Store numbers that no member changes, once a run, with all memory zero."""
         for begin in self.begins:
             begin(f)
 

@@ -51,7 +51,7 @@ def generate(operation: Operation, width: int, beside: int) -> Module:
 
 @lru_cache(maxsize=256)
 def unsupported(code: ScenePrograms) -> str:
-    """Return what a scene takes that machine code has no instruction for; empty where there is nothing.
+    """Return the operations of a scene that machine code has no instruction for; empty where there are none.
 
     The kernels of its elements are written once each, as loops take them: which operation needs them, in which form, may come to
     be something else than what is compiled, and is much longer.

@@ -51,7 +51,7 @@ class ProgramDerivative:
             module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
 
     def place(self, name: str) -> int:
-        """Return where an array begins in what loops store."""
+        """Return the place of an array among those that loops store."""
         return self._stored[name]
 
     @property

@@ -77,7 +77,7 @@ class Recorded(Differentiated):
         f.line(f"call void @free(ptr {record.name})")
 
     def free_record(self, f: Function, k: Value):
-        """Free what lane k took for its record."""
+        """Free the memory of lane k's record."""
         with f.if_(self.lane_entry(f, "given", k) < 0.5):
             f.line(f"call void @free(ptr {self._record(f, k).name})")
 

@@ -48,7 +48,7 @@ class RowEntries:
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
 
     def row_of_psi(self, f: Function, row: Value) -> Value:
-        """Return which row of Psi a chosen one is."""
+        """Return the row of Psi of a chosen one."""
         return row if len(self._chosen) == self._module.m else f.load(Value(f, _CHOSEN, POINTER), row, base=INT)
 
 

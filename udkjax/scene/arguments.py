@@ -59,7 +59,7 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 
 
 def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str, Any]], tuple[Given, Given]]:
-    """Return what names the arguments of a call: those that are given, and all with their defaults."""
+    """Return a function that names the arguments of a call: those that are given, and all with their defaults."""
     parameters = signature(function)
     defaults = {name: p.default for name, p in parameters.parameters.items() if p.default is not p.empty}
     kinds = {p.kind for p in parameters.parameters.values()}
@@ -82,7 +82,7 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
 
 
 def argument_problems(function: Callable[..., object], given: Given) -> list[str]:
-    """Return what is wrong with some of the arguments that a function is to be called with, the mechanism among them."""
+    """Return the mistakes in some of the arguments for a function, the mechanism among them."""
     problems: list[str] = []
     for name, check, if_none in _checks_of(function):
         try:
@@ -149,7 +149,7 @@ def _meant(cls: type) -> str:
 
 
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
-    """Return how to mend what is one step from right: a class in place of its instance, or its name as a text."""
+    """Return the cure of an argument that is one step from right: a class in place of its instance, or its name as a text."""
     called = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
     found = {x.__name__.lower(): x.__name__ for x in _family(classes)}.get(called.strip("() ").lower())
     return f"; give an instance: {name}=udk.{found}()" if found and found not in ("Mechanism", "State", "Analysis") else ""

@@ -106,7 +106,7 @@ class Frame(NamedTuple):
         return Point(self.cos * local[0] - self.sin * local[1], self.sin * local[0] + self.cos * local[1])
 
     def point(self, local: Vector) -> Point:
-        """Return where a point of the body's own frame is, in ground coordinates (m)."""
+        """Return a point of the body's own frame in ground coordinates (m)."""
         arm = self.vector(local)
         return Point(self.x + arm.x, self.y + arm.y)
 

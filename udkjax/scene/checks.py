@@ -109,7 +109,7 @@ def traced_numbers_hold(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
 
 
 def gravity_mistakes(gravity: object) -> list[str]:
-    """Return what is wrong with the acceleration of gravity."""
+    """Return the mistakes of the acceleration of gravity."""
     return list(_check_number("gravity", ["2"], gravity, {}, {}))
 
 

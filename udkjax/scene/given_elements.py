@@ -97,7 +97,7 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
 
 
 def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
-    """Return what is wrong with the numbers that constraints took from the initial guess; those that are traced pass."""
+    """Return the mistakes of numbers that constraints took from the initial guess; those that are traced pass."""
     found = []
     for section, elements in after.items():
         for k, ((name, completed), (_, given)) in enumerate(zip(elements, before[section], strict=True)):

@@ -90,7 +90,7 @@ Sampled = Held | Spline
 
 
 def sampled_fields(elements: Sequence[eqx.Module]) -> list[tuple[int, str]]:
-    """Return where elements have samples, by index and field: where a field holds a `Held`, or a spline that is only called."""
+    """Return the places of samples in elements, index and field: a field holds a `Held`, or a spline that is only called."""
     return [
         (k, name)
         for k, e in enumerate(elements)
@@ -105,7 +105,7 @@ def _called_fields(cls: type) -> frozenset[str]:
 
 
 def row_size(x: Sampled) -> int:
-    """Return how many numbers a row has."""
+    """Return the number of entries of a row."""
     return 5 if isinstance(x, Spline) else int(np.prod(x.values.shape[1:]))
 
 
@@ -117,7 +117,7 @@ def rows_of(x: Sampled, xp: ModuleType) -> Any:
 
 
 def with_row(x: Sampled, row: Any) -> Any:
-    """Return what stands for one interval, of a row of numbers; or of what stands for one: a mark, or None."""
+    """Return the samples of one interval, of a row of numbers; or of a mark, or None, in place of a row."""
     if isinstance(x, Spline):
         return make_module(SplinePiece, row=row)
     return make_module(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)

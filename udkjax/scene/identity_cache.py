@@ -56,7 +56,7 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:
-    """Return what tells when an object ends, and with it the right to its identity; or what keeps it."""
+    """Return a weak reference, which tells when an object ends, and with it the right to its identity; or the object itself."""
     try:
         return weakref.ref(x, forget)
     except TypeError:

@@ -30,7 +30,7 @@ class ArgumentTypeError(ArgumentError, TypeError):
 
 
 def describe(value: Any) -> str:
-    """Return what a value is, for the end of a message: 'not the class SVD', 'not "SVD", a text'."""
+    """Describe a value for the end of a message: 'not the class SVD', 'not "SVD", a text'."""
     if isclass(value):
         return f"not the class {value.__name__}"
     if isinstance(value, str):

@@ -95,7 +95,7 @@ def _evaluate(x: Number, pieces: Float[Array, "pieces 5"]) -> Array:
 
 
 def _tridiagonal_by_numpy(diagonal: np.ndarray, beside: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Do what `_tridiagonal` does, of one column, by numbers of Python: nothing is compiled for each length."""
+    """Solve as `_tridiagonal`, for one column, by numbers of Python: nothing is compiled for each length."""
     pivots, found, links = diagonal.tolist(), right[:, 0].tolist(), beside.tolist()
     for k, link in enumerate(links):
         factor = link / pivots[k]

@@ -18,12 +18,12 @@ ANGLES = ("angle", "axis", "phase")  # fields in radians
 
 
 def suspicions(mechanism: Mechanism) -> list[str]:
-    """Return what in a scene of known numbers is likely a mistake, each with the name of its element and a cure."""
+    """Return the likely mistakes of a scene of known numbers, each with the name of its element and a cure."""
     return [*_far_points(mechanism), *_degrees(mechanism), *_loose_bodies(mechanism)]
 
 
 def body_sizes(mechanism: Mechanism) -> dict[str, float]:
-    """Return how far each body reaches from its centre of mass (m): to its farthest point, or twice its radius of gyration."""
+    """Return the size of each body (m): the distance of its farthest point from its centre, or twice its radius of gyration."""
     mechanism = jax.tree.map(np.asarray, mechanism)  # by NumPy: JAX would trace known numbers while something else is traced
     return {
         name: max(2 * _gyration(body), *(_length(p) for _, p in attachments(mechanism, name)), 0.0)

@@ -45,7 +45,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
 
 
 def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
-    """Return which engine a small simulation runs on here, "native", "diffrax" or "none", and why."""
+    """Return the engine of a small simulation here, "native", "diffrax" or "none", and the reason."""
     try:
         solution = run(double_pendulum(), np.array([0.0, 0.1]))
     except Exception as error:
@@ -55,7 +55,7 @@ def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
 
 
 def summary(found: dict[str, Any]) -> str:
-    """Describe what `facts` found."""
+    """Describe the findings of `facts`."""
     cached = f"{found['cached_programs']} in {found['cache']}, {found['cached_bytes'] / 2**20:.1f} MiB"
     if found["cache"] is None:
         cached = "nothing, as UDKJAX_CACHE=0 says"

@@ -53,7 +53,7 @@ def series(data: "xarray.Dataset") -> list[Series]:
 
 
 def fit(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> Figure:
-    """Draw what was measured as points, and what the mechanism shows as lines."""
+    """Draw measurements as points, and predictions as lines."""
     every, records = series(data), data.sizes["record"]
     columns, panels = _panels(data, every, most_panels)
     rows = 1 + max(panels) // columns
@@ -75,7 +75,7 @@ def fit(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> Figure:
 
 
 def draw_series(axes: Axes, one: Series) -> None:
-    """Draw what was measured as points, and what the mechanism shows as a line."""
+    """Draw measurements as points, and the prediction as a line."""
     axes.plot(one.time, one.measured, "o", ms=4, mew=0, alpha=0.5, color=COLOURS[5], label="measured")
     axes.plot(one.time, one.predicted, color=COLOURS[0], lw=1.1, label="predicted")
     axes.margins(x=0.01)
@@ -92,7 +92,7 @@ def _panels(data: "xarray.Dataset", every: list[Series], most_panels: int) -> tu
 
 
 def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Figure:
-    """Draw what is left of each channel: over time, its distribution beside that of the noise, and its correlation in time."""
+    """Draw the residuals of each channel: over time, its distribution beside that of the noise, and its correlation in time."""
     every = series(data)
     channels = _least_white(data, most_channels)
     shown = channels[:most_channels]

@@ -25,7 +25,7 @@ ZERO_DRAWN = 1e-18  # zero is drawn as this on a logarithmic axis
 
 
 def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
-    """Draw what `Estimate.to_xarray` returns, with profile likelihoods or without."""
+    """Draw a result of `Estimate.to_xarray`, with profile likelihoods or without."""
     found = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
     found |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
     return found | ({"profiles": profiles(data)} if "profile" in data else {})

@@ -172,7 +172,7 @@ def draw_coupler_curves(axes: Axes, curves: Mapping[str, Float[ArrayLike, "T 2"]
 
 
 def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | None = None) -> Axes:
-    """Draw what was measured of a channel as points, and what the identified mechanism shows as a line.
+    """Draw the measurements of a channel as points, and the prediction of the identified mechanism as a line.
 
     Args:
         axes: axes to draw on.
@@ -227,7 +227,7 @@ def outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners
 
 
 def to_ground(points: Float[np.ndarray, "points 2"], coordinates: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
-    """Return where points of a body's own frame are, in ground coordinates."""
+    """Return points of a body's own frame in ground coordinates."""
     x, y, angle = coordinates
     cos, sin = np.cos(angle), np.sin(angle)
     return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]

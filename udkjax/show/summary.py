@@ -16,7 +16,7 @@ from udkjax.study.report import plural, row_label
 
 
 def check_summary(mech: Mechanism, found: Check) -> str:
-    """Describe what `udkjax.integrate.assembly.check` found in a mechanism."""
+    """Describe the findings of `udkjax.integrate.assembly.check` in a mechanism."""
     lines = check_lines(found)
     lines["constraint rows"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant rows"] = ", ".join(row_label(mech, *row) for row in found.redundant) or "none"
@@ -55,7 +55,7 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
 
 
 def format_peak(ts: ArrayLike, effort: ArrayLike, coordinate: str) -> str:
-    """Describe what a driver exerts over time: its peak and its root mean square, in the unit of its coordinate."""
+    """Describe the effort of a driver over time: its peak and its root mean square, in the unit of its coordinate."""
     x, unit = np.asarray(effort, float), "N m" if coordinate == "angle" else "N"
     good = x[np.isfinite(x)]
     if not good.size:

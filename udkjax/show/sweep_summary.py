@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def estimate_summary(plan: SweepPlan, cost: SweepCost) -> str:
-    """Describe what a sweep will take."""
+    """Describe the work of a sweep."""
     shape = " x ".join(f"{dimension.size} {dimension.name}" for dimension in plan.dimensions)
     tried = "" if cost.tried == cost.groups else f", {cost.tried} of which were tried"
     computing, compiling = duration(cost.computing), duration(cost.compiling)
@@ -36,7 +36,7 @@ def estimate_summary(plan: SweepPlan, cost: SweepCost) -> str:
 
 
 def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
-    """Return how many members of a sweep ended in which way, and the range of each number that was kept."""
+    """Return the counts of members of a sweep by how they ended, and the range of each number that was kept."""
     codes, counts = np.unique(data[RESULT_VARIABLE].values, return_counts=True)
     known = {int(result): result.name for result in Result}
     ranges = {}
@@ -63,7 +63,7 @@ def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Say how many bytes something has."""
+    """Return a number of bytes as text."""
     units = ("bytes", "KiB", "MiB", "GiB", "TiB")
     power = min(int(math.log2(max(count, 1)) / 10), len(units) - 1)
     return f"{count / 1024**power:.3g} {units[power]}"

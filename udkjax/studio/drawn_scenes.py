@@ -99,7 +99,7 @@ class _Draft:
         )
 
     def place(self, body: str, point: Any) -> Place:
-        """Return where a point of a body is (m)."""
+        """Return the place of a point of a body (m)."""
         x, y, angle = self.frames[body]
         px, py = np.asarray(point, float)
         c, s = np.cos(angle), np.sin(angle)

@@ -23,7 +23,7 @@ IN_LINE = 1e-4  # rad: of a toggle that is found to rounding, whose angle errs b
 
 
 def examine(mechanism: Mechanism, about: str) -> Json:
-    """Return what is found about a subject.
+    """Return the findings about a subject.
 
     Args:
         mechanism: the drawing's.
@@ -84,7 +84,7 @@ def drawn_change(fix: Fix) -> Json | None:
 
 
 def _why(found: Diagnosis, mechanism: Mechanism) -> str:
-    """Say what moves the mechanism, or why it does not move."""
+    """Describe how the mechanism moves, or why it does not."""
     drivers = list(mechanism.drivers)
     if found.joint_mobility <= 0:
         if found.is_singular:
@@ -118,7 +118,7 @@ def rest(mechanism: Mechanism) -> Json:
 
 
 def motor_travel(mechanism: Mechanism) -> Json:
-    """Return how far each motor can turn from the drawn position, where the others hold, and what is in line at its limits."""
+    """Return the travel of each motor from the drawn position, where the others hold, and the pins in line at its limits."""
     found = []
     for name, driver in mechanism.drivers.items():
         if driver.coordinate != "angle" and driver.coordinate != "x":

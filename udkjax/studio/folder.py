@@ -118,7 +118,7 @@ class Folder:
 
 
 def revision_of(data: bytes) -> str:
-    """Return what names a content of a file."""
+    """Return the digest that names a content of a file."""
     return hashlib.sha256(data).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Limits of what the studio takes: nothing that a page or a file asks for may take this machine away from its user."""
+"""Limits of the studio's input: nothing that a page or a file asks for may take this machine away from its user."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -27,7 +27,7 @@ class RefusedError(Exception):
 
 
 def count_elements(document: Mapping[str, Any]) -> int:
-    """Return how many pins and tables a document has."""
+    """Return the number of pins and tables of a document."""
     return sum(len(value) for value in document.values() if isinstance(value, list | dict))
 
 

@@ -23,7 +23,7 @@ TOLERANCE = 1e-8  # of a run, relative
 
 
 def duration_of(mechanism: Mechanism) -> float:
-    """Return how long a run should be shown (s): turns of the slowest motor, or else swings."""
+    """Return the time of a run to show (s): turns of the slowest motor, or else swings."""
     rates = [
         abs(float(np.asarray(driver.motion.coefficients)[1]))
         for driver in mechanism.drivers.values()
@@ -86,7 +86,7 @@ class RestingPositions(NamedTuple):
 
 
 def mobility_of(mechanism: Mechanism) -> int:
-    """Return how many degrees of freedom the motors leave."""
+    """Return the number of degrees of freedom that the motors leave."""
     return 3 * len(mechanism.bodies) - int(close(mechanism, 0.0).rank)
 
 

@@ -100,7 +100,7 @@ def _read(text: str) -> Json | None:
 
 
 def scene_of(mechanism: Mechanism) -> Json:
-    """Return what the page needs to show a mechanism's positions and energies."""
+    """Return the data by which the page shows a mechanism's positions and energies."""
     analysis = analyse(mechanism)
     bodies = mechanism.bodies.values()
     return {
@@ -116,7 +116,7 @@ def scene_of(mechanism: Mechanism) -> Json:
 
 
 def diagnose_drawing(text: str, about: str = "structure") -> Json:
-    """Return what is found about a drawing; `about` is one of the subjects of findings.py."""
+    """Return the findings about a drawing; `about` is one of the subjects of findings.py."""
     try:
         require_few(read_document(text))
         return examine(loads(text), about)

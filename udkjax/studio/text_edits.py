@@ -118,7 +118,7 @@ def _merge_list(old: Any, new: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _mark(table: Mapping[str, Any]) -> str:
-    """Return what tells a table from others: its name, or else all of it."""
+    """Return the key of a table: its name, or else all of it."""
     return f"name {table['name']}" if "name" in table else repr(sorted(table.items(), key=lambda item: item[0]))
 
 

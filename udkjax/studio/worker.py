@@ -34,7 +34,7 @@ class Worker:
             self._ensure()
 
     def call(self, name: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-        """Return what a task answers; raise `RefusedError` where it refuses, fails, or takes longer than so many seconds."""
+        """Return the answer of a task; raise `RefusedError` where it refuses, fails, or takes longer than so many seconds."""
         with self._lock:
             connection = self._ensure()
             try:

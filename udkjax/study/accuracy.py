@@ -26,7 +26,7 @@ class Accuracy(NamedTuple):
 
 
 def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
-    """Return how far a run, or part of one that failed, can be trusted.
+    """Return measures of how far a run, or part of one that failed, can be trusted.
 
     Args:
         mechanism: mechanism that was simulated.

@@ -79,7 +79,7 @@ def random_positions(mechanism: Mechanism, count: int, seed: int, state: State |
 
 
 def distinct_positions(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
-    """Return which of the positions that count differ from all before them; whole turns make no difference."""
+    """Return the indices of positions that count and differ from all before them; whole turns make no difference."""
     points = np.asarray(q, float)
     length, different = float(scales.length), []
     for k in np.flatnonzero(np.asarray(counts)):

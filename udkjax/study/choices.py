@@ -45,7 +45,7 @@ CHOICES = {"method": METHODS, "formulation": FORMULATIONS, "stabilization": STAB
 
 
 def choice(setting: str, given: str | Mapping[str, str | float]) -> Choice:
-    """Return what a name stands for in a setting ("method": "svd"), or a table of its `type` and its numbers.
+    """Return the object of a name in a setting ("method": "svd"), or of a table of its `type` and its numbers.
 
     Raises ValueError, which says what there is.
     """

@@ -232,7 +232,7 @@ def _advance(
 
 
 def _secant(search: _Search, xp: ArrayLibrary) -> Float[Array, ""]:
-    """Return where the secant of a bracket is zero."""
+    """Return the zero of the secant of a bracket."""
     a, fa, b, fb = search.other, search.other_value, search.sigma, search.value
     slope = fb - fa
     return xp.clip(b - fb * (b - a) / xp.where(slope != 0, slope, 1.0), xp.minimum(a, b), xp.maximum(a, b))

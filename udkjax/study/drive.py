@@ -258,7 +258,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
 
 
 def _at_once(given: PyTree) -> AbstractContextManager:
-    """Compute what is known at once, also while something else is traced."""
+    """Compute with known numbers at once, also while something else is traced."""
     traced = is_traced(given)
     return nullcontext() if traced else jax.ensure_compile_time_eval()
 

@@ -150,7 +150,7 @@ def equilibria(
 
 
 def degrees_of_freedom(analysis: Analysis) -> int:
-    """Return how many degrees of freedom there are; raise `SceneError` where that is not known."""
+    """Return the number of degrees of freedom; raise `SceneError` where it is not known."""
     free = analysis.degrees_of_freedom
     if free is None:
         raise SceneError(

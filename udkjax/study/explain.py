@@ -112,7 +112,7 @@ def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
 
 
 def _checks(s: dict[str, np.ndarray]) -> dict[str, float]:
-    """Return what must vanish, each relative to the largest number that it is the difference of."""
+    """Return the differences that must vanish, each relative to its largest term."""
     inertia, reaction = s["mass"] * s["a"], s["psi_q"].T @ s["multipliers"]
     required = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
     D, plus = s["D"], s["D_plus"]

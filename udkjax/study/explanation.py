@@ -85,7 +85,7 @@ class Explanation(NamedTuple):
         return found | {"lambda": found.pop("multipliers")}
 
     def row_labels(self) -> list[str]:
-        """Return what texts call the rows."""
+        """Return the names of the rows in texts."""
         return [row_label(self.mechanism, *name) for name in self.row_names]
 
     def __str__(self) -> str:

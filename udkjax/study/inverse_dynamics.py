@@ -76,7 +76,7 @@ class InverseDynamics(PrintsTable):
 
     @property
     def determined(self) -> Bool[Array, "T"]:
-        """At which times the efforts follow from the motion."""
+        """Times at which the efforts follow from the motion."""
         return jnp.all(jnp.isfinite(jnp.stack(list(self.efforts.values()))), 0)
 
     @property
@@ -127,7 +127,7 @@ def inverse_dynamics(
     drivers: Sequence[str | Coordinate] | None = None,
     weights: Mapping[str, Scalar] | None = None,
 ) -> InverseDynamics:
-    """Return what the drivers must exert at the times ts (s) on a prescribed motion: M a - F = J^T mu + C^T f.
+    """Return the efforts of drivers at the times ts (s) on a prescribed motion: M a - F = J^T mu + C^T f.
 
     Pure and batched by `vmap`, with exact derivatives by every number of the mechanism, the motion's share included.
 

@@ -100,7 +100,7 @@ class Kinematics(PrintsTable):
 
 
 class Travel(PrintsTable):
-    """Between which values (rad, m) a coordinate can be driven; infinite where nothing ends it.
+    """Values (rad, m) between which a coordinate can be driven; infinite where nothing ends it.
 
     `lower_q` and `upper_q` are the positions at the toggles; infinite as well where there is none.
 
@@ -280,7 +280,7 @@ def _solve(
 def _count_on_branch(
     curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], found: MarchResult
 ) -> Int[Array, ""] | int:
-    """Return how many of the trusted positions are on the branch that they started on.
+    """Return the number of trusted positions on the branch that they started on.
 
     Where a branch meets another its side changes, and so it does where machine code went over to one that comes close. Which it
     was, continuation tells, with shorter steps: of known numbers from the value before, of others from there on.

@@ -135,12 +135,12 @@ PIECE_MEMBERS = 64  # of a chunk, on them
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def concurrent_chunks() -> int:
-    """Return how many chunks are computed at a time.
+    """Return the number of chunks that are computed at a time.
 
     One CPU device runs as many programs side by side as it has cores; several devices share each chunk.
     """

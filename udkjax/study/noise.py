@@ -37,7 +37,7 @@ def robust_deviation(values: Float[np.ndarray, "N"]) -> float:
 
 
 def outlier_rows(values: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-    """Return which numbers are too large to be noise like the others: Gaussian noise has one in a thousand such series.
+    """Return a mask of numbers that are too large to be noise like the others: Gaussian noise has one in a thousand such series.
 
     More than `MOST_TOGETHER` in a row are none: there the signal is another one.
     """

@@ -94,7 +94,7 @@ def _constraints(mechanism: Any) -> list[Any]:
 def _matrices(
     curve: Curve, values: Array, found: Three, spacing: Array, counts: Array, active: PyTree
 ) -> tuple[Float[Array, "K 3 n P"], Float[Array, "K P n"]]:
-    """Return what P numbers change in q, q' and q'' where branches meet, and their residues, those of rounding as zero.
+    """Return the changes of q, q' and q'' by P numbers where branches meet, and their residues, those of rounding as zero.
 
     Args:
         curve: the positions.

@@ -15,7 +15,7 @@ _ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("acr
 
 
 def plural(count: int, noun: str) -> str:
-    """Say how many there are."""
+    """Return a count with its noun."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -67,7 +67,7 @@ def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -
 
 @checked
 def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str | Coordinate) -> Float[Array, "T"]:
-    """Return what the output yields for one unit of effort at the driver: s_dot / o_dot, since power in is power out.
+    """Return the effort of the output for one unit of effort at the driver: s_dot / o_dot, since power in is power out.
 
     Efforts are torques (N m) along angles and forces (N) along lengths; losses and inertia aside. `output` is a coordinate o, by
     its name or as a `Coordinate`. The sign tells whether both move the same way; at a toggle of the output it is infinite.
@@ -102,7 +102,7 @@ def workspace(
     point: Numbers = (0.0, 0.0),
     state: State | None = None,
 ) -> Workspace:
-    """Return where a point of a body gets over all pairs of values of two drivers, each reached along the branch of `state`.
+    """Return the places of a point of a body over all pairs of values of two drivers, each reached along the branch of `state`.
 
     Args:
         mechanism: a mechanism of two degrees of freedom once its drivers hold.

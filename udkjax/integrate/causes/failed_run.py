@@ -68,5 +68,5 @@ class FailedRun:
         return np.linalg.svd(D, full_matrices=False)[:2] if np.all(np.isfinite(D)) else (D, np.full(len(D), np.nan))
 
     def open_rows(self, t: float, q: np.ndarray) -> str:
-        """Name what is open at a position, the widest first, with its residual (m, rad)."""
+        """Name the open constraints at a position, the widest first, each with its residual (m, rad)."""
         return name_open_rows([name for name, _ in self.rows.names], self.psi(t, q), self.row_scales, self.drift_tol)

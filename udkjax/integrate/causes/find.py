@@ -59,7 +59,7 @@ class FoundCause:
 
 
 def find_cause(run: FailedRun) -> str | None:
-    """Return why a run failed, or None where no more is found than its result says."""
+    """Return the cause of a failed run; None where no more is found than its result says."""
     wrong = " and ".join(
         text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATES)) if text
     )
@@ -204,7 +204,7 @@ def _stiff(run: FailedRun) -> str:
 
 
 def _reach_at_end(run: FailedRun) -> str:
-    """Say what drivers ask for, if the run ended where the mechanism cannot follow."""
+    """Describe the demands of drivers, if the run ended where the mechanism cannot follow."""
     t, span = run.states[0][0], float(run.ts[-1] - run.ts[0])
     return explain_reach(run, min(float(run.ts[-1]), t + NEAR_REACH * span)) if t < run.ts[-1] else ""
 

@@ -35,7 +35,7 @@ class Reach(NamedTuple):
 
 
 def explain_reach(run: FailedRun, until: float) -> str:
-    """Say what drivers ask for up to a time (s) that the mechanism cannot do; an empty text where it can."""
+    """Describe the demands of drivers, up to a time (s), that the mechanism cannot meet; an empty text where it can."""
     mechanism = run.mechanism
     if not mechanism.drivers:
         return ""
@@ -59,7 +59,7 @@ def explain_reach(run: FailedRun, until: float) -> str:
 
 
 def _find_reach(run: FailedRun, until: float) -> Reach | None:
-    """Return where the constraints stop closing before a time, or None where they close all the way or nowhere."""
+    """Return the time and position where the constraints stop closing; None where they close all the way or nowhere."""
     rows, size = run.rows, run.rows.scales.size
     first = next((p for p in (rows.close(t, q) for t, q, _ in run.states[:STATES_TRIED] if t < until) if p is not None), None)
     if first is None:
@@ -114,7 +114,7 @@ def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
 
 
 def _dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
-    """Say what a dead point looks like: the pins of links that lie in line, or the joints that hold together."""
+    """Describe a dead point: the pins of links that lie in line, or the joints that hold together."""
     index = {name: k for k, name in enumerate(mechanism.body_names)}
     frames = found.q.reshape(-1, 3)
     driven = {GROUND, *(body for name in drivers for body in mechanism.drivers[name].bodies)}

@@ -1,4 +1,4 @@
-"""Checks of what events are made of: each error names the event, its argument, what was given and what is meant."""
+"""Checks of the parts of events: each error names the event, its argument, what was given and what is meant."""
 
 from typing import Any
 
@@ -63,7 +63,7 @@ def require_limits(where: str, lower: Any, upper: Any) -> None:
 
 
 def require_joint(name: str, value: object) -> None:
-    """Raise where what is attached is not a joint of finite numbers."""
+    """Raise unless the attached object is a joint of finite numbers."""
     if not isinstance(value, Joint):
         raise ArgumentTypeError(f"{name} must be a joint, such as udk.Weld(...), {describe(value)}")
     for leaf in jax.tree.leaves(value):

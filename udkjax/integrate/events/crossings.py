@@ -63,7 +63,7 @@ def first_crossing(
 
 
 def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: Int[Array, "*G C"]) -> Bool[Array, "*G C"]:
-    """Tell which conditions cross zero in the direction that counts, 0 for either."""
+    """Return a mask of the conditions that cross zero in the direction that counts, 0 for either."""
     return (before != 0) & (after == -before) & ((direction == 0) | (after == direction))
 
 
@@ -86,7 +86,7 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 
 def cubic_extremum(cubic: Cubic, side: Array) -> Array:
-    """Return where a cubic on `side` of zero is nearest to it, or farthest beyond, if it approaches at 0 and leaves at 1."""
+    """Return the extremum of a cubic on `side` of zero, nearest to it or beyond it, if it approaches at 0 and leaves at 1."""
     a, da, b, db = cubic
     # The slope c + 2 h x + k x^2 is below zero at 0 and above it at 1: so the root is real, and the larger one.
     c, h, k = side * da, side * (3 * (b - a) - 2 * da - db), side * 3 * (2 * (a - b) + da + db)
@@ -96,7 +96,7 @@ def cubic_extremum(cubic: Cubic, side: Array) -> Array:
 
 
 def cubic_root(cubic: Cubic, side: Array) -> Array:
-    """Return where a cubic that is on `side` of zero at 0, and beyond it at 1, crosses zero."""
+    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1."""
     low, width, places = jnp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
     for _ in range(DIVISIONS):
         width /= PARTS

@@ -187,6 +187,6 @@ def _coefficients(cubic: Cubic, side: Int[Array, "I C"], error: Float[Array, "I 
 
 
 def _sign_changes(x: Float[Array, "5 I C"]) -> Int[Array, "I C"]:
-    """Return how often the coefficients change their sign, from the positive one that the first stands for."""
+    """Return the number of changes of sign of the coefficients, from the positive one that the first stands for."""
     signs = (x > 0).at[0].set(True)
     return jnp.sum(signs[1:] != signs[:-1], axis=0)

@@ -104,7 +104,7 @@ class Hybrid(eqx.Module):
         return reduce(jnp.logical_and, (limits[f"{n}.lower"] <= limits.get(f"{n}.upper", jnp.inf) for n in both), found)
 
     def mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
-        """Tell which events have an action of these kinds."""
+        """Return a mask of the events with an action of these kinds."""
         return np.array([isinstance(e.action, actions) for e in self.events])
 
     @property
@@ -113,7 +113,7 @@ class Hybrid(eqx.Module):
         return self.mask(Impact)
 
     def rests(self, at_rest: str) -> Bool[np.ndarray, "E"]:
-        """Tell which events are impacts with this choice of what happens at rest."""
+        """Return a mask of the events that are impacts with this choice for contacts at rest."""
         return np.array([isinstance(e.action, Impact) and e.action.at_rest == at_rest for e in self.events])
 
     @property
@@ -141,7 +141,7 @@ class Hybrid(eqx.Module):
         return jnp.array(getattr(self.phases.tables, name))
 
     def is_held(self, phase: Int[Array, ""]) -> Bool[Array, "E"]:
-        """Tell which contacts are at rest in a phase."""
+        """Return a mask of the contacts at rest in a phase."""
         return self.table("held")[phase] >= 0
 
     def without_contacts(self, phase: Int[Array, ""]) -> Int[Array, ""]:
@@ -161,7 +161,7 @@ class Hybrid(eqx.Module):
     # --- the flow
 
     def problem(self, phase: int, ts: Array, q: Array, v: Array, added: Added) -> Problem:
-        """Return what to integrate in a phase."""
+        """Return the system to integrate in a phase."""
         mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
         compiled = CompiledMechanism(equations, mechanism.breakpoints, self.plans[phase])

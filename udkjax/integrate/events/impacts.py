@@ -164,7 +164,7 @@ def contact_states(
     W: Float[Any, "*m E E"],
     xp: ModuleType,
 ) -> Int[Any, "*m E"]:
-    """Tell which contacts take part in event k, and which of them are too slow to rebound.
+    """Return the state of each contact in event k: OPEN where it takes no part, TOUCHES, or SLOW where it is too slow to rebound.
 
     Those take part that are closed, do not separate and, where the event is of a contact, act on it, or on one that does. A
     contact is slow whose g_dot is small while it is pressed on.
@@ -239,7 +239,7 @@ def hit_contacts(
 
 
 def _depends(W: Float[Any, "*m E E"], on: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m E"]:
-    """Tell which rows depend on some of the others, which do not depend on one another."""
+    """Return a mask of the rows that depend on some of the others, which do not depend on one another."""
     parts = xp.where(on[..., :, None], W, 0.0)
     both = on[..., None, :] & on[..., :, None]
     solved = xp.linalg.solve(xp.where(both, W, xp.eye(W.shape[-1])), parts)

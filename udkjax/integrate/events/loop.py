@@ -113,7 +113,7 @@ def _values(hybrid: Hybrid, loop: LoopState, state: RunState) -> ConditionValues
 
 
 def _watched(hybrid: Hybrid, loop: LoopState) -> Bool[Array, "2E"]:
-    """Tell which conditions and contact forces count."""
+    """Return a mask of the conditions and contact forces that count."""
     held = hybrid.is_held(loop.state.phase)
     return jnp.append(~held & ~loop.carried, held)
 

@@ -122,7 +122,7 @@ class PieceOutput(NamedTuple):
 
 
 def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...]:
-    """Return what is smooth in a run that is known, as a function with its first derivatives: the first fields of `EventRun`."""
+    """Return the smooth parts of a known run as a function with its first derivatives: the first fields of `EventRun`."""
     ts, T, K, n = stop_gradients(given.ts), len(given.ts), len(found.event_time), len(given.q)
     width = min(OUTPUTS, T)
     pieces = K + -(-T // (width - 1)) + 2

@@ -53,7 +53,7 @@ class PortableEvents:
             raise UnsupportedError("the condition of an event")
 
     def data(self, analysis: Analysis) -> dict[str, Any] | None:
-        """Return what a page knows of the events; None where there are none."""
+        """Return the events as data of a page; None where there are none."""
         if not self._events:
             return None
         impacts = [event.action if isinstance(event.action, Impact) else None for event in self._events]

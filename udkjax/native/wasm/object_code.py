@@ -165,7 +165,7 @@ def _skip_type(reader: Reader, kind: int):
 
 
 def _data_end(body: bytes) -> int:
-    """Return where the last segment of data ends."""
+    """Return the end of the last segment of data."""
     reader, end = Reader(body), 0
     for _ in range(reader.number()):
         if reader.number() or reader.byte() != I32_CONST:

@@ -204,7 +204,7 @@ def _spring_between(
 
 
 def _mistakes_of_ends(layout: PinLayout, between: tuple[str, ...], pin: str | None, of: tuple[str, ...]) -> Iterator[str]:
-    """Iterate over what is wrong with an element between two pins, or at one."""
+    """Iterate over the mistakes of an element between two pins, or at one."""
     if bool(between) == (pin is not None):
         yield "between: give two pins, or one pin to turn at"
     elif pin is not None:

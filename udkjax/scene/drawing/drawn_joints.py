@@ -106,7 +106,7 @@ class GearPair(DrawnElement):
         return Parts(joint=Gear(self.links, radii, self.internal, self.carrier))
 
     def misfit(self, placement: Placement) -> tuple[float, float] | None:
-        """Return how far the centres are apart and how far the radii ask them to be (m); None where they are not asked."""
+        """Return the distance of the centres, and the one that the radii require (m); None if there are no radii."""
         if self.radii is None:
             return None
         one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)

@@ -90,7 +90,7 @@ class Units:
         return value if factor in (None, 1.0) else value * factor
 
     def _factor(self, unit: str) -> float | None:
-        """Return what a plain number of a quantity in this SI unit is multiplied by; None where it could mean several things."""
+        """Return the factor of a plain number of a quantity in this SI unit; None where it could mean several things."""
         kind = _KIND_OF.get(unit, "")
         if kind in self.chosen:
             return conversion_factor(self.chosen[kind], unit)
@@ -104,7 +104,7 @@ class Units:
         }
 
     def write(self, value: float, unit: str) -> float | str:
-        """Return what to write for a number in SI units, so that it is read as the same number, bit by bit."""
+        """Return a number in SI units as it is written, so that it is read as the same number, bit by bit."""
         factor = self._factor(unit) if unit else 1.0
         if factor == 1.0 or value == 0.0:
             return value

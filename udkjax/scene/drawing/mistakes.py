@@ -39,7 +39,7 @@ def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, 
 
 
 def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str]) -> Iterator[str]:
-    """Iterate over what is wrong with who meets whom; all names are known."""
+    """Iterate over the mistakes in how pins, links and other elements meet; all names are known."""
     elements = {s: g for s, g in groups.items() if g and isinstance(next(iter(g.values())), DrawnElement)}
     yield from _taken_names(layout, groups)
     anchors = {pin for group in elements.values() for element in group.values() for pin in element.anchors}
@@ -99,7 +99,7 @@ def _attached(layout: PinLayout, groups: Groups) -> set[str]:
 
 
 def _link_mistakes(link: Link) -> Iterator[str]:
-    """Iterate over what is wrong with a link by itself, its numbers aside."""
+    """Iterate over the mistakes of a link by itself, its numbers aside."""
     if not link.pins:
         yield ".pins: a link needs at least one pin"
         return

@@ -81,7 +81,7 @@ class Placement(PinLayout):
         return array_namespace(*found).stack(found)
 
     def distance(self, one: str, two: str) -> Number:
-        """Return how far two pins are apart (m)."""
+        """Return the distance of two pins (m)."""
         way = self.places[two] - self.places[one]
         return array_namespace(way).sqrt(way @ way)
 
@@ -111,11 +111,11 @@ class DrawnElement(PrintsLine):
 
     @abstractmethod
     def mistakes(self, layout: PinLayout) -> Iterator[str]:
-        """Iterate over what is wrong with it in a layout, each a key and a text; all names are known."""
+        """Iterate over its mistakes in a layout, each a key and a text; all names are known."""
 
     @abstractmethod
     def parts(self, placement: Placement) -> Parts:
-        """Return what it becomes in the mechanism."""
+        """Return the parts of the mechanism that it becomes."""
 
     @property
     def measured_as(self) -> str:
@@ -129,7 +129,7 @@ class DrawnElement(PrintsLine):
 
 
 def line_mistakes(along: tuple[str, ...], direction: Number | None) -> Iterator[str]:
-    """Iterate over what is wrong with a line, which two pins or a direction give."""
+    """Iterate over the mistakes of a line, which two pins or a direction give."""
     if bool(along) == (direction is not None):
         yield "along: give two pins, or a direction"
     elif along and (len(along) != 2 or along[0] == along[1]):
@@ -137,7 +137,7 @@ def line_mistakes(along: tuple[str, ...], direction: Number | None) -> Iterator[
 
 
 def pair_mistakes(layout: PinLayout, pin: str, of: tuple[str, ...]) -> Iterator[str]:
-    """Iterate over what is wrong with an element between two links that meet at a pin."""
+    """Iterate over the mistakes of an element between two links that meet at a pin."""
     members = layout.members(pin)
     listed = ", ".join(members) or "none"
     if not of and len(members) != 2:

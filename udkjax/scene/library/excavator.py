@@ -120,7 +120,7 @@ def _points(places, length) -> dict[str, Numbers]:
 
 
 def _spot(placed, local):
-    """Return where a point of a body is."""
+    """Return the place of a point of a body."""
     return as_array(Frame.at(*placed).point(local))
 
 

@@ -81,7 +81,7 @@ class BodyTree:
         return self.find(read, attribute, self._index, "body", default) or 0
 
     def find(self, read: AttributeReader, attribute: str, known: dict, what: str, default: str = ""):
-        """Return what an attribute names, or None, and refuse it, where nothing has that name."""
+        """Return the object that an attribute names; None, and refuse it, where nothing has that name."""
         name = read.text(attribute, default)
         if name not in known:
             read.refuse(f"{attribute}={quote(name)}: no {what} has this name{suggestion(name, known)}")

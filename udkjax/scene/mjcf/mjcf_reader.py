@@ -123,7 +123,7 @@ def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tupl
 
 
 def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint | None:
-    """Return what holds a body to the one that it hangs on, by its hinges and slides in their order; None: it is free."""
+    """Return the joint that holds a body to its holder, made of its hinges and slides in their order; None: it is free."""
     holder, kinds = model.holder(body), "".join(joint.kind[0] for joint in joints)
     names, angle = model.names((holder, body)), model.relative_angle(holder, body)
     anchors, axes = [model.plane.flat(joint.anchor) for joint in joints], [model.plane.flat(joint.axis) for joint in joints]

@@ -36,7 +36,7 @@ class PlaneMotion(NamedTuple):
     rate: complex = 0j  # m/s; that point moves with rate + i omega z
 
     def point(self, z: complex) -> complex:
-        """Return where a point is (m)."""
+        """Return the place of a point (m)."""
         return np.exp(1j * self.angle) * z + self.shift
 
     def velocity(self, z: complex) -> complex:
@@ -174,7 +174,7 @@ class PlaneModel:
         return joint.read.number(name) * (self.tree.settings.radians if joint.kind == "hinge" else 1.0)
 
     def motions(self, values: Mapping[str, float], rates: Mapping[str, float]) -> dict[int, PlaneMotion]:
-        """Return how far bodies have moved where joints have these values and rates, by default those of the model as written."""
+        """Return the motions of bodies for values and rates of joints, by default those of the model as written."""
         found = {0: PlaneMotion()}
         for k, body in self.tree.moving():
             motion = found[self.holder(k)]
@@ -196,7 +196,7 @@ class PlaneModel:
 
 
 def gap_of(ends: Ends, motions: Mapping[int, PlaneMotion]) -> float:
-    """Return how far apart two points are (m) where bodies have moved."""
+    """Return the distance of two points (m) after motions of their bodies."""
     one, two = (motions[body].point(point) for body, point in zip(*ends, strict=True))
     return abs(two - one)
 

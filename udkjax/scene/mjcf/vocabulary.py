@@ -106,7 +106,7 @@ _CURES = {
 
 
 def unknown_parts(root: XmlElement) -> list[str]:
-    """Return what of a model is not taken over, each with its line: elements and attributes that could change its motion."""
+    """Return the parts of a model that are not taken over, by line: elements and attributes that could change its motion."""
     found: list[str] = []
     if root.tag != "mujoco":
         return [f"{root.where}: an MJCF model begins with <mujoco>"]

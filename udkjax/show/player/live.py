@@ -32,7 +32,7 @@ SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteris
 def live_data(
     runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live, events: Sequence[ExpandsToEvents] = ()
 ) -> Json:
-    """Return what a live page of some runs has besides, as plain data; each run with what the player shows of it.
+    """Return the further data of a live page of some runs, each with its data for the player.
 
     Args:
         runs: mechanisms, their motions, and these as the player has them.

@@ -92,7 +92,7 @@ def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
 
 
 def names_in(mechanism: Mechanism, live: Live) -> Live:
-    """Return what is wanted of a mechanism: the names that it has."""
+    """Return the names, of those wanted, that a mechanism has."""
     if isinstance(live, bool):
         return live
     known = mechanism.parameters()
@@ -111,7 +111,7 @@ def section_of(name: str) -> str:
 
 
 def label_of(name: str) -> str:
-    """Return what a parameter is called: `joint.A.points[1][0]` is "A point 2 x"."""
+    """Return a parameter's title: `joint.A.points[1][0]` is "A point 2 x"."""
     base, indices = _base(name), [int(k) for k in re.findall(r"\[(\d+)\]", name)]
     parts = base.split(".")
     words = parts[1:] if len(parts) > 1 else parts

@@ -285,7 +285,7 @@ class _Drawing:
 
 
 def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
-    """Return where a point of a body's frame is in ground coordinates (m), for each of its coordinates x, y, angle."""
+    """Return a point of a body's frame in ground coordinates (m), for each of its coordinates x, y, angle."""
     x, y = np.asarray(point, float)
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
     return frames[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])

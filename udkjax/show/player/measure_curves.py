@@ -80,7 +80,7 @@ def singular_values_over_time(mechanism: Mechanism, solution: ShownMotion) -> Fl
 
 
 def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return how many singular values are above `STATIC_RANK_TOL` of the largest, in each row; nan where there are none."""
+    """Return the number of singular values above `STATIC_RANK_TOL` of the largest, in each row; nan where there are none."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
     count = (values > STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
@@ -129,7 +129,7 @@ MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort":
 
 
 def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArrows:
-    """Return what the arrows of reactions need, for each joint and driver that puts a force on a body.
+    """Return the data of arrows of reactions, for each joint and driver that puts a force on a body.
 
     Returns:
         Anchors [body, x, y]; forces (N, ground axes) on the second body, or, where this is the ground, on the first one, of

@@ -270,7 +270,7 @@ def _speed(duration: float) -> float:
 
 
 def failure_of(solution: ShownMotion) -> str:
-    """Say how a run failed, whatever of it can be shown; an empty text where it did not."""
+    """Return the cause of a failed run, whatever of it can be shown; an empty text of others."""
     result, cause = getattr(solution, "result", None), getattr(solution, "cause", "")
     if isinstance(result, Result):
         return "" if result.is_success else cause

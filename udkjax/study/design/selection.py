@@ -95,7 +95,7 @@ def _verify(
 
 
 def _what_is_exceeded(problem: DesignProblem, state: SearchState) -> str:
-    """Return which limit keeps the trial nearest to all of them away."""
+    """Return the limit that excludes the trial nearest to all of them."""
     present = np.flatnonzero(state.found.is_there)
     if not len(present):
         return "no trial has all positions of the goal in one motion: widen the bounds, or give more starts"

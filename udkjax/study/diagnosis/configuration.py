@@ -73,7 +73,7 @@ class RankedPositions:
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
     def distance(self, one: Configuration, two: Configuration, turns: bool = True) -> float:
-        """Return how far two positions are apart: the norm of the scaled displacement; whole turns may not count."""
+        """Return the distance of two positions: the norm of the scaled displacement; whole turns may not count."""
         way = (two.q - one.q) / self.unit
         if not turns:
             way[2::3] = np.remainder(way[2::3] + np.pi, 2 * np.pi) - np.pi

@@ -75,7 +75,7 @@ def _minimal_set_around(
 
 
 def _distances(seed: str, names: list[str], attached: dict[str, tuple[str, ...]]) -> dict[str, int]:
-    """Return how many bodies lie between one constraint and each of the others."""
+    """Return the number of bodies between one constraint and each of the others."""
     far, edge = {seed: 0}, [seed]
     while edge:
         reached = {body for name in edge for body in attached[name]}

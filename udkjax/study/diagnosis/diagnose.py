@@ -143,7 +143,7 @@ def _cure(
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
-    """Return which multipliers are unique, by N; and of a pin's force the direction that alone is unique, if there is one."""
+    """Return the uniqueness of multipliers, by N; and of a pin's force the direction that alone is unique, if there is one."""
     found = {}
     for name, element in mechanism.constraints.items():
         own = [k for k, owner in enumerate(owners) if owner == name]

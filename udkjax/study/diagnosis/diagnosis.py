@@ -58,7 +58,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """In which the mechanism can move away from here, along the branch that has most, with drivers held."""
+        """Number of directions in which the mechanism can move, along the branch that has most, with drivers held."""
         if self.is_singular or not self.can_move:
             return max((branch.degrees_of_freedom for branch in self.branches if branch.followed), default=0)
         return self.coordinates - self.ordinary_rank
@@ -202,7 +202,7 @@ def _branches(found: Diagnosis) -> list[str]:
 
 
 def _forces(found: Diagnosis) -> list[str]:
-    """Name what is not unique, constraints with the same direction together."""
+    """Name the multipliers that are not unique, constraints with the same direction together."""
     groups: dict[str, list[str]] = {}
     for name, forces in found.forces.items():
         if all(forces.unique):

@@ -37,7 +37,7 @@ class JointChange(NamedTuple):
         return np.array([[-sin, cos]]) @ rows
 
     def alignment(self, force: np.ndarray, q: np.ndarray, places: list[int | None]) -> float:
-        """Return how much of the stress (rows, redundancy) lies in what a slot gives up, 0 to 1; for any other change, 1."""
+        """Return the share of the stress (rows, redundancy) that a slot gives up, 0 to 1; for any other change, 1."""
         if self.slides is None:
             return 1.0
         return float(np.linalg.norm(self._direction(q, places) @ force[:2]) / np.linalg.norm(force[:2], 2))
@@ -112,7 +112,7 @@ def _own(owners: list[str], name: str) -> list[int]:
 
 
 def _places(mechanism: Mechanism, name: str) -> list[int | None]:
-    """Return where the bodies of a constraint are among all; None: the ground."""
+    """Return the places of the bodies of a constraint among all; None: the ground."""
     bodies = mechanism.frames_of(mechanism.constraints[name])
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
 

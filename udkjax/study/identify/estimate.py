@@ -152,7 +152,7 @@ class Estimate:
     # --- as a table
 
     def rows(self) -> list[Row]:
-        """Return what was found, in the order in which it was asked for; then what was found of initial states."""
+        """Return the estimates of the parameters in their order; then those of initial states."""
         known, guess = self.uncertainty, self.problem.unknowns.guess
         notes = [known.notes(name) + (["at a bound"] if name in self.at_bounds else []) for name in self.names]
         errors = known.standard_errors.tolist()
@@ -204,7 +204,7 @@ class Estimate:
     # --- as data
 
     def to_xarray(self, profiles: Sequence[ProfileLikelihood] = (), level: float = CONFIDENCE) -> "xarray.Dataset":
-        """Return what was measured, what the mechanism shows, and what is known of the parameters.
+        """Return measurements, predictions, and the knowledge of the parameters.
 
         Args:
             profiles: profile likelihoods that are to be in it.

@@ -222,7 +222,7 @@ def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
 
 
 def _score(rows: np.ndarray, criterion: Criterion, floor: float) -> tuple[tuple[int, float], np.ndarray]:
-    """Return how many directions are known and how well; and the standard errors of the unknowns."""
+    """Return the number of known directions and their precision; and the standard errors of the unknowns."""
     K = rows.shape[1]
     _, s, vt = np.linalg.svd(np.concatenate([rows, np.zeros((K, K))]))
     known = s > floor

@@ -104,7 +104,7 @@ class FitProblem:
         return float((self.ts[:, -1] - self.ts[:, 0]).max())
 
     def series(self) -> list[np.ndarray]:
-        """Return which residuals belong to one channel of one record, in the order of time: for each that has some."""
+        """Return the indices of the residuals of each channel of each record that has some, in the order of time."""
         record, _, channel = self.index.T
         pairs = ((k, c) for k in range(len(self.records)) for c in range(len(self.channels)))
         return [places for k, c in pairs if len(places := np.flatnonzero((record == k) & (channel == c)))]

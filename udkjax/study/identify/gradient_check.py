@@ -228,7 +228,7 @@ def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[Tolerance
 
 
 def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B R"]:
-    """Return what channels show, in their units; no numbers where a run does not come to its end."""
+    """Return the predictions of channels, in their units; nan where a run does not come to its end."""
     rows = len(problem.index)
     # Few at a time, so that they are computed one by one: lanes would have to be compiled.
     together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))

@@ -233,7 +233,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerance
 
 
 def _residuals_of_others(problem: FitProblem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
-    """Return what a fit without the outliers would leave of all other residuals, to first order; nan in the place of outliers."""
+    """Return the residuals of a fit without the outliers, to first order; nan in the place of outliers."""
     r, J, kept = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
     left = r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE_RATIO)[0]
     return np.where(outlying, np.nan, left[: len(outlying)])

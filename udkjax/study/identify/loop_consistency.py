@@ -50,7 +50,7 @@ _consistent: set[Hashable] = set()
 def loop_problems(
     mechanism: Mechanism, apply: Callable[[Mechanism, Array], Mechanism], x: Numbers, names: Sequence[str]
 ) -> list[str]:
-    """Return what is wrong with moving parameters each by itself; nothing if loops stay closed whatever they are.
+    """Return the objections to moving parameters each by itself; nothing if loops stay closed whatever they are.
 
     `apply` assigns values (P,), which may be traced, to a mechanism that closes; x are those around which they are to move. A
     message names the constraints that close a loop, the parameters that would open it, and the ties that leave it closed.
@@ -258,7 +258,7 @@ class RedundantLoops:
 
 
 def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
-    """Return how parameters with the values x have to move together, where u are their changes."""
+    """Return the relation in words by which parameters of the values x move together, with changes u."""
     nonzero = np.flatnonzero(u).tolist()
     names, x, u = [names[i] for i in nonzero], x[nonzero], u[nonzero]
     same = np.allclose(u, u[0], rtol=SAME_CHANGE)

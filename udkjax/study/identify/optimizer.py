@@ -182,7 +182,7 @@ def _descend(optimizer: Optimizer, descent: "_LossDescent", steps: int) -> None:
 
 
 def _update(optimizer: "optax.GradientTransformation", state, at, value, gradient):
-    """Return where an optimizer of optax goes next, and its state then."""
+    """Return the next unknowns of an optimizer of optax, and its state then."""
     with OptionalImport():
         import optax
     change, state = optax.with_extra_args_support(optimizer).update(gradient, state, at, value=value, grad=gradient)

@@ -31,7 +31,7 @@ class Outlier(NamedTuple):
 
 
 def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
-    """Return which measured numbers are outliers, by weighted residuals: each channel by its own, of all records together."""
+    """Return a mask of the outliers, by weighted residuals: each channel by its own, of all records together."""
     found, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
     shows = np.abs(r * problem.sigma) > NOISE_FLOOR * problem.channel_scale[channel]
     for c in range(len(problem.channels)):

@@ -175,7 +175,7 @@ def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
 
 
 def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
-    """Return what a parameter refers to: of an array, each of its entries."""
+    """Return the numbers that a parameter refers to: of an array, each of its entries."""
     of, scaled = p.of, p.share == "scale"
     if p.share not in ("value", "scale"):
         raise ValueError(f'share must be "value" or "scale", is {p.share!r}')

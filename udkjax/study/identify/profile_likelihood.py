@@ -262,6 +262,6 @@ def _text(name: str, units: str, level: float, ends: tuple[float, float], sides:
 
 
 def _digits(ends: tuple[float, float]) -> int:
-    """Return how many digits distinguish the ends of an interval."""
+    """Return the number of digits that distinguish the ends of an interval."""
     size, width = max(map(abs, ends)), ends[1] - ends[0]
     return max(4, 2 + int(np.ceil(np.log10(size / width)))) if width > 0 else 4

@@ -187,7 +187,7 @@ def tabulate(records: Sequence[Record], keys: Sequence[Key]) -> tuple[np.ndarray
 
 
 def label_prefixes(records: Sequence[Record]) -> list[str]:
-    """Return what names of channels begin with in messages: the name of their record, if there are several."""
+    """Return the beginning of names of channels in messages: the name of their record, if there are several."""
     return [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
 
 
@@ -198,7 +198,7 @@ def dataset_of_fit(
     residuals: Sequence[Mapping[str, np.ndarray]],
     noise: Sequence[Mapping[str, np.ndarray]],
 ) -> "xarray.Dataset":
-    """Return what was measured and what a fit shows of it, along record, sample and channel; nan where nothing was measured."""
+    """Return measurements and predictions of a fit, along record, sample and channel; nan where nothing was measured."""
     with OptionalImport():
         import xarray
     shape = len(records), max(len(record.times) for record in records), len(channels)

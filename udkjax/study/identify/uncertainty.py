@@ -46,7 +46,7 @@ class UnknownValues(NamedTuple):
     kinds: Sequence[str]
 
     def typical(self, k: int) -> float:
-        """Return what a standard error is compared with: the value; of a parameter of either sign, its scale."""
+        """Return the scale of a standard error: the value; of a parameter of either sign, its scale."""
         return float(abs(self.x[k]) or abs(self.dx_dz[k])) if self.kinds[k] == "bounded" else float(abs(self.dx_dz[k]))
 
 
@@ -111,7 +111,7 @@ class Uncertainty:
         return tuple((self.names[i], self.names[j], float(self.correlation[i, j])) for i, j in pairs)
 
     def notes(self, name: str) -> list[str]:
-        """Return what is wrong with what is known of a parameter, a few words each."""
+        """Return the remarks on the knowledge of a parameter, a few words each."""
         sizes = [len(flat.names) for flat in self.flat if name in flat.names]
         notes = {
             "shows in nothing that was measured": name in self.dead,

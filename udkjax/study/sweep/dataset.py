@@ -73,7 +73,7 @@ def variables_of(plan: SweepPlan) -> Mapping[str, StoredVariable]:
 
 
 def bytes_per_member(plan: SweepPlan) -> int:
-    """Return how many bytes the stored variables of one member take."""
+    """Return the size of the stored variables of one member (bytes)."""
     return sum(int(np.prod(v.shape)) * v.dtype.itemsize for v in variables_of(plan).values())
 
 

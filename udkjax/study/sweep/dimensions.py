@@ -162,7 +162,7 @@ def _suggest_ending(target: str, known: Iterable[str]) -> str:
 
 
 def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
-    """Iterate over what the mechanism refuses of the values: their shape, and what each must satisfy."""
+    """Iterate over values that the mechanism refuses, for their shape or a requirement."""
     parameters = [target for target in of if target not in NUMBERS]
     if parameters:
         for value in (numbers.min(axis=0), numbers.max(axis=0)):
@@ -193,7 +193,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
 
 
 def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
-    """Return what is wrong with axes of settings: values of no use, what is given twice, gains that no choice has."""
+    """Return the mistakes of axes of settings: values of no use, settings given twice, gains that no choice has."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
@@ -215,7 +215,7 @@ def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settin
 
 
 def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
-    """Return what is wrong with the names by which derivatives are asked for."""
+    """Return the mistakes in the names of derivatives."""
     columns = {column.name: column for dimension in dimensions for column in dimension.columns}
     known, problems = parameters_of(mechanism), []
     for name in names:

@@ -181,7 +181,7 @@ class _GridReader:
         return ()
 
     def of(self, place: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
-        """Read what an axis sets: names, the length or the initial angle of bodies, or names with factors."""
+        """Read the targets of an axis: names, the length or the initial angle of bodies, or names with factors."""
         if given is None or isinstance(given, str):
             return given
         if isinstance(given, list):

@@ -160,7 +160,7 @@ class GroupRun:
         return found | numbers | {"ts": ts}
 
     def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
-        """Return what is stored of one member, with `shifts` (names,) added to what derivatives are taken by."""
+        """Return the stored variables of one member, with `shifts` (names,) added to the numbers that derivatives are by."""
         shift = dict(zip(self.names, shifts, strict=True))
         mechanism = self.mechanism(shared, own, shift)
         closure, settings = self._closure(shared, own, mechanism), self.settings(shared, own, shift)
@@ -209,7 +209,7 @@ def _with(choice: PyTree, name: str, value: np.ndarray | Array) -> PyTree:
 
 
 def _piece(members: int, in_lanes: bool, platform: str) -> int:
-    """Return how many members are computed at once on each device: in vector lanes, or one by one."""
+    """Return the number of members that are computed at once on each device: in vector lanes, or one by one."""
     full = -(-members // LANE_WIDTH) * LANE_WIDTH
     if platform not in CHUNKED_PLATFORMS:
         return min(DEVICE_PIECE, full)
@@ -217,7 +217,7 @@ def _piece(members: int, in_lanes: bool, platform: str) -> int:
 
 
 def group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
-    """Return how the members of a group are computed: compiled once for each process."""
+    """Return the program of the members of a group, compiled once for each process."""
     return _group_run(plan, group, redundant)
 
 

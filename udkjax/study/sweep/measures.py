@@ -79,7 +79,7 @@ class Measure:
 
 
 def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Label:
-    """Label what a user's function returned, by its shape."""
+    """Label the result of a user's function by its shape."""
     dims = [f"{name}_{k}" for k in range(len(shape))]
     if shape[-2:] == (bodies, 3):
         dims[-2:] = "body", "coordinate"
@@ -163,7 +163,7 @@ _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 
 
 def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute], Compute]:
-    """Decorator of what computes a measure: its name, whether it needs all output times, and its variables."""
+    """Decorator of a function that computes a measure: its name, whether it needs all output times, and its variables."""
 
     def add(compute: Compute) -> Compute:
         MEASURES[name] = Measure(name, compute, labels, along)

@@ -135,7 +135,7 @@ class SweepPlan:
         return int(self._numbers[member])
 
     def choice(self, group: Group, setting: str) -> AxisChoice:
-        """Return what a group has for a setting: the first of its choices, where these differ by numbers."""
+        """Return a group's value of a setting: the first of its choices, where these differ by numbers."""
         for column in self.columns:
             if column.of == (setting,) and column.is_choice:
                 return column.choices[group.choices[column.name][0]]

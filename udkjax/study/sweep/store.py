@@ -46,11 +46,11 @@ class MemoryStore:
         return None
 
     def write(self, chunk: Chunk, data: Data) -> None:
-        """Store what a chunk gave: one array for each name, whose first axis is the chunk's members."""
+        """Store the results of a chunk: one array for each name, whose first axis is the chunk's members."""
         self._done.append((np.asarray(chunk.members), data))
 
     def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
-        """Iterate over what is finished: members, and their data."""
+        """Iterate over finished chunks: members, and their data."""
         yield from self._done
 
 
@@ -90,14 +90,14 @@ class FolderStore:
         self._lock.release()
 
     def write(self, chunk: Chunk, data: Data) -> None:
-        """Write what a chunk gave, whole or not at all: one array for each name, whose first axis is the chunk's members."""
+        """Write the results of a chunk, whole or not at all: one array for each name, whose first axis is the chunk's members."""
         stream = io.BytesIO()
         np.savez(stream, allow_pickle=False, **{MEMBERS: chunk.members}, **{STORED_PREFIX + name: x for name, x in data.items()})
         content = stream.getvalue()
         self._write(f"{CHUNKS}/{chunk.index:06d}-{self._sweep}-{digest(content)}.npz", content)
 
     def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
-        """Iterate over what is finished, one file at a time: members, and their data. Damaged files are removed."""
+        """Iterate over finished chunks, one file at a time: members, and their data. Damaged files are removed."""
         for file in self._files():
             try:
                 content = file.read_bytes()
@@ -112,7 +112,7 @@ class FolderStore:
             yield data.pop(MEMBERS), {name.removeprefix(STORED_PREFIX): values for name, values in data.items()}
 
     def _begin(self, sweep: dict[str, Json]) -> None:
-        """Say what the sweep is; where something is there already, compare."""
+        """Write the description of the sweep; compare it with one that is there already."""
         for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
             file.unlink(missing_ok=True)  # of a process that was killed while it wrote
         manifest = self.folder / MANIFEST
@@ -152,7 +152,7 @@ class FolderStore:
 
 
 def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Json]) -> MemoryStore | FolderStore:
-    """Return what stores the finished chunks: the folder `out`, or, without one, memory."""
+    """Return the store of finished chunks: the folder `out`, or, without one, memory."""
     return MemoryStore() if out is None else FolderStore(out, fingerprint)
 
 

@@ -74,7 +74,7 @@ class Ball(NamedTuple):
         return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
 
     def _like(self, x: Any) -> "Ball":
-        """Return what is no ball as one, of the same numbers as these."""
+        """Return numbers that are no balls as balls, of the same type as these."""
         if isinstance(x, Ball):
             return x
         return Ball.fractions(x) if self.mid.dtype == object else Ball.of(x)
@@ -94,7 +94,7 @@ class Ball(NamedTuple):
         return (_size(self.mid) / INFLATE - self.rad) / INFLATE
 
     def overlaps(self, other: "Ball") -> np.ndarray:
-        """Return where two balls may have a number in common."""
+        """Return a mask of the places where two balls may have a number in common."""
         return ~((self - other).least > 0)
 
 
@@ -123,11 +123,11 @@ class ComplexBall(NamedTuple):
         return ComplexBall(self.re.part(index), self.im.part(index))
 
     def overlaps(self, other: "ComplexBall") -> np.ndarray:
-        """Return where two may have a number in common."""
+        """Return a mask of the places where two may have a number in common."""
         return self.re.overlaps(other.re) & self.im.overlaps(other.im)
 
     def distance(self, z: np.ndarray) -> np.ndarray:
-        """Return how far any number of these may be from complex numbers, at most."""
+        """Return the largest distance of any number of these from complex numbers."""
         return np.hypot((self.re - np.real(z)).largest, (self.im - np.imag(z)).largest) * INFLATE
 
 

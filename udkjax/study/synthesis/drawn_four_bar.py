@@ -51,7 +51,7 @@ class DrawnFourBar(NamedTuple):
 
 
 def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourBar:
-    """Return what the pins of a drawing are; raise `SceneError` where it is no four-bar with `point` on its coupler."""
+    """Return the roles of a drawing's pins; raise `SceneError` where it is no four-bar with `point` on its coupler."""
     if mechanism.drawing is None:
         raise SceneError(["drawing: all solutions are found of four-bars that are drawn: give a Drawing"], mechanism.name)
     groups = mechanism.drawing.groups

@@ -81,7 +81,7 @@ def find_real_dyads(poses: np.ndarray) -> RealDyads:
 
 
 def _first_of_each(found: Certificate) -> np.ndarray:
-    """Return which boxes do not overlap one before them."""
+    """Return a mask of the boxes that do not overlap one before them."""
     keep = np.ones(len(found.is_proven), bool)
     for j, i in combinations(range(len(keep)), 2):
         keep[i] &= not (keep[j] and found.balls.part(np.s_[:, i]).overlaps(found.balls.part(np.s_[:, j])).all())

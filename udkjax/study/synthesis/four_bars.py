@@ -197,7 +197,7 @@ def _other(a: ComplexBall, b: ComplexBall, x: ComplexBall, y: ComplexBall) -> Fo
 
 
 def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float) -> np.ndarray:
-    """Return how far the pins of four-bars, as floating-point numbers, may be from the exact ones (M,), at most (m)."""
+    """Return the largest distance of four-bars' pins, as floating-point numbers, from the exact ones (M,) (m)."""
     start = ComplexBall(Ball.of(np.real(origin)), Ball.of(np.imag(origin)))
     size = ComplexBall(Ball.of(scale), Ball.of(0.0))
     pins = (bars.O, bars.C, bars.A[:, 0], bars.B[:, 0])

@@ -225,7 +225,7 @@ def class_keys(z: np.ndarray) -> np.ndarray:
 
 
 def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Return which of some solutions (M,) are in a class with others."""
+    """Return a mask of the solutions (M,) that are in a class with others."""
     found, places = np.zeros(z.shape[1], bool), np.flatnonzero(of)
     found[places[np.unique(_pairs(z[:, places]))]] = True
     return found
