@@ -120,7 +120,7 @@ def _take_end(members: RunMembers, some: Int[np.ndarray, "b"], found: StretchEnd
 
 
 def _watch(members: RunMembers, phase: int, some: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
-    """Return what machine code is told of all that it watches in a phase: sides, whether each counts, floors, directions."""
+    """Return the numbers of all that machine code watches in a phase: sides, whether each counts, floors, directions."""
     units, E = members.units, members.event_count
     where = members.watched_of(phase)
     force = units.mass[some] * units.length[some] * units.rate[some] ** 2

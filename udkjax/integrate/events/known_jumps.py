@@ -158,7 +158,7 @@ def _find_following(
     settled: Bool[np.ndarray, "b E"],
     own: Bool[np.ndarray, "b E"],
 ) -> Int[np.ndarray, "b"]:
-    """Return what happens to members right behind an event; `settled`: the contacts that took part; `own`: what has crossed."""
+    """Return the events of members right behind others; `settled`: the contacts that took part; `own`: conditions that crossed."""
     E = members.event_count
     watched = members.watched(some)[:, :E] & ~own
     unclear = watched & ~settled & (np.abs(values.h) <= ZERO * values.scale)

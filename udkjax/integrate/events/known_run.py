@@ -172,7 +172,7 @@ def event_plan(
     max_steps: int,
     max_events: int,
 ) -> EventPlan:
-    """Return what runs have in common.
+    """Return the common part of runs.
 
     Args:
         phases: the phases.

@@ -221,7 +221,7 @@ class PhaseCode:
 
 
 def _of(x: np.ndarray, some: Int[np.ndarray, "b"]) -> np.ndarray:
-    """Return what some members have of an array, or what all share."""
+    """Return the rows of some members, or the one that all share."""
     return x if len(x) == 1 else x[some]
 
 

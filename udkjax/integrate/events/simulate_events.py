@@ -99,7 +99,7 @@ def simulate_events(
 
 
 def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
-    """Return what `_run` does, where machine code alone finds it, of known numbers."""
+    """Return the result of `_run`, of known numbers; None where machine code alone does not find it."""
     is_known = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
     if given.conditions is None or not is_known or jax.config.jax_disable_jit:
         return None
