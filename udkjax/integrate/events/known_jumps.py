@@ -158,7 +158,7 @@ def _find_following(
     settled: Bool[np.ndarray, "b E"],
     own: Bool[np.ndarray, "b E"],
 ) -> Int[np.ndarray, "b"]:
-    """Return the events of members right behind others; `settled`: the contacts that took part; `own`: conditions that crossed."""
+    """Return the events right behind others; `settled`: the contacts that took part; `own`: the conditions that crossed."""
     E = members.event_count
     watched = members.watched(some)[:, :E] & ~own
     unclear = watched & ~settled & (np.abs(values.h) <= ZERO * values.scale)
