@@ -105,7 +105,7 @@ def _best(fits: Sequence[Fit]) -> Fit:
 
 
 def _count_agreeing(fits: Sequence[Fit]) -> int:
-    """Return how many fits are at the best minimum."""
+    """Return the number of fits at the best minimum."""
     best = _best(fits).z
     near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best).max())
     return sum(bool(np.isfinite(fit.cost)) and bool(np.abs(fit.z - best).max() <= near) for fit in fits)

@@ -103,7 +103,7 @@ def sweep(
 
 
 def _engine(engine: str, client: "distributed.Client | None") -> Compute:
-    """Return what computes chunks: a client that is given is there to be used."""
+    """Return the engine that computes chunks: a client that is given is there to be used."""
     return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices
 
 
@@ -209,7 +209,7 @@ def _find_slowest(before: tuple[int, T] | None, who: ArrayLike, values: ArrayLik
 
 
 def duration(seconds: float) -> str:
-    """Say how long something takes."""
+    """Return a time (s) as text."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
