@@ -237,7 +237,7 @@ _compiled, _deferred = eqx.filter_jit(_simulate), deferred(_simulate)
 def _finish(
     run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
 ) -> tuple[Solution, Any, Any]:
-    """Return what `_run` does, from what the integrator found."""
+    """Return the results of `_run`, of a run as the integrator leaves it."""
     problem, ts = run.problem, run.ts
     later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
     q, v = xp.where(later, raw.q, problem.q), xp.where(later, raw.v, problem.v)

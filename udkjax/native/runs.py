@@ -50,7 +50,7 @@ class RunStates(Operation):
         return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
 
     def plan(self, width: int, vector: int) -> Plan:
-        """Return what the module's code depends on."""
+        """Return the plan of the module's code."""
         return Plan(
             code=self.code,
             method=self.method.method,
