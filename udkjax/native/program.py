@@ -4,6 +4,7 @@ It finds its inputs and leaves its outputs in memory: all are numbers side by si
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -78,8 +79,13 @@ class Writer:
 
     def run(self) -> list[Value]:
         """Write all operations; return the outputs."""
+        nodes = self.program.graph.nodes
+        used = Counter(s.index for index in self.program.order for s in nodes[index].arguments)
+        used.update(s.index for s in self.program.outputs)
         for index in self.program.order:
-            self.known[index] = self._operation(self.program.graph.nodes[index])
+            self.known[index] = found = self._operation(nodes[index])
+            if used[index] > 1:  # fused with each sum, a product would keep two numbers in registers in place of one
+                found.product = None
         return [self._with_sign(s) for s in self.program.outputs]
 
     def _with_sign(self, s: Any) -> Value:
