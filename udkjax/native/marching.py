@@ -44,7 +44,7 @@ class Marching(Module):
         for name in ("previous dq", "previous ddq", "third derivative", "prediction"):
             self.places.add(name, self.n)
         self._rows = None
-        if len(code.eliminated_rows) == self.n and not code.marks_rows:
+        if self._has_sides:
             for name, count in (("psi_q", code.scratch["psi_q"]), ("root", self.n)):
                 if name not in self.places.places:
                     self.places.add(name, count)
@@ -60,8 +60,12 @@ class Marching(Module):
         write_run(self)
         return self.module_text()
 
+    @property
+    def _has_sides(self) -> bool:
+        return len(self.code.eliminated_rows) == self.n and not self.code.marks_rows
+
     def program_names(self) -> list[str]:
-        return ["newton_q", "value_derivatives", "dense_newton_q"]
+        return ["newton_q", "value_derivatives", *(["dense_newton_q"] if self._has_sides else [])]
 
     @property
     def arrays(self) -> dict[str, Place]:
