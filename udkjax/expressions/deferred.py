@@ -93,7 +93,9 @@ class _Known:
     def __init__(self, value: Any):
         self.value = value
         content = np.asarray(value) if isinstance(value, float | jax.Array | np.ndarray | np.generic) else value
-        self._key = (content.shape, content.dtype.str, content.tobytes()) if isinstance(content, np.ndarray) else content
+        if isinstance(content, np.ndarray):
+            content = content.shape, content.dtype.str, content.tobytes()
+        self._key = content if isinstance(content, Hashable) else id(content)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Known) and type(self.value) is type(other.value) and self._key == other._key

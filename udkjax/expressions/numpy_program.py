@@ -41,7 +41,7 @@ class TooLongError(Exception):
 class Meter:
     """Counts operations, of many entries as several, and ends an evaluation that takes more than `limit`."""
 
-    def __init__(self, limit: int):
+    def __init__(self, limit: float):
         self.count, self.limit = 0, limit
 
     def add(self, operations: int) -> None:

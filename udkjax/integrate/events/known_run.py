@@ -1,5 +1,6 @@
 """Runs with events by machine code, as functions of arrays: called at once, or from compiled programs of JAX."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,7 +31,6 @@ from udkjax.native.conditions import Conditions
 from udkjax.native.host_function import call_host
 from udkjax.scene.identity_cache import cached_by_identity
 
-MOST_OPERATIONS = 10**12  # of NumPy: there is no limit
 SHARED = 9  # arrays of a run besides those of its phases
 
 
@@ -52,7 +52,7 @@ class PlainForm:
     def __call__(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         given = [x.astype(dtype) for x, (_, dtype) in zip(arrays, self.shapes, strict=True)]
         with np.errstate(all="ignore"):
-            return numpy_program(_plain_program(self))(Meter(MOST_OPERATIONS), given)
+            return numpy_program(_plain_program(self))(Meter(math.inf), given)
 
 
 @lru_cache(maxsize=64)

@@ -96,10 +96,6 @@ class RunMembers:
         self.together, self.closed = np.zeros((B, K + 1), bool), np.zeros((B, K + 1, E), int)
 
     @property
-    def _count(self) -> int:
-        return len(self.plan.directions)
-
-    @property
     def event_count(self) -> int:
         """The number E of events."""
         return len(self.plan.directions)
