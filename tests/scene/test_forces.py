@@ -62,6 +62,18 @@ def test_spring_pulls_with_stiffness_times_stretch():
     assert jnp.isfinite(jax.grad(energy)(0.0))  # its ends meet
 
 
+def test_a_spring_without_a_length_is_smooth_where_its_ends_meet():
+    ground = udk.Frame(0.0, 0.0, 0.0, 1.0, 0.0)
+
+    def energy(numbers):  # x, y, length
+        spring = udk.Spring(["ground", "a"], [[0.0, 0.0], [0.0, 0.0]], stiffness=10.0, length=numbers[2])
+        return spring.potential(0.0, ground, udk.Frame(numbers[0], numbers[1], 0.0, 1.0, 0.0))
+
+    assert_allclose(jax.hessian(energy)(jnp.zeros(3)), np.diag([10.0, 10.0, 10.0]))
+    away = jnp.array([0.3, -0.4, 0.0])  # 1/2 k (|d| - L)^2, |d| = 0.5
+    assert_allclose(jax.grad(energy)(away), [3.0, -4.0, -5.0])
+
+
 def test_torsion_spring_and_friction(everything, at):
     loads = total_loads(everything, "torsion", at, everything.q0, V)
     turned, omega = everything.q0[0, 2] - everything.q0[1, 2], V[0, 2] - V[1, 2]

@@ -76,7 +76,11 @@ class Spring(ForceElement):
     damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
 
     def potential(self, t, *frames):
-        return 0.5 * self.stiffness * (between(self.points, *frames).norm() - self.length) ** 2
+        d = between(self.points, *frames)
+        distance = d.norm()
+        # Where the ends meet, |d| has a kink, but the energy of a spring without a length has none: its |d|^2 is d.d.
+        square = jnp.where(self.length > 0, (distance - self.length) ** 2, d.dot(d) - (2 * distance - self.length) * self.length)
+        return 0.5 * self.stiffness * square
 
     def loads(self, t, *frames):
         if self.damping is None:
