@@ -284,9 +284,9 @@ class _Draw:
                 kind = str(self.pick.choice(["revolute", "distance", "angle", "slot", "weld"]))
                 found.append(getattr(self, f"_{kind}")(one, two))
             elif joint["type"] == "revolute" and self._is(0.1):
-                found.append(joint | {"type": "slot", "axis": float(self.of.uniform(-np.pi, np.pi))})
+                found.append(copy.deepcopy(joint) | {"type": "slot", "axis": float(self.of.uniform(-np.pi, np.pi))})
             elif joint["type"] == "prismatic" and self._is(0.3):
-                found.append({"type": "angle", "bodies": [one, two]} if self._is(0.5) else joint | {"type": "slot"})
+                found.append({"type": "angle", "bodies": [one, two]} if self._is(0.5) else copy.deepcopy(joint) | {"type": "slot"})
         return found
 
     def _driver(self, k: int) -> Table:

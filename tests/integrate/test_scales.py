@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.special import ellipk
 
 import udkjax as udk
 from tests.choices import fast
@@ -181,3 +182,17 @@ def test_arms_and_rows_of_rounding_are_none(x):
     length = np.sqrt(0.1)  # the radius of gyration: there is no arm
     assert_allclose([found.length, found.arm], length, rtol=1e-12)
     assert_allclose(found.rows, length, rtol=1e-12)
+
+
+@pytest.mark.parametrize("inertia", [1e-10, 1e-16])
+def test_a_point_mass_swings(inertia):
+    """What hardly resists turning brings the row along the rod down to the root of I / m l^2 of the largest."""
+    start, omega = 0.7, np.sqrt(9.81)
+    place = [np.sin(start), -np.cos(start)]
+    bob = udk.Mechanism(
+        {"bob": udk.Body(1.0, inertia, place, start)}, {"O": udk.Revolute(["ground", "bob"], [[0.0, 0.0], [0.0, 1.0]])}
+    )
+    half_period = 2 * ellipk(np.sin(start / 2) ** 2) / omega
+    assert_allclose(udk.simulate(bob, [0.0, half_period]).q[-1, 0, 2], -start, rtol=1e-6)
+    below = udk.State([[0.0, -1.0, 0.0]], [[0.0, 0.0, 0.0]])
+    assert_allclose(udk.modes(bob, below).frequencies, omega, rtol=1e-9)

@@ -10,7 +10,7 @@ import numpy as np
 
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import Scales, known_scales, mass_of, rank_tolerance
+from udkjax.equations.scales import Scales, known_scales, mass_of
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.fields import ROUNDING
@@ -84,7 +84,7 @@ class DenseRows(DenseTerms):
     def __init__(self, mechanism: Mechanism, scales: Scales):
         super().__init__(mechanism)
         self.scales = jax.tree.map(np.asarray, scales)
-        self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(rank_tolerance(mechanism))
+        self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(scales.rank_tol)
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi and Psi_dot."""

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.equations.scene_arrays import SceneArrays
@@ -23,7 +22,7 @@ from udkjax.scene.mechanism import Mechanism
 # Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
 # ordinary positions. With the states returned to the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
-ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `rank_tolerance`
+ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `Scales.rank_tol`
 
 
 class GuessTerms(NamedTuple):
@@ -39,13 +38,20 @@ class GuessTerms(NamedTuple):
 
 @prints_table
 class Scales(NamedTuple):
-    """The units of lengths, rates, masses and rows of Psi; arrays without derivatives."""
+    """The units of lengths, rates, masses and rows of Psi, and the rank threshold of D; arrays without derivatives.
+
+    `rank_tol` is `RANK_TOL`, less where masses are far apart. Where a light body carries a heavy one the singular values of
+    D = Psi_q M^(-1/2) are as far apart as the roots of the masses, in any position: a ratio of 1e8 brings a constraint between
+    them down to 1e-4 of the largest. So does a body that hardly resists turning, such as a point mass at the end of a rod: to a
+    row with an arm r it is as light as 1 / (1 / m + r^2 / I).
+    """
 
     length: Float[Array, ""]  # m
     arm: Float[Array, ""]  # m; the longest of a constraint, masses aside; `length` where there is none
     rate: Float[Array, ""]  # 1/s; 0 where nothing moves and nothing pulls
     mass: Float[Array, ""]  # kg
     rows: Float[Array, "m"]  # m, rad or whatever the row is in
+    rank_tol: Float[Array, ""]  # of D, its rows weighted, relative to its largest singular value
 
     _units = units(length="m", arm="m", rate="1/s", mass="kg")
 
@@ -150,21 +156,13 @@ def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales
     def largest(x: NumericArray) -> NumericArray:
         return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)
 
+    body = pair % len(mass)
+    yields = (moved**2 / mass[body] + turned**2 / inertia[body]) * (length / scale[row]) ** 2  # 1/kg, of a row at a body
+    rank_tol = RANK_TOL / xp.sqrt(xp.maximum(1.0, largest(yields) * xp.max(mass) / ORDINARY_MASS_RATIO))
+
     unit = xp.tile(xp.stack([length, length, xp.ones_like(length)]), len(mass))
     v = xp.asarray(mechanism.v0).ravel()
     # An acceleration a lets a pendulum of length L swing to and fro in pi sqrt(L / a) each.
     swings = (xp.sqrt(largest(x)) / np.pi for x in (free / unit, gamma / scale))
     rates = [largest(v / unit), largest(psi_t / scale), *swings]
-    return Scales(length, arm, reduce(xp.maximum, rates), xp.max(mass), scale)
-
-
-def rank_tolerance(mechanism: Mechanism) -> Float[Array, ""]:
-    """Return `RANK_TOL`, less where masses are far apart.
-
-    Where a light body carries a heavy one the singular values of D = Psi_q M^(-1/2) are as far apart as the roots of the masses,
-    in any position: a ratio of 1e8 brings a constraint between them down to 1e-4 of the largest.
-    """
-    masses = numbers_as_vector([body.mass for body in mechanism.bodies.values()])
-    xp: ArrayLibrary = jnp if isinstance(masses, Tracer) else np  # while something is traced, jnp would trace what is known, too
-    ratio = xp.min(masses) / xp.max(masses)
-    return jax.lax.stop_gradient(number(RANK_TOL * xp.minimum(1.0, xp.sqrt(ORDINARY_MASS_RATIO * ratio))))
+    return Scales(length, arm, reduce(xp.maximum, rates), xp.max(mass), scale, rank_tol)

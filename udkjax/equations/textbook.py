@@ -10,7 +10,7 @@ from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart, Time, Vector
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.scales import Scales
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
@@ -121,7 +121,7 @@ def prepare(
 
     Args:
         mechanism: The scene; its numbers may be traced.
-        method: The pseudoinverse, by default `Auto`; without a `rank_tol` it gets `rank_tolerance`.
+        method: The pseudoinverse, by default `Auto`; without a `rank_tol` it gets that of the scales.
         baumgarte: Gains to feed violations back; None: no stabilization.
         analysis: The mechanism's `Analysis`; by default made here.
 
@@ -134,7 +134,7 @@ def prepare(
     analysis = analyse(mechanism) if analysis is None else analysis
     mechanism = mechanism.without_origin
     chosen = Auto() if method is None else method
-    tol = rank_tolerance(mechanism) if chosen.rank_tol is None else chosen.rank_tol
+    tol = analysis.scales.rank_tol if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     if isinstance(chosen, Elimination) and not chosen.relative:
         raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")

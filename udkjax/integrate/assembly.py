@@ -25,7 +25,7 @@ from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.position_closure import is_closed
 from udkjax.equations.redundancy import dependent_constraints
-from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate import native_closing
@@ -143,7 +143,7 @@ def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, 
     if scene_programs(mechanism).is_small:  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_closing.can_close(mechanism):
-        return native_closing.close_known(mechanism.at(t), scales, rank_tolerance(mechanism), t, q, v)
+        return native_closing.close_known(mechanism.at(t), scales, t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
     return SparseRows(mechanism).assemble(t, q, v)

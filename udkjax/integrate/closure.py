@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, TracedRows, close_position, damped_step
-from udkjax.equations.scales import Scales, rank_tolerance
+from udkjax.equations.scales import Scales
 from udkjax.equations.textbook import prepare
 from udkjax.integrate import native_closing
 from udkjax.integrate.linear_map import DifferentiableFunction, Linear
@@ -18,7 +18,7 @@ from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 
 Closed = Assembly[Array]
-NativeGuess = tuple[Mechanism, Scales, Float[Array, ""], Array, Array, Array]  # mechanism, scales, rank tolerance, t, q, v
+NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales, t, q, v
 
 
 def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
@@ -87,7 +87,7 @@ class AssemblyFunction(DifferentiableFunction):
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
         if others or not native_closing.can_close(mechanism):
             return None, None
-        return (mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v), which
+        return (mechanism, analysis.scales, t, q, v), which
 
 
 def _native_inputs(tree: PyTree) -> PyTree:
@@ -99,7 +99,7 @@ def _native_inputs(tree: PyTree) -> PyTree:
 @eqx.filter_custom_jvp
 def _close_by_code(function: AssemblyFunction, xs: list[Array]) -> Closed:
     mechanism, analysis, t, q, v = function.guess(xs)
-    return native_closing.close(mechanism, analysis.scales, rank_tolerance(mechanism), t, q, v)
+    return native_closing.close(mechanism, analysis.scales, t, q, v)
 
 
 @_close_by_code.def_jvp

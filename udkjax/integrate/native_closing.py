@@ -28,14 +28,14 @@ def can_close(mechanism: Mechanism) -> bool:
     return not unsupported(_close(mechanism).code)
 
 
-def close(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:
+def close(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
     """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, at time t."""
-    return _unpack(native_p.bind(*_inputs(mechanism, scales, tol, t, q, v), operation=_close(mechanism), times=2), len(q))
+    return _unpack(native_p.bind(*_inputs(mechanism, scales, t, q, v), operation=_close(mechanism), times=2), len(q))
 
 
-def close_known(mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any) -> Closed:
+def close_known(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
     """Close with known numbers, without tracing anything."""
-    return _unpack(call_known(_close(mechanism), _inputs(mechanism, scales, tol, t, q, v, np), 2), len(q))
+    return _unpack(call_known(_close(mechanism), _inputs(mechanism, scales, t, q, v, np), 2), len(q))
 
 
 def _unpack(found: Sequence[Any], n: int) -> Closed:
@@ -45,7 +45,7 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 
 
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
-    """Return the changes of q and v along a `change` of what is active of (mechanism, scales, tol, t, q, v)."""
+    """Return the changes of q and v along a `change` of what is active of (mechanism, scales, t, q, v)."""
     operation = CloseTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
     return _close_along(guess, operation, (active, change))
 
@@ -75,11 +75,9 @@ def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
     return found, *(x if m is True else None for x, m in zip(states, active[-2:], strict=True))
 
 
-def _inputs(
-    mechanism: Mechanism, scales: Scales, tol: ArrayLike, t: ArrayLike, q: Any, v: Any, xp: ModuleType = jnp
-) -> list[Any]:
-    settings, ts = {"length": scales.length, "fallback_tol": tol}, numbers_as_vector([t, t])
-    numbers = [*mechanism.numbers, tol**2, 0.0]
+def _inputs(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any, xp: ModuleType = jnp) -> list[Any]:
+    settings, ts = {"length": scales.length, "fallback_tol": scales.rank_tol}, numbers_as_vector([t, t])
+    numbers = [*mechanism.numbers, scales.rank_tol**2, 0.0]
     return _close(mechanism).pack(numbers, ts, q, v, settings, scales.rows, xp=xp)
 
 

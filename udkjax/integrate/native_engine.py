@@ -12,7 +12,6 @@ from jaxtyping import Array
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.formulations import FormulatedSystem
-from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
@@ -168,7 +167,7 @@ def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPo
     method: Any = textbook.method
     rank_tol = method.rank_tol
     # Elimination, by which derivatives of all methods are taken, has relative thresholds.
-    relative_tol = rank_tol if method.relative else rank_tolerance(textbook.mechanism)
+    relative_tol = rank_tol if method.relative else textbook.scales.rank_tol
     safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
     drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
@@ -202,7 +201,7 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
     equations = compiled.textbook
     mechanism = equations.mechanism.at(t)
     finding = MarkRows(scene_programs(mechanism).with_all_rows)
-    tol = rank_tolerance(mechanism)
+    tol = equations.scales.rank_tol
     settings = {"length": length, "omega": rate}
     numbers = [*mechanism.numbers, tol**2, 0.0]
     given = finding.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)

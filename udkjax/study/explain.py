@@ -12,7 +12,6 @@ from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import left_null_space, uniqueness
-from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import State, assemble
@@ -52,7 +51,7 @@ def explain(
     state = assemble(mechanism, t, state)
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)
-    symbols = _symbols(mechanism.without_origin, analysis, number(t), q, v, stabilization, rank_tolerance(mechanism))
+    symbols = _symbols(mechanism.without_origin, analysis, number(t), q, v, stabilization, analysis.scales.rank_tol)
     s = {name: np.asarray(value) for name, value in symbols.items()}
     rank, null_rows = int(s.pop("rank")), s.pop("null_rows")
     return Explanation(

@@ -21,7 +21,6 @@ from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.control_flow import BY_JAX, ControlFlow
-from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.scene.mechanism import Mechanism
 
@@ -49,7 +48,7 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
     V = _null_space(uk.D(mechanism, t, q, w), free) if mechanism.constraints else jnp.eye(len(q))
     if mechanism.constraints:
         D = uk.D(mechanism, t, q, w)
-        plus = SVD(RANK_TOL).plus(D)
+        plus = SVD(analysis.scales.rank_tol).plus(D)
         N = root[:, None] * (V - plus @ (D @ V))
         multipliers = w * (plus.T @ (root * F(q, still)))
     else:

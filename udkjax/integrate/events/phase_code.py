@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import places_of_joints
@@ -67,11 +66,10 @@ def phase_plan(
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
     """Return the arrays of a phase, with the member first."""
-    mechanism = problem.textbook.mechanism
     if plan.marking is not None:
         problem = replace(problem, marks=np.ones(plan.run.code.row_count))
     inputs = run_inputs(problem, plan.run, xp)
-    tol = rank_tolerance(mechanism) ** 2 if plan.marking is not None else 0.0
+    tol = problem.textbook.scales.rank_tol ** 2 if plan.marking is not None else 0.0
     return [
         *inputs[: STATE.start],
         *inputs[STATE.stop : len(INPUTS)],

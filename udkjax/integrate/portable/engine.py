@@ -11,7 +11,6 @@ import numpy as np
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
-from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import compile_known
@@ -107,7 +106,7 @@ def portable_engine(
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
     data["why"] = problem.compiled.plan.why_not_native
-    modules = {"close": _close(dressed, data)}
+    modules = {"close": _close(dressed, analysis, data)}
     if data["marks"]:
         modules["mark"] = _operation(MarkRows(scene_programs(dressed).with_all_rows))
     if runs and not data["why"]:
@@ -186,9 +185,9 @@ def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
     return modules
 
 
-def _close(mechanism: Mechanism, data: Json) -> Json:
+def _close(mechanism: Mechanism, analysis: Analysis, data: Json) -> Json:
     """Return the module of closing; its inputs go into the data."""
-    tol = float(rank_tolerance(mechanism))
+    tol = float(analysis.scales.rank_tol)
     settings = [data["scales"]["length"], tol]
     data["closing"] = {"thresholds": [tol**2, 0.0], "settings": settings, "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}
     return _operation(Close(scene_programs(mechanism).with_all_rows))

@@ -13,7 +13,6 @@ from typing_extensions import TypeAliasType
 
 from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.quantities import energy, violation
-from udkjax.equations.scales import rank_tolerance
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
@@ -230,9 +229,9 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     """Compute ranks by the method's own rule; that of `Auto` is the rule of the singular values that it falls back to."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
-    if method.rank_tol is None:
-        method = replace(method, rank_tol=rank_tolerance(run.mechanism))
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
+    if method.rank_tol is None:
+        method = replace(method, rank_tol=equations.scales.rank_tol)
     reached = jnp.all(jnp.isfinite(q), axis=1)
     ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
     return {"rank": jnp.where(reached, ranks, RANK_NOT_REACHED)}
