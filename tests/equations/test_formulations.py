@@ -270,3 +270,12 @@ def test_completion_has_derivatives(linkage, placed):
     dependent = jnp.tile(~independent, 2)
     assert_allclose(jacobian[:, dependent], 0.0, atol=1e-11)
     assert_allclose(backward, jacobian, atol=1e-11)
+
+
+def test_partitioning_keeps_the_rod_of_a_point_mass():
+    bob = udk.Mechanism(
+        {"bob": udk.Body(1.0, 1e-12, [0.6, -0.8], np.arcsin(0.6))},
+        {"O": udk.Revolute(["ground", "bob"], [[0.0, 0.0], [0.0, 1.0]])},
+    )
+    a = udk.accelerations(bob, 0.0, bob.q0, bob.v0, formulation=udk.CoordinatePartitioning())
+    assert_allclose(a[0], -9.81 * 0.6 * np.array([0.8, 0.6, 1.0]), rtol=1e-6)

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Time, Vector
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
 from udkjax.equations.position_closure import LONGEST_STEP
-from udkjax.equations.scales import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.scene.fields import number_called
@@ -41,10 +40,11 @@ class CoordinatePartitioning(Formulation):
     Mechanisms only, since the rows of a `ConstrainedSystem` may be nonholonomic.
 
     Args:
-        rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
+        rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: that of D, less where
+            masses are far apart.
     """
 
-    rank_tol: Float[Array, ""] = eqx.field(converter=number_called("rank_tol"), default=RANK_TOL)
+    rank_tol: Float[Array, ""] | None = eqx.field(converter=number_called("rank_tol", optional=True), default=None)
 
     def formulate(self, equations: AbstractSystem) -> "PartitionedSystem":
         if not isinstance(equations, MechanismSystem):
@@ -90,7 +90,7 @@ class PartitionedSystem(WrappedSystem):
         D = self.equations.weighted_rows(t, q)[0]
         if not len(D):
             return PartitionedSystem(self.equations, self.formulation, jnp.zeros(len(q), bool))
-        _, _, order, rank = complete_qr(D, self.formulation.rank_tol * jnp.linalg.norm(D, axis=0).max())
+        _, _, order, rank = complete_qr(D, self._tol * jnp.linalg.norm(D, axis=0).max())
         dependent = jnp.zeros(len(q), bool).at[order].set(jnp.arange(len(order)) < rank)
         return PartitionedSystem(self.equations, self.formulation, jax.lax.stop_gradient(dependent))
 
@@ -105,9 +105,14 @@ class PartitionedSystem(WrappedSystem):
             raise ValueError("no partition is fixed: call fix_partition first")
         return self.dependent
 
+    @property
+    def _tol(self) -> Float[Array, ""]:
+        given = self.formulation.rank_tol
+        return self.equations.scales.rank_tol if given is None else given
+
     def _plus(self, D: Float[Array, "m n"]) -> Plus:
         """D^+ of the dependent columns: zero for the others."""
-        return SVD(self.formulation.rank_tol).plus(jnp.where(self.dependent_columns, D, 0))
+        return SVD(self._tol).plus(jnp.where(self.dependent_columns, D, 0))
 
 
 # Derivatives. Where the partition is fixed, Psi(t, q_d, q_i) = 0 makes q_d a function of the rest. One Newton step from a state
