@@ -286,7 +286,8 @@ class _Draw:
             elif joint["type"] == "revolute" and self._is(0.1):
                 found.append(copy.deepcopy(joint) | {"type": "slot", "axis": float(self.of.uniform(-np.pi, np.pi))})
             elif joint["type"] == "prismatic" and self._is(0.3):
-                found.append({"type": "angle", "bodies": [one, two]} if self._is(0.5) else copy.deepcopy(joint) | {"type": "slot"})
+                same = copy.deepcopy(joint) | {"type": "slot"}
+                found.append({"type": "angle", "bodies": [one, two]} if self._is(0.5) else same)
         return found
 
     def _driver(self, k: int) -> Table:
