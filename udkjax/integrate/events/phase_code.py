@@ -69,7 +69,7 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
     if plan.marking is not None:
         problem = replace(problem, marks=np.ones(plan.run.code.row_count))
     inputs = run_inputs(problem, plan.run, xp)
-    tol = problem.textbook.scales.rank_tol ** 2 if plan.marking is not None else 0.0
+    tol = problem.textbook.scales.rank_tol**2 if plan.marking is not None else 0.0
     return [
         *inputs[: STATE.start],
         *inputs[STATE.stop : len(INPUTS)],
