@@ -11,8 +11,10 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from udkjax.equations import constraints, loads, prepare
-from udkjax.equations.scene_arrays import arrays_in_time
+from udkjax.equations.dense_rows import DenseTerms
+from udkjax.equations.scene_arrays import SceneArrays, _evaluator, arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
+from udkjax.expressions import loop_program
 from udkjax.pinv.rank_policy import RankPolicy
 
 
@@ -259,3 +261,36 @@ def test_energies_along_a_motion(machine):
         assert_allclose(found.kinetic[k], loads.kinetic_energy(machine, v), rtol=1e-13)
         assert_allclose(found.potential[k], loads.potential_energy(machine, t, q, v), rtol=1e-13)
     assert_allclose(found.total, found.kinetic + found.potential, rtol=1e-15)
+
+
+def test_floats_and_arrays_find_the_same(monkeypatch):
+    """Scenes of few elements are evaluated by Python's floats, others, and what is not finite, by NumPy's arrays."""
+    names = ("revolute", "prismatic", "slot", "weld")
+    mechanism = udk.Mechanism(BODIES, {name: JOINTS[name] for name in names}, forces={"push": FORCES["push"]})
+    q, v = np.asarray(mechanism.q0).ravel(), np.linspace(-1.0, 1.0, mechanism.q0.size)
+    states = [(q, v)] * 25 + [(np.full_like(q, np.inf), v)]  # the first ones step by step, later ones by what was written of it
+
+    def evaluate(few):
+        monkeypatch.setattr(loop_program, "FEW_ROWS", few)
+        _evaluator.cache_clear()
+        at = arrays_in_time(mechanism)(0.3)
+        return [np.concatenate([at.psi(0.3, q), *at.geometry(0.3, q, v), *at.loads(0.3, q, v)]) for q, v in states]
+
+    few = loop_program.FEW_ROWS
+    by_arrays, by_floats = evaluate(0), evaluate(few)
+    assert loop_program.ArrayLoops(scene_programs(mechanism).geometry, np)._short_parts
+    assert_allclose(by_floats, by_arrays, rtol=1e-12, atol=1e-12)
+    assert np.isnan(by_floats[-1]).any() and np.isfinite(by_floats[:-1]).all()
+
+
+def test_one_position_is_evaluated_once(monkeypatch):
+    runs, run = [], SceneArrays._run
+    monkeypatch.setattr(SceneArrays, "_run", lambda self, name, *state: runs.append(name) or run(self, name, *state))
+    mechanism = udk.library.four_bar()
+    terms, q = DenseTerms(mechanism), np.array(mechanism.q0).ravel()
+    slopes, psi = terms.slopes(0.0, q)[0], terms.psi(0.0, q)
+    assert_allclose(terms.slopes(0.0, q + 0.0)[0], slopes)
+    assert runs == ["geometry"]
+    assert not np.allclose(terms.psi(0.0, q + 0.1), psi)  # of another position
+    q += 0.1  # and of the same array with other numbers
+    assert not np.allclose(terms.slopes(0.0, q)[0], slopes)

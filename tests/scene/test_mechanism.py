@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from tests.elements import P
+from udkjax.scene import given_elements
 from udkjax.scene.checks import traced_numbers_hold
 
 
@@ -248,3 +249,21 @@ def test_traced_numbers_are_looked_at_as_known_ones_are(everything):
     for owner, name in {(type(owner), name): (owner, name) for owner, name in found}.values():
         assert hold(owner)
         assert not hold(eqx.tree_at(lambda x, name=name: getattr(x, name), owner, -getattr(owner, name)))
+
+
+def test_what_takes_nothing_from_the_guess_is_not_completed_again(monkeypatch):
+    """A change of one number is no work for the hundreds of rods of a truss: they have their lengths."""
+    pair = ["a", "b"]
+    joints = {
+        "rod": udk.Distance(pair, P),
+        "weld": udk.Weld(pair, P),
+        "slide": udk.Prismatic(pair, P, axis=0.1),
+        "turn": udk.Angle(pair),
+    }
+    bodies = {"a": udk.Body(1.0, 1.0), "b": udk.Body(1.0, 1.0, [1.0, 0.0], 0.2)}
+    mechanism = udk.Mechanism(bodies, joints)
+    monkeypatch.setattr(given_elements, "Frame", None)  # which completing an element asks for
+    changed = mechanism.with_parameters({"body.a.mass": 2.0})
+    assert_allclose(changed.joints["rod"].length, mechanism.joints["rod"].length)
+    with pytest.raises(AttributeError):
+        udk.Mechanism(bodies, {"rod": udk.Distance(pair, P)})

@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 import udkjax as udk
 from udkjax.scene import GROUND, Prismatic, Revolute, Slot
 from udkjax.study.accuracy import pendulum
+from udkjax.study.diagnosis import fixes
 
 COS, SIN = Fraction(3, 5), Fraction(4, 5)
 ANGLE = float(np.arctan2(4.0, 3.0))
@@ -362,3 +363,17 @@ def test_traced_numbers_are_refused():
 
     with pytest.raises(ValueError, match="known numbers"):
         jax.jit(ask)(1.0)
+
+
+def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
+    """Two braced cells of six bars: each bar has a fix; of the second step of the cure the best one alone is verified."""
+    bodies = {f"{k}{i}": udk.Body(1.0, 0.01, [float(k), float(i)]) for k in range(3) for i in (0, 1)}
+    pairs = [(f"{k}{i}", f"{k + 1}{j}") for k in (0, 1) for i in (0, 1) for j in (0, 1)] + [(f"{k}0", f"{k}1") for k in range(3)]
+    joints: dict[str, Any] = {f"{a} {b}": udk.Distance([a, b], [[0.0, 0.0]] * 2) for a, b in pairs}
+    joints["pin"] = Revolute([GROUND, "00"], [[0.0, 0.0]] * 2)
+    built, apply = [], fixes.apply_change
+    monkeypatch.setattr(fixes, "apply_change", lambda *given: built.append(given) or apply(*given))
+    found = udk.diagnose(udk.Mechanism(bodies, joints), walk=False)
+    assert len(found.redundancies) == 2 and len(found.cure) == 2
+    assert found.cured is not None and udk.analyse(found.cured).redundant == ()
+    assert len(built) == sum(len(r.fixes) for r in found.redundancies) + 1

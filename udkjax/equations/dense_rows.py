@@ -3,7 +3,7 @@
 With them a mechanism is closed, and its redundant rows are found (redundancy.py).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -44,6 +44,10 @@ class TruncatedPseudoinverse(NamedTuple):
         return self.vt.T @ (self.inverse * (self.u.T @ b))
 
 
+def _key(t: Time, q: np.ndarray) -> tuple[bytes, bytes]:
+    return np.asarray(t, float).tobytes(), q.tobytes()
+
+
 class RowTerms:
     """Psi of a mechanism with known numbers, Psi_dot and the entries of Psi_q, by NumPy on the scene's programs."""
 
@@ -52,14 +56,20 @@ class RowTerms:
         self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self._arrays_at = arrays_in_time(mechanism)
+        self._latest: tuple[Any, bytes, Any] = ((), b"", None)  # position, velocity, and what was found there
 
     def geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q."""
-        return self._arrays_at(t).geometry(t, q, v)
+        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q: of one state once, though several ask for it."""
+        position, velocity = _key(t, q), v.tobytes()
+        latest = self._latest
+        if latest[:2] != (position, velocity):
+            self._latest = latest = position, velocity, self._arrays_at(t).geometry(t, q, v)
+        return latest[2]
 
     def psi(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Return Psi (m,)."""
-        return self._arrays_at(t).psi(t, q)
+        position, _, found = self._latest
+        return found[0] if position == _key(t, q) else self._arrays_at(t).psi(t, q)
 
 
 class DenseTerms(RowTerms):

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.given_elements import attached_bodies
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
@@ -31,6 +32,7 @@ Element: TypeAlias = Constraint | ForceElement
 Result = TypeVar("Result")
 
 
+@cached_by_identity  # also of traced numbers: what is stored holds none of them
 def structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
     """Return the tree of a mechanism, and the shape and the type of each of its numbers: the same for any number of samples."""
     return _structure(mechanism.without_origin.without_samples)

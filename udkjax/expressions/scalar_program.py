@@ -32,6 +32,7 @@ _NUMBER_FUNCTIONS: dict[str, Callable] = {
     "min": lambda a, b: a if a < b or a != a else b,
     "neg": operator.neg,
     "select_n": lambda which, *cases: cases[int(which)],
+    "sign": lambda x: x if x != x else float((x > 0) - (x < 0)),
     "square": lambda x: x * x,
 }
 # The same of NumPy's arrays, element by element.
@@ -57,7 +58,49 @@ _OPERATORS: dict[str, tuple[Callable, Callable]] = {
 }
 
 
-Steps: TypeAlias = tuple[list[tuple[Callable, list[int]]], list[int]]
+_SYMBOLS: dict[Callable, str] = {operator.add: "+", operator.sub: "-", operator.mul: "*", operator.truediv: "/"}
+_WORTH_WRITING = (
+    20  # runs of steps one by one that take as long as writing them as a function of Python, which is 3 times as fast
+)
+
+
+class _Steps:
+    """Functions that are called one after another, each with numbers among the given ones and the results so far."""
+
+    def __init__(self, given: int, steps: list[tuple[Callable, list[int]]], outputs: list[int]):
+        self._given, self._steps, self._outputs = given, steps, outputs
+        self._runs, self._function = 0, None
+
+    def __call__(self, values: Sequence[Value]) -> list[Value]:
+        if self._function is None:
+            self._runs += 1
+            if self._runs <= _WORTH_WRITING:
+                known: list[Value] = [*values]
+                for function, places in self._steps:
+                    known.append(function(*[known[k] for k in places]))
+                return [known[k] for k in self._outputs]
+            self._function = self._write()
+        return self._function(values)
+
+    def _write(self) -> Callable[[Sequence[Value]], list[Value]]:
+        """Return the steps as one function of Python."""
+        lines = ["def run(values):"]
+        if self._given:
+            lines.append(f" {''.join(f'x{k}, ' for k in range(self._given))} = values")
+        functions: dict[str, Any] = {}
+        for k, (function, places) in enumerate(self._steps, self._given):
+            arguments = [f"x{p}" for p in places]
+            if function in _SYMBOLS:
+                found = f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}"
+            elif function is operator.neg:
+                found = f"-{arguments[0]}"
+            else:
+                functions[f"f{k}"] = function
+                found = f"f{k}({', '.join(arguments)})"
+            lines.append(f" x{k} = {found}")
+        lines.append(f" return [{', '.join(f'x{k}' for k in self._outputs)}]")
+        exec("\n".join(lines), functions)
+        return functions["run"]
 
 
 class ScalarProgram:
@@ -83,10 +126,10 @@ class ScalarProgram:
     def __call__(self, values: Sequence[Value]) -> list[Value]:
         if all(isinstance(v, float | int) for v in values):
             try:
-                return self._run_on_floats(values)
+                return self.on_floats(values)
             except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
                 with np.errstate(all="ignore"):
-                    return _run_steps(self._steps_on_arrays, [np.float64(v) for v in values])
+                    return self._steps_on_arrays([np.float64(v) for v in values])
         return self._traced(self._typed(values))
 
     def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -96,7 +139,7 @@ class ScalarProgram:
             if self._calls_arrays:  # one row after the other
                 found = [self([float(v[k]) for v in values]) for k in range(shape[0])]
                 return [np.array(x, float) for x in zip(*found, strict=True)]
-            found = _run_steps(self._steps_on_arrays, values)
+            found = self._steps_on_arrays(values)
         return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in found]
 
     @cached_property
@@ -115,19 +158,22 @@ class ScalarProgram:
             known[index] = _evaluate(node, [_signed(known, a) for a in node.arguments])
         return [_signed(known, s) for s in self.outputs]
 
-    def _run_on_floats(self, values: Sequence[float]) -> list[Value]:
-        return _run_steps(self._steps_on_floats, values)
-
     @cached_property
-    def _steps_on_floats(self) -> Steps:
+    def on_floats(self) -> Callable[[Sequence[float]], list[Value]]:
+        """The program on Python's floats, with its errors where a result is not finite."""
         return self._steps(_function_of_floats)
 
     @cached_property
-    def _steps_on_arrays(self) -> Steps:
+    def is_plain(self) -> bool:
+        """True if Python's own functions of floats compute all of it, without calls of JAX."""
+        nodes = (self.graph.nodes[i] for i in self.order)
+        return all(n.kind == "constant" or _plain_function(n, math, _NUMBER_FUNCTIONS) for n in nodes)
+
+    @cached_property
+    def _steps_on_arrays(self) -> _Steps:
         return self._steps(_function_of_arrays)
 
-    def _steps(self, function_of: Callable[[Node], Callable]) -> Steps:
-        """Each step's function and where its arguments are among the inputs and the steps' results; where the outputs are."""
+    def _steps(self, function_of: Callable[[Node], Callable]) -> _Steps:
         places, steps = {(s.index, 1): k for k, s in enumerate(self.inputs)}, []
 
         def append(key: tuple[int, int], function: Callable, arguments: list[int]) -> None:
@@ -142,7 +188,8 @@ class ScalarProgram:
         for index in self.order:
             node = self.graph.nodes[index]
             append((index, 1), function_of(node), [find(a) for a in node.arguments])
-        return steps, [find(s) for s in self.outputs]
+        outputs = [find(s) for s in self.outputs]
+        return _Steps(len(self.inputs), steps, outputs)
 
     def count(self) -> dict[str, int]:
         """Count the operations of each kind; the sine and cosine of one angle are one."""
@@ -258,14 +305,6 @@ def _evaluate_by_jax(node: Node, values: Sequence[np.ndarray]) -> np.ndarray | l
     with jax.ensure_compile_time_eval():
         found = _evaluate(node, list(values))
         return found if isinstance(found, list) else np.asarray(found)[()]
-
-
-def _run_steps(program: Steps, values: Sequence[Value]) -> list[Value]:
-    steps, outputs = program
-    known: list[Value] = [*values]
-    for function, places in steps:
-        known.append(function(*[known[k] for k in places]))
-    return [known[k] for k in outputs]
 
 
 def _library(x: Value) -> ModuleType:

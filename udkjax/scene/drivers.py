@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Point, between
 from udkjax.scene.fields import CALLED, KNOTS, NOT_EMPTY, Number, given_direction, given_number, given_or_guess
-from udkjax.scene.joints import Constraint, fill
+from udkjax.scene.joints import Constraint, fill, fills
 from udkjax.scene.splines import natural_spline
 
 
@@ -122,5 +122,6 @@ class Driver(Constraint):
     def breakpoints(self):
         return self.motion.breakpoints
 
+    @fills("points")
     def complete(self, *frames):
         return self if self.coordinate == "angle" else fill(self, "points", ((0.0, 0.0), (0.0, 0.0)))

@@ -83,8 +83,10 @@ def _as_static(leaf: object) -> object:
 
 def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
     """Return a constraint with the numbers that it leaves to the initial guess, which the bodies hold."""
-    if type(constraint).complete is Constraint.complete:  # most joints: spares the sines and cosines of every body
-        return constraint
+    its_own = type(constraint).complete
+    filled = getattr(its_own, "fills", None)
+    if its_own is Constraint.complete or (filled and getattr(constraint, filled) is not None):
+        return constraint  # as most are: spares the sines and cosines of every body
     places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
     known = not is_traced((constraint, places))
     if known:  # NumPy has nothing to compile

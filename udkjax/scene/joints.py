@@ -7,7 +7,7 @@ them. A number that is None when a joint is made ("as in the initial guess") is 
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Self, TypeVar
 
 import equinox as eqx
@@ -71,6 +71,17 @@ class Constraint(PrintsLine):
 
 
 AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
+Completion = TypeVar("Completion", bound=Callable)
+
+
+def fills(name: str) -> Callable[[Completion], Completion]:
+    """Mark a `complete` that does nothing but set the number `name` where it is absent: elsewhere nobody has to call it."""
+
+    def mark(complete: Completion) -> Completion:
+        complete.fills = name  # pyright: ignore[reportFunctionMemberAccess]
+        return complete
+
+    return mark
 
 
 class Joint(Constraint):
@@ -117,6 +128,7 @@ class Prismatic(Joint):
         one, two = frames
         return [_lateral_distance(self.axis, self.points, one, two), two.angle - one.angle - self.angle]
 
+    @fills("angle")
     def complete(self, *frames):
         return fill(self, "angle", frames[1].angle - frames[0].angle)
 
@@ -154,6 +166,7 @@ class Weld(Joint):
         gap = between(self.points, one, two)
         return [gap.x, gap.y, two.angle - one.angle - self.angle]
 
+    @fills("angle")
     def complete(self, *frames):
         return fill(self, "angle", frames[1].angle - frames[0].angle)
 
@@ -176,6 +189,7 @@ class Distance(Joint):
         d = between(self.points, *frames)
         return [0.5 * (d.dot(d) / self.length - self.length)]
 
+    @fills("length")
     def complete(self, *frames):
         length = between(self.points, *frames).norm()
         reach = sum(abs(x) for frame, point in zip(frames, self.points, strict=True) for x in (frame.x, frame.y, *point))
@@ -197,6 +211,7 @@ class Angle(Joint):
         one, two = frames
         return [two.angle - one.angle - self.angle]
 
+    @fills("angle")
     def complete(self, *frames):
         return fill(self, "angle", frames[1].angle - frames[0].angle)
 

@@ -14,7 +14,7 @@ from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions, decompose
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
 from udkjax.study.diagnosis.diagnosis import Diagnosis
-from udkjax.study.diagnosis.fixes import Fix, Redundancy, fixes_of
+from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fixes_of
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.timeline import timeline
 
@@ -128,18 +128,20 @@ def _cure(
 ) -> tuple[Fix, ...]:
     """Return the best fixes one after another, each found on what the one before has left, until nothing is redundant."""
     done: list[Fix] = []
-    current, at, sets = mechanism, usual, [r for r in found if r.permanent]
-    while sets and len(done) < MOST_FIXES:
-        best = max((r.fixes[0] for r in sets if r.fixes), key=lambda fix: (fix.removes, fix.conditioning), default=None)
-        if best is None:
-            return ()
+    sets = [r for r in found if r.permanent]
+    best = max((r.fixes[0] for r in sets if r.fixes), key=lambda fix: (fix.removes, fix.conditioning), default=None)
+    at = usual
+    while best is not None:
         done.append(best)
-        current = best.mechanism
-        rows = KinematicRows(current)
+        rows = KinematicRows(best.mechanism)
         ranked = RankedPositions(rows, positions.rank_tol)
         at, owners = [ranked.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
-        sets = _with_fixes(current, ranked, at, _dependencies(current, at[0], at, owners)[0])
-    return tuple(done)
+        left = _dependencies(best.mechanism, at[0], at, owners)[0]
+        if not left or len(done) == MOST_FIXES:
+            return tuple(done)
+        order = sorted(at, key=lambda c: -c.smallest)  # the stress of a set is that of the first
+        best = best_fix(best.mechanism, ranked, order, owners, left)
+    return ()
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:

@@ -5,7 +5,7 @@ weld or a prismatic joint one of its freedoms, anything all of its rows. That he
 stress by which the constraints of a set hold each other in balance, and frees nothing, since others hold it, too.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Constraint, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, decompose
+from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
 SMALLEST_PIVOT = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
@@ -69,6 +69,13 @@ class Redundancy(NamedTuple):
     fixes: tuple[Fix, ...]  # verified: each takes redundancy away and leaves the mobility; none of a momentary one
 
 
+class _ChangesOfConstraint(NamedTuple):
+    """The changes of one constraint that help as far as the Jacobian tells, the best first."""
+
+    constraint: str
+    changes: list[tuple[int, float, JointChange]]  # what each removes, and the conditioning then
+
+
 def fixes_of(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[Fix]:
@@ -76,21 +83,49 @@ def fixes_of(
 
     `at` are positions of ordinary rank, in all of which it must help.
     """
+    candidates = _candidates(mechanism, positions, at, owners, dependency)
+    found = [_verify(mechanism, positions, at, one) for one in candidates]
+    return sorted((fix for fix in found if fix), key=lambda fix: (-fix.removes, -fix.conditioning))
+
+
+def best_fix(
+    mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], sets: Sequence[Dependency]
+) -> Fix | None:
+    """Return the best fix of all sets, or None: it alone is verified, for which a mechanism is built."""
+    candidates = [one for dependency in sets for one in _candidates(mechanism, positions, at, owners, dependency)]
+    candidates.sort(key=lambda one: one.changes[0][:2], reverse=True)
+    return next((fix for one in candidates if (fix := _verify(mechanism, positions, at, one))), None)
+
+
+def _candidates(
+    mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], dependency: Dependency
+) -> list[_ChangesOfConstraint]:
     found, stresses = [], [stress_of(position.left, owners, dependency.constraints) for position in at]
     for name in dependency.constraints:
-        options, own = [], _own(owners, name)
+        options, own, places = [], _own(owners, name), _places(mechanism, name)
         forces = [stress[own] / positions.row_unit[own, None] for stress in stresses]
         for change in _changes(mechanism, name, at[0], forces[0]):
-            removes, conditioning = _effect(mechanism, name, change, at, owners, positions.rank_tol)
+            removes, conditioning = _effect(own, places, change, at, positions.rank_tol)
             if removes > 0 and conditioning > SMALLEST_PIVOT * min(c.smallest for c in at):
-                aligned = min(change.alignment(force, c.q, _places(mechanism, name)) for force, c in zip(forces, at, strict=True))
+                aligned = min(change.alignment(force, c.q, places) for force, c in zip(forces, at, strict=True))
                 options.append((removes, round(aligned, 6), round(conditioning, 12), change))
-        for removes, _, conditioning, change in sorted(options, key=lambda option: option[:3], reverse=True):
-            changed = apply_change(mechanism, name, change)
-            if changed is not None and _removes_redundancy(changed, removes, at, positions.rank_tol):
-                found.append(Fix(name, change.text, removes, conditioning, changed))
-                break
-    return sorted(found, key=lambda fix: (-fix.removes, -fix.conditioning))
+        options.sort(key=lambda option: option[:3], reverse=True)
+        if options:
+            found.append(
+                _ChangesOfConstraint(name, [(removes, conditioning, change) for removes, _, conditioning, change in options])
+            )
+    return found
+
+
+def _verify(
+    mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], candidates: _ChangesOfConstraint
+) -> Fix | None:
+    """Return the first of a constraint's changes that does on the mechanism what it does on the Jacobian."""
+    for removes, conditioning, change in candidates.changes:
+        changed = apply_change(mechanism, candidates.constraint, change)
+        if changed is not None and _removes_redundancy(changed, removes, at, positions.rank_tol):
+            return Fix(candidates.constraint, change.text, removes, conditioning, changed)
+    return None
 
 
 def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechanism | None:
@@ -148,17 +183,23 @@ def _half_turn(angle: float) -> float:
 
 
 def _effect(
-    mechanism: Mechanism, name: str, change: JointChange, at: list[Configuration], owners: list[str], rank_tol: float
+    own: list[int], places: list[int | None], change: JointChange, at: list[Configuration], rank_tol: float
 ) -> tuple[int, float]:
-    """Return by how much the redundancy falls (-1: the mobility changes, or it falls unevenly), and the conditioning then."""
-    own, places, falls, conditioning = _own(owners, name), _places(mechanism, name), set(), np.inf
-    for position in at:
+    """Return by how much the redundancy falls (-1: the mobility changes, or it falls unevenly), and the conditioning then.
+
+    `own` are the rows of the constraint, `places` those of its bodies.
+    """
+    falls, conditioning = -1, np.inf
+    for k, position in enumerate(at):
         rest = np.delete(position.J, own, axis=0)
         remaining = np.concatenate([rest, change.remaining_rows(position.J[own], position.q, places)])
-        _, sigma, _, rank = decompose(remaining, rank_tol)
-        falls.add(position.redundancy - (len(remaining) - rank) if rank == position.rank else -1)
-        conditioning = min(conditioning, sigma[rank - 1] / sigma[0] if rank else 1.0)
-    return falls.pop() if len(falls) == 1 else -1, float(conditioning)
+        sigma = np.linalg.svd(remaining, compute_uv=False) if remaining.size else np.zeros(0)
+        rank = int(np.sum(sigma > rank_tol * sigma[0])) if remaining.size else 0
+        fall = position.redundancy - (len(remaining) - rank)
+        if rank != position.rank or (k and fall != falls):
+            return -1, float(conditioning)
+        falls, conditioning = fall, min(conditioning, sigma[rank - 1] / sigma[0] if rank else 1.0)
+    return falls, float(conditioning)
 
 
 def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
