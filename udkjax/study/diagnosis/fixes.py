@@ -73,7 +73,7 @@ class _ChangesOfConstraint(NamedTuple):
     """The changes of one constraint that help as far as the Jacobian tells, the best first."""
 
     constraint: str
-    changes: list[tuple[int, float, JointChange]]  # what each removes, and the conditioning then
+    changes: list[tuple[int, float, JointChange]]  # the redundancy that each removes, and the conditioning then
 
 
 def fixes_of(
