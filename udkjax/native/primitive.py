@@ -33,6 +33,8 @@ from udkjax.native.steps import STEP_LIMIT
 QUICK_MEMBERS = 16  # of a call by code that is compiled quickly
 QUICK_STEPS = 4_000  # of all its members: some 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # of such calls, in all: a tenth of what it takes to compile a line
+CORES = os.cpu_count() or 1  # threads of a call
+TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
 FEW = 2  # members up to which one follows another: eight lanes take as long as two members
 
 
@@ -78,6 +80,8 @@ class LoadedCode:
         settings = operation.all_settings
         self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
         self._seconds = QUICK_SECONDS_OF_LINE * self._module.written_text.count("\n") if operation.code.is_small else 0.0
+        names = (*INPUTS, *self._module.inputs, *self._module.results, *self._module.outputs)
+        self._lengths = [names.index(name) for name in self._module.lengths]
 
     @property
     def name(self) -> str:
@@ -121,25 +125,22 @@ class LoadedCode:
         self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: "Code | None" = None
     ) -> "PreparedCall":
         """Return a call, which may be repeated with other numbers in its inputs: those given, where they are float64."""
-        code = code or self._optimized
-        module, inputs = self._module, [np.ascontiguousarray(x, np.float64) for x in inputs]
+        code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Of the two passes of reverse mode each leaves out what the other finds: zeros, since NaN would alarm jax.debug_nans.
         found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
-        members, times, knots = shapes[0][0], *(inputs[INPUTS.index(name)].shape[1] for name in ("ts", "breaks"))
-        names = (*INPUTS, *module.inputs, *module.results, *module.outputs)
-        lengths = [(*inputs, *found)[names.index(name)].shape[1] for name in module.lengths]
-        following = ctypes.c_int64(0)
+        members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
+        arrays, following = (*inputs, *found), ctypes.c_int64(0)
         record = (  # the fields in the order of `Memory.call_fields`
-            *(members, times, knots, inputs[-1].shape[module.directions_in]),
-            *(x.ctypes.data for x in inputs),
-            *(math.prod(x.shape[1:]) if len(x) > 1 else 0 for x in inputs),
-            *(x.ctypes.data for x in found),
-            *lengths,
+            *(members, times, knots, inputs[-1].shape[self._module.directions_in]),
+            *(x.__array_interface__["data"][0] for x in inputs),
+            *(x.size // len(x) if len(x) > 1 else 0 for x in inputs),
+            *(x.__array_interface__["data"][0] for x in found),
+            *(arrays[k].shape[1] for k in self._lengths),
             ctypes.addressof(following),
         )
         assert len(record) == self._field_count
         call = (ctypes.c_int64 * len(record))(*record)
-        threads = max(1, min(members // self._share, os.cpu_count() or 1))
+        threads = max(1, min(members // self._share, CORES))
         return PreparedCall(code.run, call, following, threads, inputs, found)
 
 
@@ -166,7 +167,7 @@ class PreparedCall(NamedTuple):
 @cache
 def _pool() -> ThreadPoolExecutor:
     """Return the threads that calls share: to start one takes longer than many a run."""
-    return ThreadPoolExecutor(os.cpu_count() or 1)
+    return ThreadPoolExecutor(CORES)
 
 
 class Code(NamedTuple):
