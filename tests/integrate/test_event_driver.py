@@ -19,7 +19,7 @@ from udkjax.integrate.events.condition_program import watched_conditions
 from udkjax.integrate.events.conditions import frames_of
 from udkjax.integrate.events.event import expand_events
 from udkjax.integrate.events.impacts import contact_rows, rows_of_directions
-from udkjax.integrate.events.known_run import event_arrays, known_event_plan
+from udkjax.integrate.events.known_run import event_arrays, known_plan
 from udkjax.integrate.events.phase_code import PhaseCode
 from udkjax.integrate.events.phases import phases_of
 from udkjax.integrate.prepare import Choices, prepare_run
@@ -104,7 +104,7 @@ def phase_codes(mechanism, events):
         run = prepare_run(compiled[0], phases.analyses[0], np.array([0.0, 1.0]), state, None, choices, np)
         conditions = watched_conditions(listed, mechanism)
         assert conditions is not None
-        plan = known_event_plan(phases, conditions, 1000, 10, *listed, *compiled)
+        plan = known_plan(phases, conditions, 1000, 10, *listed, *compiled)
         problems = [replace(run.problem, compiled=x) for x in compiled]
         arrays = event_arrays(plan, listed, phases, problems, np.zeros(()), np.asarray(1e-6), np)
     numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[9:], []

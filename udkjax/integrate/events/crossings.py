@@ -18,13 +18,13 @@ Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slo
 
 
 class ConditionValues(NamedTuple):
-    """The conditions of events and their rates in a state; behind those of all E may be the contact forces of all."""
+    """The conditions of events and their rates in a state."""
 
-    h: Float[Any, "*m C"]
-    rate: Float[Any, "*m C"]  # 0 of forces
-    rate_2: Float[Any, "*m C"]  # 0 of forces, and of conditions that depend on velocities
+    h: Float[Any, "*m E"]
+    rate: Float[Any, "*m E"]
+    rate_2: Float[Any, "*m E"]  # 0 of conditions that depend on velocities
     a: Float[Any, "*m n"]
-    scale: Float[Any, "*m C"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
+    scale: Float[Any, "*m E"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
 
 
 def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType = jnp) -> Int[Any, "*m C"]:
@@ -83,16 +83,6 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
     """Return the slope of Hermite's cubic on [0, 1] at x."""
     a, da, b, db = cubic
     return da + x * (2 * (3 * (b - a) - 2 * da - db) + 3 * x * (2 * (a - b) + da + db))
-
-
-def cubic_extremum(cubic: Cubic, side: Array) -> Array:
-    """Return the extremum of a cubic on `side` of zero, nearest to it or beyond it, if it approaches at 0 and leaves at 1."""
-    a, da, b, db = cubic
-    # The slope c + 2 h x + k x^2 is below zero at 0 and above it at 1: so the root is real, and the larger one.
-    c, h, k = side * da, side * (3 * (b - a) - 2 * da - db), side * 3 * (2 * (a - b) + da + db)
-    root = jnp.sqrt(jnp.maximum(h**2 - k * c, 0.0))
-    above, below = jnp.where(h > 0, -c, root - h), jnp.where(h > 0, root + h, k)
-    return jnp.clip(above / jnp.where(below != 0, below, 1.0), 0.0, 1.0)
 
 
 def cubic_root(cubic: Cubic, side: Array) -> Array:

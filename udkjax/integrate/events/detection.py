@@ -3,13 +3,12 @@
 At the nodes of a window the conditions are known, and their rates where they depend on positions alone. Between two nodes a
 condition is Hermite's cubic up to E x^2 (1 - x)^2, with E measured: how far the cubic over two intervals misses the value and the
 rate at the node in between, of which one interval makes a sixteenth, or less. A crossing is certain where Bernstein's
-coefficients of the cubic plus and minus this change their sign once (Descartes' rule), none where they do not change it. A cubic
-that comes near zero and leaves again is a dip, whose extremum is then sought in the motion itself. All else is refined.
+coefficients of the cubic plus and minus this change their sign once (Descartes' rule), none where they do not change it. All else
+is refined.
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -19,7 +18,6 @@ from udkjax.integrate.events.crossings import (
     Cubic,
     carry_signs,
     crosses,
-    cubic_extremum,
     cubic_root,
     cubic_slope,
     cubic_value,
@@ -31,12 +29,9 @@ INTERVALS = 32  # of a window
 _shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
 NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
-BENDS = 3.0  # times as much as beside it a smooth condition bends in an interval that is fine enough, at most
 INTERVALS_OF_JUMP = 6  # intervals too coarse to resolve a jump or a kink, at every scale
 
 BESIDE = 4  # intervals before one that is too coarse that are done again
-
-ROOT, FIRST_OF_TWO, SECOND_OF_TWO = 0, 1, 2  # the target: a root, or the extremum, and then the root before it or behind it
 
 
 class Nodes(NamedTuple):
@@ -52,12 +47,12 @@ class Detection(NamedTuple):
     """The first crossing of conditions in a window."""
 
     sides: Int[Array, "G C"]  # of zero, at the nodes
-    place: Int[Array, ""]  # the interval of the first crossing
+    place: Int[Array, ""]  # the last node before the first crossing at which its condition is not zero
+    behind: Int[Array, ""]  # the first node behind it
     is_found: Bool[Array, ""]
     event: Int[Array, ""]
-    root: Float[Array, ""]  # or the extremum, in the interval, from 0 to 1
-    seeks: Int[Array, ""]  # ROOT, FIRST_OF_TWO or SECOND_OF_TWO
-    side: Int[Array, ""]  # before it
+    root: Float[Array, ""]  # between the two, from 0 to 1
+    is_exact: Bool[Array, ""]  # to rounding
     is_coarse: Bool[Array, ""]  # whether an interval before, or that one, is too coarse
     last_sure: Int[Array, ""]  # the node up to which all is certain, where an interval is too coarse
     coarse: Bool[Array, "C"]  # of which conditions
@@ -70,8 +65,8 @@ def detect(
     direction: Int[np.ndarray, "C"],
     sides: Int[Array, "C"],
     scale: Float[Array, "C"],
+    located: Int[Array, ""],
     watched: Bool[Array, "C"],
-    quiet: Float[Array, "C"],
     is_short: Bool[Array, ""],
     unresolved: Bool[Array, "C"],
 ) -> Detection:
@@ -83,15 +78,16 @@ def detect(
         direction: the direction in which the zero of each counts, 0 for either.
         sides: the sides of zero at the first node.
         scale: scale of each condition.
+        located: the condition that is known to cross zero, wherever it is; -1: none.
         watched: mask of the conditions that count.
-        quiet: the time up to which the dips of each are known.
         is_short: whether the window is so short that what is too coarse in it may be a jump.
         unresolved: mask of the conditions not to be refined.
     """
     t, g, g_dot, good = nodes
     finite = jnp.isfinite(g)
     g = jnp.where(finite, g, 0.0)
-    signs = jnp.where((jnp.abs(g) <= ZERO * scale) | ~good[:, None] | ~finite, 0, jnp.sign(g)).astype(int)
+    least = jnp.where(np.arange(len(scale)) == located, 0.0, ZERO * scale)
+    signs = jnp.where((jnp.abs(g) <= least) | ~good[:, None] | ~finite, 0, jnp.sign(g)).astype(int)
     sides = carry_signs(sides, signs.at[0].set(0))
     before, after = sides[:-1], sides[1:]
     step = jnp.diff(t)[:, None]
@@ -105,41 +101,33 @@ def detect(
     hits = (after == -before) & (before != 0)
     single = (_sign_changes(low) == 1) & (_sign_changes(high) == 1) & resolved
     away = (jnp.min(low, 0) >= -ZERO * scale) & (resolved | (jnp.min(low, 0) >= FAR * error - ZERO * scale))
-    away = away | (t[1:, None] <= quiet)
-    valley = ~hits & ~away & resolved & (before * cubic[1] < 0) & (before * cubic[3] > 0) & _bends_as_beside(step, slope)
-    lowest = cubic_extremum(cubic, before)
-    dips = valley & (before * cubic_value(cubic, lowest) <= error + ZERO * scale)
     usable = good[1:, None] & watched
-    certain = jnp.where(hits, single, away | valley)
-    coarse = (usable & ~unresolved & ~certain) | (good[1:, None] & ~finite[1:])
+    coarse = (usable & ~unresolved & ~jnp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
     # Intervals too coarse in a short window, and only there, hold a jump or a kink: finer windows would not tell more.
     jumps = is_short & (jnp.sum(coarse, 0) <= INTERVALS_OF_JUMP) & jnp.all(finite, 0)
     coarse = coarse & ~jumps
 
-    enters = dips & crosses(direction, before, -before)
-    leaves = dips & ~enters & crosses(direction, -before, before)
-    found = ((hits & crosses(direction, before, after)) | enters | leaves) & usable
-    place = jnp.argmax(jnp.any(found, axis=1))
-    coarse_place = jnp.argmax(jnp.any(coarse, axis=1))
+    found = hits & crosses(direction, before, after) & usable
+    place, coarse_place = (jnp.argmax(jnp.any(x, axis=1)) for x in (found, coarse))
     last_sure = jnp.maximum(coarse_place - BESIDE, 0)  # intervals before may only look fine enough
-    cubic, side, here, enters, leaves, lowest = jax.tree.map(lambda x: x[place], (cubic, before, found, enters, leaves, lowest))
-    root = jnp.where(enters | leaves, lowest, cubic_root(cubic, side))
-    event = jnp.argmin(jnp.where(here, root, jnp.inf))
-    seeks = jnp.where(enters, FIRST_OF_TWO, jnp.where(leaves, SECOND_OF_TWO, ROOT))
-    is_found = jnp.any(found)
+    at_place: Cubic = (cubic[0][place], cubic[1][place], cubic[2][place], cubic[3][place])
+    root = jnp.where(found[place], cubic_root(at_place, before[place]), jnp.inf)
+    event, is_found = jnp.argmin(root), jnp.any(found)
+    is_before = (signs.at[0].set(1)[:, event] != 0) & (np.arange(len(t)) <= place)
+    last_before = jnp.where(event == located, place, jnp.max(jnp.where(is_before, np.arange(len(t)), 0)))
     is_coarse = jnp.any(coarse) & ~(is_found & (place < last_sure))
     return Detection(
-        sides,
-        place,
-        is_found & ~is_coarse,
-        event,
-        root[event],
-        seeks[event],
-        side[event],
-        is_coarse,
-        last_sure,
-        coarse[coarse_place],
-        ~finite[coarse_place + 1],
+        sides=sides,
+        place=last_before,
+        behind=place + 1,
+        is_found=is_found & ~is_coarse,
+        event=event,
+        root=root[event],
+        is_exact=(single & (error <= ZERO / 10 * scale))[place, event] & (place == last_before),
+        is_coarse=is_coarse,
+        last_sure=last_sure,
+        coarse=coarse[coarse_place],
+        undefined=~finite[coarse_place + 1],
     )
 
 
@@ -154,13 +142,6 @@ def _slopes(
     ends = 2 * secant[0] - inner[0], 2 * secant[-1] - inner[-1]
     by_differences = jnp.concatenate([ends[0][None], inner, ends[1][None]])
     return jnp.where(has_rates & jnp.isfinite(g_dot), g_dot, by_differences)
-
-
-def _bends_as_beside(step: Float[Array, "I 1"], slope: Float[Array, "G C"]) -> Bool[Array, "I C"]:
-    """Tell where a condition bends as it does in the intervals beside; in a kink, which looks like a parabola, it bends more."""
-    bend = jnp.abs(jnp.diff(slope, axis=0)) / jnp.where(step > 0, step, 1.0)
-    beside = jnp.pad(bend, ((1, 1), (0, 0)))
-    return bend <= BENDS * jnp.maximum(beside[:-2], beside[2:])
 
 
 def _errors(

@@ -10,6 +10,7 @@ is the condition, as those of the ready-made ones do: numbers that a plain funct
 """
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Literal, Protocol
 
 import equinox as eqx
@@ -237,6 +238,25 @@ def sees_velocity(event: Event, mechanism: Mechanism) -> bool:
         return event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
     except (TypeError, AttributeError, ValueError):  # as arithmetic with None raises, of Python, JAX or NumPy
         return True
+
+
+def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
+    """Tell whether the numbers of events are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
+
+    Those that are known were checked before; those that were traced then are looked at here.
+    """
+    found, limits = jnp.array(True), {}
+    for e in events:
+        if isinstance(e.condition, WithinLimit):
+            limits[e.name] = e.condition.limit
+        if isinstance(e.action, Impact):
+            found &= (e.action.restitution >= 0) & (e.action.restitution <= 1)
+        if isinstance(e.condition, WithinLimit | Gap):
+            found &= jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(e.condition)]))
+        if isinstance(e.condition, Gap):
+            found &= jnp.any(e.condition.normal != 0)
+    both = (name[: -len(".lower")] for name in limits if name.endswith(".lower"))
+    return reduce(jnp.logical_and, (limits[f"{n}.lower"] <= limits.get(f"{n}.upper", jnp.inf) for n in both), found)
 
 
 def _with_name(event: Event, name: str) -> Event:

@@ -111,21 +111,16 @@ def contact_rows(
     root, D = uk.inverse_sqrt_mass(mechanism), uk.D(mechanism, t, q, w)
     plus, given = uk.pseudoinverse(equations.method, D), root * normals
     u = jax.vmap(lambda u: u - plus @ (D @ u))(given)
-    return ContactRows(u @ u.T, root * u, _leaves_motion(jnp.sum(u**2, 1), jnp.sum(given**2, 1)))
+    return rows_of_directions(normals, root * u, root**2)
 
 
 def rows_of_directions(
-    normals: Float[np.ndarray, "*m E n"], directions: Float[np.ndarray, "*m E n"], inverse_mass: Float[np.ndarray, "*m n"]
+    normals: Float[Any, "*m E n"], directions: Float[Any, "*m E n"], inverse_mass: Float[Any, "*m n"]
 ) -> ContactRows:
-    """Return the rows of contacts whose directions of impulses are known, by NumPy."""
+    """Return the rows of contacts whose directions of impulses are known."""
     mobility = inverse_mass[..., None, :]
-    W = directions / mobility @ directions.swapaxes(-1, -2)
-    return ContactRows(W, directions, _leaves_motion(diagonal(W, np), np.sum(normals**2 * mobility, -1)))
-
-
-def _leaves_motion(left: Any, given: Any) -> Any:
-    """Tell of which rows constraints leave something, by the squares of their sizes."""
-    return left > BLOCKED * given
+    W, given = directions / mobility @ directions.swapaxes(-1, -2), (normals**2 * mobility).sum(-1)
+    return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED * given)
 
 
 def impulses_of_impact(

@@ -1,5 +1,6 @@
 """Machine code of the phases of a run with events, for the members of a batch: to the next crossing, and at single states."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
@@ -12,10 +13,11 @@ from jaxtyping import Float, Int
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import places_of_joints
+from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.native_engine import run_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.conditions import HEAD, Conditions
-from udkjax.native.layout import INFO, INPUTS
+from udkjax.native.layout import INPUTS
 from udkjax.native.operations import EvaluateEvents, MarkRows, ProjectStates
 from udkjax.native.primitive import call_members
 from udkjax.native.runs import RunWatched
@@ -79,33 +81,18 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
 
 
 class StretchEnd(NamedTuple):
-    """The ends of some runs, at a crossing or not, and their outputs."""
+    """The ends of some runs, at a crossing or not, and their outputs; whole numbers as floats."""
 
     q: Float[np.ndarray, "b T n"]  # at the times that were asked for
     v: Float[np.ndarray, "b T n"]
     violation: Float[np.ndarray, "b T"]
-    written: Int[np.ndarray, "b"]  # the number of the last output, counted from the start as 0
-    status: Int[np.ndarray, "b"]  # one of native/steps.py
-    raw: Float[np.ndarray, "b 2n+1"]  # the last time and state of the integrator
-    counts: Int[np.ndarray, "b 3"]  # steps tried, accepted, right-hand sides
-    event: Int[np.ndarray, "b"]  # of what is watched: which crosses; -1: none
+    info: Float[np.ndarray, "b K"]  # `INFO`, and the last state of the integrator
+    event: Float[np.ndarray, "b"]  # of what is watched: which crosses; -1: none
     t: Float[np.ndarray, "b"]  # up to which nothing else happens
     worst: Float[np.ndarray, "b"]  # violation at a node
-    sides: Int[np.ndarray, "b C"]
-    y: Float[np.ndarray, "b 2n"]  # at t
-
-
-class States(NamedTuple):
-    """Conditions at some states, with their derivatives and what impulses along them do."""
-
-    a: Float[np.ndarray, "b n"]
-    g: Float[np.ndarray, "b E"]
-    rate: Float[np.ndarray, "b E"]
-    rate_2: Float[np.ndarray, "b E"]
-    by_t: Float[np.ndarray, "b E"]
-    by_q: Float[np.ndarray, "b E n"]
-    by_v: Float[np.ndarray, "b E n"]
-    directions: Float[np.ndarray, "b E n"]  # of impulses; zero of events that are no impacts
+    sides: Float[np.ndarray, "b C"]
+    q_end: Float[np.ndarray, "b n"]  # at t
+    v_end: Float[np.ndarray, "b n"]
 
 
 class PhaseCode:
@@ -131,37 +118,32 @@ class PhaseCode:
     ):
         self.plan, (self._numbers, self._settings, self._rows, self._breaks, self._tol, *self._samples) = plan, arrays
         names = plan.run.all_settings
-        self._of_states = [names.index(name) for name in plan.states.all_settings]
+        self._of_states = self._settings[:, [names.index(name) for name in plan.states.all_settings]]
         self._of_marking = [] if plan.marking is None else [names.index(name) for name in plan.marking.all_settings]
-        self._event_numbers, self._inverse_mass, self._joints = event_numbers, inverse_mass, joints
+        self._event_numbers, self._joints = event_numbers, joints
+        rows = max(len(event_numbers), len(inverse_mass))
+        self._numbers_of_states = np.concatenate([_spread(x, rows) for x in (event_numbers, inverse_mass)], axis=1)
+        assert plan.states.conditions is not None  # it evaluates some
+        n, E = inverse_mass.shape[1], plan.states.conditions.own_count
+        self._places, start = [], 0
+        for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues`
+            self._places.append((slice(start, start + math.prod(shape)), shape))
+            start += math.prod(shape)
         self._marks = np.full((members, plan.run.code.row_count), np.nan)
 
     def run(self, some: Int[np.ndarray, "b"], ts: np.ndarray, q: np.ndarray, v: np.ndarray, watch: np.ndarray) -> StretchEnd:
-        """Run some members over times (b, T) to the first crossing; `watch` is what is watched besides (b, K)."""
+        """Run some members over times (b, T) to the first crossing; `watch` is what is watched, with room for its numbers."""
         operation, conditions = self.plan.run, self.plan.run.conditions
         assert conditions is not None  # it watches some
         numbers = self._with_marks(some, ts[:, 0], q, v)
         own = [_of(x, some) for x in (self._settings, self._rows, self._breaks, *self._samples)]
-        watch = np.concatenate([_spread(_of(self._event_numbers, some), len(some)), watch], axis=1)
+        watch[:, : conditions.number_count] = _of(self._event_numbers, some)
         qs, vs, violation, info, crossing = call_members(numbers, ts, q, v, *own, watch, operation=operation, times=ts.shape[1])
-        count = conditions.count
-        code, t, *counts, written = (info[:, k] for k in range(len(INFO)))
-        return StretchEnd(
-            q=qs,
-            v=vs,
-            violation=violation,
-            written=written.astype(int),
-            status=code.astype(int),
-            raw=np.concatenate([t[:, None], info[:, len(INFO) :]], axis=1),
-            counts=np.stack(counts, axis=1).astype(int),
-            event=crossing[:, 0].astype(int),
-            t=crossing[:, 1],
-            worst=crossing[:, 2],
-            sides=crossing[:, HEAD : HEAD + count].astype(int),
-            y=crossing[:, HEAD + count :],
-        )
+        behind, n = HEAD + conditions.count, q.shape[1]
+        sides, q_end, v_end = crossing[:, HEAD:behind], crossing[:, behind : behind + n], crossing[:, behind + n :]
+        return StretchEnd(qs, vs, violation, info, crossing[:, 0], crossing[:, 1], crossing[:, 2], sides, q_end, v_end)
 
-    def at(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> States:
+    def at(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> StateValues:
         """Evaluate some members at states."""
         operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
         assert conditions is not None  # it evaluates some
@@ -170,23 +152,19 @@ class PhaseCode:
             numbers = _spread(numbers, b).copy()
             row = np.sum(_of(self._breaks, some) <= t[:, None], axis=1)
             numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], some), b)[np.arange(b), row]
-        settings = _of(self._settings, some)[:, self._of_states]
-        further = np.concatenate([_spread(_of(x, some), b) for x in (self._event_numbers, self._inverse_mass)], axis=1)
-        ts = np.stack([t, t], axis=1)
-        (found,) = call_members(
-            numbers, ts, q, v, settings, _of(self._rows, some), np.zeros((1, 0)), further, operation=operation, times=2
-        )
-        E = conditions.own_count
-        a, g, rate, rate_2, by_t, by_q, by_v, of_impacts = np.split(found, np.cumsum([n, E, E, E, E, E * n, E * n]), axis=1)
-        directions = np.zeros((b, E, n))
-        directions[:, list(operation.impacts)] = of_impacts.reshape(b, -1, n)
-        return States(a, g, rate, rate_2, by_t, by_q.reshape(b, E, n), by_v.reshape(b, E, n), directions)
+        given = numbers, np.stack([t, t], axis=1), q, v, _of(self._of_states, some), _of(self._rows, some), np.zeros((1, 0))
+        (found,) = call_members(*given, _of(self._numbers_of_states, some), operation=operation, times=2)
+        values = [found[:, place].reshape(b, *shape) for place, shape in self._places]
+        directions = np.zeros((b, conditions.own_count, n))
+        if operation.impacts:
+            directions[:, list(operation.impacts)] = found[:, self._places[-1][0].stop :].reshape(b, -1, n)
+        return StateValues._make([*values, directions])
 
     def project(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions and velocities of some members to the constraints of the phase."""
         operation, n = self.plan.project, q.shape[1]
         assert operation is not None  # events add joints
-        further = _of(self._settings, some)[:, self._of_states], _of(self._rows, some), np.zeros((1, 0))
+        further = _of(self._of_states, some), _of(self._rows, some), np.zeros((1, 0))
         given = self._with_marks(some, t, q, v), np.stack([t, t], axis=1), q, v
         (found,) = call_members(*given, *further, operation=operation, times=2)
         return found[:, :n], found[:, n:]

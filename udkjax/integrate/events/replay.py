@@ -10,10 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.integrate.events.crossings import ZERO_RATE
-from udkjax.integrate.events.event_run import EventRun, RunInput, run_plain
-from udkjax.integrate.events.hybrid import Hybrid, RunState
+from udkjax.integrate.events.hybrid import Hybrid, rate_along
 from udkjax.integrate.events.jumps import apply_event
 from udkjax.integrate.events.known_run import run_by_machine_code
+from udkjax.integrate.events.loop import condition_values
+from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_member, without_member
+from udkjax.integrate.events.runs import EventRun, RunState
 from udkjax.integrate.gradients import TreeDef, stop_gradients
 from udkjax.integrate.solution import Result
 from udkjax.integrate.traced_numbers import replaced, select
@@ -22,18 +24,16 @@ from udkjax.native.conditions import Conditions
 OUTPUTS = 32  # of one piece
 
 
-def run_events(hybrid: Hybrid, given: RunInput, conditions: Conditions | None, max_events: int) -> EventRun:
+def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
     """Run a system with events. What is smooth in the result has first derivatives, forward and reverse.
 
     Args:
         hybrid: the system.
-        given: the initial state, and the output times.
         conditions: conditions of all events, for machine code; None: it cannot serve the run.
-        max_events: most events that may happen.
     """
-    arrays, rest = eqx.partition((hybrid, given), eqx.is_inexact_array)
+    arrays, rest = eqx.partition(hybrid, eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
-    return _run(FixedPart(rest, tree, conditions, max_events), xs)
+    return _run(FixedPart(rest, tree, conditions), xs)
 
 
 class FixedPart(eqx.Module):
@@ -42,19 +42,16 @@ class FixedPart(eqx.Module):
     rest: PyTree
     tree: TreeDef = eqx.field(static=True)
     conditions: Conditions | None = eqx.field(static=True)
-    max_events: int = eqx.field(static=True)
 
-    def combine(self, xs: Sequence[Array]) -> tuple[Hybrid, RunInput]:
-        """Return the system and the input of the run with these numbers."""
+    def combine(self, xs: Sequence[Array]) -> Hybrid:
+        """Return the system with these numbers."""
         return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
 
 
 @eqx.filter_custom_jvp
 def _run(fixed: FixedPart, xs: list[Array]) -> EventRun:
-    hybrid, given = fixed.combine(xs)
-    if fixed.conditions is None:
-        return run_plain(hybrid, given, fixed.max_events)
-    return run_by_machine_code(hybrid, given, fixed.conditions, fixed.max_events)
+    hybrid = fixed.combine(xs)
+    return run_plain(hybrid) if fixed.conditions is None else run_by_machine_code(hybrid, fixed.conditions)
 
 
 @_run.def_jvp
@@ -64,14 +61,13 @@ def _(primals, tangents):
     has_tangent = tuple(dx is not None for dx in tangents[1])
     if not any(has_tangent):
         return found, EventRun._make([None] * len(found))
-    if jax.tree.unflatten(fixed.tree, has_tangent)[1].ts:
+    if jax.tree.unflatten(fixed.tree, has_tangent).ts:
         raise NotImplementedError("a run with events has no derivatives by its output times")
 
     xs = [_differentiate_once(x) for x in xs]
 
     def replay_from(*some: Array) -> tuple[Array, ...]:
-        hybrid, given = fixed.combine(replaced(xs, has_tangent, some))
-        return replay(hybrid, given, stop_gradients(found))
+        return replay(fixed.combine(replaced(xs, has_tangent, some)), stop_gradients(found))
 
     change = jax.jvp(replay_from, select(xs, has_tangent), select(tangents[1], has_tangent))[1]
     return found, EventRun._make([*change, *(None for _ in found[len(change) :])])
@@ -121,9 +117,10 @@ class PieceOutput(NamedTuple):
     event_v: Float[Array, "2 n"]
 
 
-def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...]:
+def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
     """Return the smooth parts of a known run as a function with its first derivatives: the first fields of `EventRun`."""
-    ts, T, K, n = stop_gradients(given.ts), len(given.ts), len(found.event_time), len(given.q)
+    system = PlainSystem(hybrid)
+    ts, T, K, n = stop_gradients(hybrid.ts), len(hybrid.ts), len(found.event_time), len(hybrid.q)
     width = min(OUTPUTS, T)
     pieces = K + -(-T // (width - 1)) + 2
 
@@ -133,9 +130,9 @@ def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...
             return start, PieceOutput(*rows, *_no_event(n, K))
 
         goes_on = (start.state.t < found.time) | (start.event < found.count)
-        return jax.lax.cond(goes_on, lambda: _integrate_piece(hybrid, ts, found, width, start), skip)
+        return jax.lax.cond(goes_on, lambda: _integrate_piece(system, ts, found, width, start), skip)
 
-    state = RunState(ts[0], given.q, given.v, jnp.array(0), hybrid.phases.first_added())
+    state = hybrid.first_state()._replace(t=ts[0])
     end, out = jax.lax.scan(piece, PieceStart(state, jnp.array(0), jnp.array(0), jnp.zeros(())), None, length=pieces)
     rows = out.rows.ravel()
     q, v = (jnp.full((T, n), jnp.inf).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
@@ -151,10 +148,10 @@ def replay(hybrid: Hybrid, given: RunInput, found: EventRun) -> tuple[Array, ...
 
 
 def _integrate_piece(
-    hybrid: Hybrid, ts: Float[Array, "T"], found: EventRun, width: int, start: PieceStart
+    system: PlainSystem, ts: Float[Array, "T"], found: EventRun, width: int, start: PieceStart
 ) -> tuple[PieceStart, PieceOutput]:
     """Integrate to the next event, or as far as there is room for outputs, and apply the event."""
-    state, written, event, shift = start
+    hybrid, (state, written, event, shift) = system.hybrid, start
     T, K = len(ts), len(found.event_time)
     output = written + np.arange(width)
     due = ts[jnp.minimum(output, T - 1)]
@@ -170,11 +167,11 @@ def _integrate_piece(
     q = jnp.where(own, state.q + (times - state.t)[:, None] * state.v, raw.q)
     v = jnp.where(own, state.v, raw.v)
     rows = jnp.where((output < T) & (due < end), output, T)
-    at_end = RunState(end, q[-1], v[-1], state.phase, state.added)
+    at_end = RunState(end, q[-1], v[-1], state.phase, state.joints)
 
     def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
         known = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
-        after, d, (t, qs, vs) = _apply_at_fixed_time(hybrid, found, j, known, shift, short)
+        after, d, (t, qs, vs) = _apply_at_fixed_time(system, found, j, known, shift, short)
         return after, d, (j, t, qs, vs)
 
     after, shift, record = jax.lax.cond(happens, jump, lambda: (at_end, shift, _no_event(len(state.q), K)))
@@ -185,12 +182,12 @@ def _integrate_piece(
 
 
 def _apply_at_fixed_time(
-    hybrid: Hybrid, found: EventRun, j: Int[Array, ""], state: RunState, shift: Float[Array, ""], again: Array
+    system: PlainSystem, found: EventRun, j: Int[Array, ""], state: RunState, shift: Float[Array, ""], again: Array
 ) -> tuple[RunState, Float[Array, ""], tuple[Array, Array, Array]]:
     """Apply an event that was found at the time of `state`, and return the state after it at that time.
 
     Args:
-        hybrid: the system.
+        system: the system.
         found: the run.
         j: the number of the event in it.
         state: the state before it.
@@ -200,20 +197,23 @@ def _apply_at_fixed_time(
     Returns:
         The state after the event at the fixed time, the change d of the event's time, and time and states at the event.
     """
-    E = hybrid.count
-    index = found.event_index[j]
+    hybrid, E, index = system.hybrid, system.plan.count, found.event_index[j]
     k = jnp.where(index >= 2 * E, index - 2 * E, index)
-    values = hybrid.values(state)
-    rate = values.rate[k]
-    if any(row >= 0 for rows in hybrid.phases.tables.held for row in rows):
-        rate = jnp.where(k >= E, hybrid.rate_of_pressure(k % E, state, values.a), rate)
-    h, rate = values.h[k] - stop_gradients(values.h[k]), stop_gradients(rate)
-    is_transversal = jnp.abs(rate) > ZERO_RATE * values.scale[k] * hybrid.rate
+    values, _ = condition_values(system, None, with_member(state))
+    h, rate, a = values.h[0, k % E], values.rate[0, k % E], values.a[0]
+    if system.plan.held.any():
+        force = lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
+        h, rate = (jnp.where(k >= E, *x) for x in zip(rate_along(force, *state[:3], a), (h, rate), strict=True))
+    h, rate = h - stop_gradients(h), stop_gradients(rate)
+    unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E]) * hybrid.rate
+    is_transversal = jnp.abs(rate) > ZERO_RATE * unit
     # An event that happens again at the same instant, where its condition stands still, moves with the first one.
     d = jnp.where(is_transversal, -h / jnp.where(is_transversal, rate, 1.0), jnp.where(again, shift, 0.0))
-    before = state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * values.a)
-    after = apply_event(hybrid, k, before, hybrid.values(before), found.closed[j]).state._replace(phase=found.event_phase[j])
-    fixed = after._replace(t=state.t, q=after.q - d * after.v, v=after.v - d * hybrid.accelerations(after))
+    before = with_member(state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * a))
+    after = apply_event(system, None, k[None], before, *condition_values(system, None, before), found.closed[j][None]).state
+    after = without_member(after)._replace(phase=found.event_phase[j])
+    fixed = after._replace(t=state.t, q=after.q - d * after.v, v=after.v - d * hybrid.values(after).a)
+    before = without_member(before)
     return fixed, d, (before.t, jnp.stack([before.q, after.q]), jnp.stack([before.v, after.v]))
 
 

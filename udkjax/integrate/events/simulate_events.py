@@ -18,12 +18,13 @@ from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import Closure, State
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.events.condition_program import watched_conditions, with_known_functions
-from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events
-from udkjax.integrate.events.event_run import EventRun, RunInput
+from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
+from udkjax.integrate.events.event_plan import event_plan
 from udkjax.integrate.events.hybrid import Hybrid
-from udkjax.integrate.events.known_run import KnownRun, event_arrays, known_event_plan
+from udkjax.integrate.events.known_run import KnownRun, event_arrays, known_plan
 from udkjax.integrate.events.phases import Phases, phases_of
 from udkjax.integrate.events.replay import run_events
+from udkjax.integrate.events.runs import EventRun
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import violation
@@ -112,7 +113,7 @@ def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[st
     code = Result.invalid_argument if not run.is_usable else Result.drift if run.has_missed_rows else code
     problems = [replace(run.problem, compiled=x) for x in compiled]
     settings = choices.max_steps, given.max_events
-    plan = known_event_plan(phases, given.conditions, *settings, *given.events, *compiled)
+    plan = known_plan(phases, given.conditions, *settings, *given.events, *compiled)
     arrays = event_arrays(plan, given.events, phases, problems, np.asarray(code.value), choices.drift_tol, np)
     found = EventRun(*(x[0] for x in KnownRun(plan, len(run.ts), len(run.problem.q))(*arrays)))
     return None if found.code < 0 else (found, tuple(x.plan.why_not_native for x in compiled))
@@ -146,9 +147,20 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)
     problem, stabilization = run.problem, choices.stabilization
+    code = jnp.where(run.is_closed, Result.successful, Result.could_not_assemble)
+    if closure is None:
+        y = jnp.concatenate([problem.q, problem.v])
+        is_open = ~(violation(problem.equations, problem.ts[0], y) <= choices.drift_tol)
+        code = jnp.where(is_open, Result.initial_state_open, code)
+    code = jnp.where(run.has_missed_rows, Result.drift, code)
     hybrid = Hybrid(
         phases=phases,
         events=events,
+        ts=problem.ts,
+        q=problem.q,
+        v=problem.v,
+        code=jnp.where(run.is_usable & stop_gradients(has_usable_numbers(events)), code, Result.invalid_argument),
+        drift_tol=choices.drift_tol,
         rtol=problem.rtol,
         atol=problem.atol,
         smallest=problem.smallest,
@@ -158,20 +170,12 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
         method=choices.method,
         baumgarte=stabilization if isinstance(stabilization, Baumgarte) else None,
         formulation=choices.formulation,
-        max_steps=choices.max_steps,
+        plan=event_plan(phases, events, choices.max_steps, max_events),
         plans=tuple(x.plan for x in compiled),
     )
-    code = jnp.where(run.is_closed, Result.successful, Result.could_not_assemble)
-    if closure is None:
-        y = jnp.concatenate([problem.q, problem.v])
-        is_open = ~(violation(problem.equations, problem.ts[0], y) <= choices.drift_tol)
-        code = jnp.where(is_open, Result.initial_state_open, code)
-    code = jnp.where(run.has_missed_rows, Result.drift, code)
-    code = jnp.where(run.is_usable & stop_gradients(hybrid.has_usable_numbers), code, Result.invalid_argument)
-    start = RunInput(problem.ts, problem.q, problem.v, code, choices.drift_tol)
     if not all(x.plan.is_native for x in compiled):
         conditions = None
-    return run_events(hybrid, start, conditions, max_events), tuple(x.plan.why_not_native for x in compiled)
+    return run_events(hybrid, conditions), tuple(x.plan.why_not_native for x in compiled)
 
 
 _compiled_run, _deferred_run = eqx.filter_jit(_run), deferred(_run)

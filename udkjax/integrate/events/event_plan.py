@@ -1,0 +1,120 @@
+"""The common part of runs with events, whatever their numbers are: tables of the phases, and kinds of the events."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Log, Stop
+from udkjax.integrate.events.event import Event, sees_velocity
+from udkjax.integrate.events.phases import Phases, Tables
+
+
+@dataclass(frozen=True)
+class EventPlan:
+    """The events and phases of a run, as far as no number changes them; equal ones have the same code."""
+
+    tables: Tables
+    directions: tuple[int, ...]  # of each event
+    by_velocity: tuple[bool, ...]  # whether its condition depends on velocities
+    actions: tuple[type[Action], ...]
+    at_rest: tuple[str, ...]  # of impacts
+    max_steps: int
+    max_events: int
+
+    @property
+    def count(self) -> int:
+        """The number E of events."""
+        return len(self.directions)
+
+    @cached_property
+    def both_directions(self) -> Int[np.ndarray, "2E"]:
+        """The directions in which the zeros of conditions count, and those of contact forces: they fall below it."""
+        return np.array([*self.directions, *[-1] * self.count])
+
+    @cached_property
+    def impacts(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the events that are impacts."""
+        return self._mask(Impact)
+
+    @cached_property
+    def stops(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the events that end the run."""
+        return self._mask(Stop)
+
+    @cached_property
+    def changes(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the events that do more than to take note or to stop."""
+        return ~self._mask(Log, Stop)
+
+    @cached_property
+    def adds(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the events that add a joint."""
+        return self._mask(Attach, Lock)
+
+    @cached_property
+    def held_at_rest(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the impacts that are held where they come to rest."""
+        return np.array([x == "hold" for x in self.at_rest])
+
+    @cached_property
+    def stops_at_rest(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the impacts that end the run where they come to rest."""
+        return np.array([x == "stop" for x in self.at_rest])
+
+    @cached_property
+    def held(self) -> Bool[np.ndarray, "phases E"]:
+        """Mask of the contacts at rest in each phase."""
+        return np.array(self.tables.held) >= 0
+
+    @cached_property
+    def after(self) -> Int[np.ndarray, "phases E"]:
+        """The phase that follows an event."""
+        return np.array(self.tables.after)
+
+    @cached_property
+    def free(self) -> Int[np.ndarray, "phases"]:
+        """The phase that follows when all contacts at rest let go."""
+        free = np.arange(len(self.tables.held))
+        for k in np.flatnonzero(self.impacts):
+            free = np.array(self.tables.freed)[free, k]
+        return free
+
+    def with_contacts(self, phase: Int[Any, "*m"], held: Bool[Any, "*m E"], xp: ModuleType) -> Int[Any, "*m"]:
+        """Return the phase that follows when contacts come to rest."""
+        resting = xp.asarray(np.array(self.tables.resting))
+        for k in np.flatnonzero(self.held_at_rest):
+            phase = xp.where(held[..., k], resting[phase, k], phase)
+        return phase
+
+    def watched(self, phase: Int[Any, "*m"], carried: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m 2E"]:
+        """Return a mask of the conditions, and of the contact forces, that count."""
+        held = xp.asarray(self.held)[phase]
+        return xp.concatenate([~held & ~carried, held], axis=-1)
+
+    def _mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
+        return np.array([issubclass(x, actions) for x in self.actions])
+
+
+def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_events: int) -> EventPlan:
+    """Return the plan of a run.
+
+    Args:
+        phases: the phases.
+        events: all events.
+        max_steps: the largest number of steps that are tried.
+        max_events: most events that may happen.
+    """
+    return EventPlan(
+        tables=phases.tables,
+        directions=tuple(e.direction for e in events),
+        by_velocity=tuple(sees_velocity(e, phases.mechanisms[0]) for e in events),
+        actions=tuple(type(e.action) for e in events),
+        at_rest=tuple(e.action.at_rest if isinstance(e.action, Impact) else "" for e in events),
+        max_steps=max_steps,
+        max_events=max_events,
+    )

@@ -1,0 +1,205 @@
+"""Runs with events in their plain form, by JAX: of one member, window by window.
+
+A window has the output times within it, and nodes at which the conditions and the forces of contacts at rest are looked at
+(`detection`). Where these are too coarse for a condition, the window is done again, an eighth as long. An interval in which one
+crosses is the next window, until the zero of its cubic is exact to rounding, which is the end of the last one; or until it is as
+short as can be, as where a condition jumps.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.scales import mass_of
+from udkjax.integrate.events.actions import Impact
+from udkjax.integrate.events.crossings import NO_EVENT
+from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
+from udkjax.integrate.events.hybrid import Added, Hybrid
+from udkjax.integrate.events.impacts import Contacts
+from udkjax.integrate.events.loop import run_loop
+from udkjax.integrate.events.runs import Change, EventRun, MemberRuns, Members, RunState, results, runs_before
+from udkjax.integrate.events.system import StateValues
+from udkjax.integrate.problem import IntegratorOutput
+from udkjax.integrate.solution import Result
+from udkjax.native.conditions import FINER, FINEST, PER_TIME, SHORT
+from udkjax.native.steps import DONE, LOST, NOT_FINITE, STEP_LIMIT, UNIT
+
+MOST_OUTPUTS = 32  # output times of a window
+
+
+class Window(NamedTuple):
+    """The next window of a run, and the findings of those before."""
+
+    reach: Float[Array, ""]  # its length, at most (s)
+    event: Int[Array, ""]  # the condition whose crossing is being located, or `NO_EVENT`
+    high: Float[Array, ""]  # the end of the interval in which it does (s)
+    lands: Bool[Array, ""]  # whether it does at that end
+    last: Float[Array, ""]  # the time of the last event (s)
+    unresolved: Float[Array, "2E"]  # from when on a condition varies too quickly to be sure of its crossings (s), or infinite
+
+
+def run_plain(hybrid: Hybrid) -> EventRun:
+    """Run a system with events, window by window."""
+    system, ts, never = PlainSystem(hybrid), hybrid.ts, jnp.full(2 * hybrid.count, jnp.inf)
+    window = Window(ts[-1] - ts[0], jnp.array(NO_EVENT), ts[0], jnp.array(False), ts[0], never)
+    start = with_member(hybrid.first_state())
+    runs = run_loop(system, runs_before(hybrid.plan, start, len(ts), hybrid.code[None], jnp, window))
+    # Before it is no number, a condition may vary quickly: the end of the run says so.
+    unresolved = jnp.where(runs.undefined, jnp.inf, runs.window.unresolved[: hybrid.count])
+    return jax.tree.map(lambda x: x[0], results(hybrid.plan, runs, ts[None], unresolved, jnp))
+
+
+def with_member(state: RunState) -> RunState:
+    """Return a state with the one member in front."""
+    t, q, v, phase, joints = state
+    return RunState(t[None], q[None], v[None], phase[None], joints)
+
+
+def without_member(state: RunState) -> RunState:
+    """Return the state of the one member."""
+    t, q, v, phase, joints = state
+    return RunState(t[0], q[0], v[0], phase[0], joints)
+
+
+class PlainSystem:
+    """The motion of one member (`system.System`) by JAX, with the plain forms of all that machine code does."""
+
+    xp = jnp
+
+    def __init__(self, hybrid: Hybrid):
+        self.hybrid, self.plan = hybrid, hybrid.plan
+        self.end, self.rate = hybrid.ts[-1:], hybrid.rate[None]
+        self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
+        self.inverse_mass = 1 / mass_of(hybrid.phases.mechanisms[0], jnp)[None]
+
+    def contacts(self, some: Members) -> Contacts:
+        """Return the contacts."""
+        plan = self.plan
+        e = [e.action.restitution if isinstance(e.action, Impact) else jnp.zeros(()) for e in self.hybrid.events]
+        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
+
+    def look(self, some: Members, at: RunState, is_free: bool = False) -> StateValues:
+        """Evaluate a state."""
+        return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free))
+
+    def project(self, some: Members, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
+        """Return positions and velocities that the phase of a state allows."""
+
+        def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
+            # Velocities jump to a state that the phase allows: its derivatives are not those of a small correction.
+            equations = self.hybrid.textbook(p, added)
+            return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
+
+        t, q, v, phase, added = without_member(at)
+        q, v = self.hybrid.in_phase(phase, of_phase, t, q, v, added, is_free=is_free)
+        return q[None], v[None]
+
+    def add_joints(self, some: Members, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
+        """Return the joints that events have added, with that which an event adds at q; -1: none."""
+        phases = self.hybrid.phases
+        new = (phases.joint_at(i, q[0]) for i in range(len(joints)))
+        is_new = (event[0] == by for by, _ in phases.added_by)
+        return tuple(
+            jax.tree.map(lambda x, y, chosen=chosen: jnp.where(chosen, x, y), x, y)
+            for chosen, x, y in zip(is_new, new, joints, strict=True)
+        )
+
+    def when(self, those: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
+        """Return the run with a change, or as it is."""
+        return jax.lax.cond(those[0], lambda runs: change(runs, None), lambda runs: runs, runs)
+
+    def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
+        """Return the run after as many changes as it takes."""
+        return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
+
+    def advance(self, runs: MemberRuns, some: Members) -> MemberRuns:
+        """Integrate a window, and go on to its end; or to the last node before something crosses, or may; or to the crossing."""
+        hybrid, ts, window, state = self.hybrid, self.hybrid.ts, runs.window, without_member(runs.state(None))
+        t, E, T = state.t, hybrid.count, len(ts)
+        output = jnp.searchsorted(ts, t) + np.arange(min(MOST_OUTPUTS, T))
+        due = ts[jnp.minimum(output, T - 1)]
+        speed = jnp.maximum(hybrid.scales.rate, hybrid.scales.size(state.v))
+        full = jnp.where(speed > 0, INTERVALS / PER_TIME / jnp.where(speed > 0, speed, 1.0), ts[-1] - ts[0])
+        zooms = window.event != NO_EVENT
+        end = jnp.where(zooms, window.high, t + jnp.minimum(full, window.reach))
+        end = jnp.minimum(end, jnp.minimum(due[-1], ts[-1]))
+        nodes = (t + (end - t) * NODES).at[-1].set(end)
+        times = jnp.sort(jnp.concatenate([nodes, jnp.clip(due, t, end)]))
+        length = end - t
+        # Too short to integrate, or of no length, as of a member of a batch that something else happens to.
+        short = length <= 2 * hybrid.smallest
+        clear = jnp.where(short, t + 100 * hybrid.smallest * np.arange(len(times)), times)
+        raw = hybrid.flow(clear, state, derivatives=False)
+        own = (short | (times <= t))[:, None]
+        q = jnp.where(own, state.q + (times - t)[:, None] * state.v, raw.q)
+        v = jnp.where(own, state.v, raw.v)
+        lands = window.lands & (np.arange(2 * E) == window.event)
+        good = jnp.cumsum(~(own[:, 0] | (raw.reached & (raw.violation <= hybrid.drift_tol)))) == 0
+
+        at = jnp.searchsorted(times, nodes)
+        g, g_dot = jax.vmap(hybrid.conditions_and_rates)(nodes, q[at], v[at])
+        forces = jax.vmap(lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v)))(nodes, q[at], v[at])
+        found = detect(
+            Nodes(nodes, jnp.concatenate([g, forces], axis=1), jnp.concatenate([g_dot, 0 * g_dot], axis=1), good[at]),
+            has_rates=np.append(~np.array(self.plan.by_velocity), np.zeros(E, bool)),
+            direction=self.plan.both_directions,
+            sides=runs.sides[0],
+            scale=jnp.append(runs.scale[0], jnp.zeros(E) + hybrid.force),
+            located=window.event,
+            watched=self.plan.watched(runs.phase, runs.carried, jnp)[0] & ~lands,
+            is_short=length * hybrid.rate <= SHORT,
+            unresolved=jnp.isfinite(window.unresolved) | zooms,  # within an interval that was fine enough
+        )
+        place, width = found.place, nodes[found.behind] - nodes[found.place]
+        root = nodes[place] + found.root * width
+        is_shortest = length <= jnp.maximum(FINEST / hybrid.rate, 100 * len(times) * hybrid.smallest)
+        undefined = found.is_coarse & is_shortest & found.undefined[:E]
+        stays = found.is_found | found.is_coarse
+        fails = (~jnp.all(good) & ~stays) | jnp.any(undefined)
+        has_landed, jumps = zooms & window.lands & ~stays & ~fails & (end == window.high), width <= 2 * UNIT * hybrid.smallest
+        is_located = has_landed | (found.is_found & jumps)
+
+        node = jnp.where(stays, jnp.where(found.is_coarse, found.last_sure, place), len(nodes) - 1)
+        last_good = jnp.where(jnp.all(good), len(times) - 1, jnp.maximum(jnp.sum(good) - 1, 0))
+        # Where a condition jumps, the event is the first time behind that.
+        k = jnp.where(stays, at[jnp.where(is_located, found.behind, node)], last_good)
+        t_new = times[k]
+        rows = jnp.where((output < T) & (due < t_new), output, T)
+        of_outputs = jnp.searchsorted(times, jnp.clip(due, t, end))
+        code = jnp.where(jnp.any(undefined), Result.undefined_condition, _failure(raw))
+        reach = jnp.where(found.is_coarse, length / FINER, jnp.where(zooms | found.is_found, window.reach, 2 * window.reach))
+        since = t_new - window.last
+        is_unresolved = found.is_coarse & is_shortest & found.coarse & ~found.undefined
+        projections = hybrid.projects * (raw.tried + 2 * len(times) - 2)
+        return runs._replace(
+            t=t_new[None],
+            q=q[k][None],
+            v=v[k][None],
+            event=jnp.where(has_landed, window.event, jnp.where(is_located, found.event, NO_EVENT))[None],
+            sides=jnp.where(lands, runs.sides[0], found.sides[node])[None],
+            running=~fails[None],
+            code=jnp.where(fails, code, Result.successful)[None],
+            undefined=undefined[None],
+            totals=runs.totals + jnp.stack([raw.tried, raw.accepted, raw.evaluations, projections]),
+            qs=runs.qs.at[0, rows].set(q[of_outputs], mode="drop"),
+            vs=runs.vs.at[0, rows].set(v[of_outputs], mode="drop"),
+            window=Window(
+                reach=jnp.where(is_located & (since > 0), jnp.minimum(reach, 2 * since), reach),
+                event=jnp.where(found.is_found & ~is_located, found.event, jnp.where(end < window.high, window.event, NO_EVENT)),
+                high=jnp.where(found.is_found, jnp.where(found.is_exact, root, nodes[found.behind]), window.high),
+                lands=jnp.where(found.is_found, found.is_exact, window.lands),
+                last=jnp.where(is_located, t_new, window.last),
+                unresolved=jnp.where(is_unresolved & jnp.isinf(window.unresolved), t_new, window.unresolved),
+            ),
+        )
+
+
+def _failure(raw: IntegratorOutput) -> Int[Array, ""]:
+    code = jnp.where(raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    code = jnp.where(raw.status == NOT_FINITE, Result.not_finite, code)
+    return jnp.where((raw.status == DONE) | (raw.status == LOST), Result.drift, code)

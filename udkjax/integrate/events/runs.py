@@ -1,0 +1,143 @@
+"""The members of a batch of runs with events: their states, and their results.
+
+Arrays have the members of a batch in front. Those of runs by machine code are NumPy's, and rows of some members change in place;
+those of the plain form are JAX's, of one member, and new ones take their place.
+"""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from udkjax.integrate.events.event_plan import EventPlan
+from udkjax.integrate.solution import Result
+
+# In place of an event: the conditions are not known yet, at the start of the run, or behind an event.
+BEGIN, AGAIN = -3, -2
+
+Members = Int[np.ndarray, "b"] | None  # the indices of some members; None: all of them
+
+
+class RunState(NamedTuple):
+    """The states of runs: time, coordinates, velocities, phase, and the joints that events have added."""
+
+    t: Float[Any, "*m"]
+    q: Float[Any, "*m n"]
+    v: Float[Any, "*m n"]
+    phase: Int[Any, "*m"]
+    joints: Any  # JAX's, of the one member; or NumPy's arrays of their numbers, of all members, which change in place
+
+
+class EventRun(NamedTuple):
+    """The outputs and events of a run, infinite where it did not get. In derivatives a field is None that has none."""
+
+    q: Float[Any, "*m T n"]
+    v: Float[Any, "*m T n"]
+    time: Float[Any, "*m"]  # the end of the run
+    event_time: Float[Any, "*m K"]
+    event_q: Float[Any, "*m K 2 n"]  # before and after
+    event_v: Float[Any, "*m K 2 n"]
+    event_index: Int[Any, "*m K"]  # of the event; plus E where a contact is released, plus 2 E where it comes to rest
+    event_phase: Int[Any, "*m K"]  # after it
+    together: Bool[Any, "*m K"]  # whether it happens with the one before it, as one event
+    closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
+    count: Int[Any, "*m"]
+    unresolved: Float[Any, "*m E"]
+    undefined: Bool[Any, "*m E"]
+    code: Int[Any, "*m"]
+    totals: Int[Any, "*m 4"]  # steps tried, accepted, right-hand sides, projections
+
+
+RECORD = EventRun._fields[3:10]  # of which there is one for each event
+
+
+def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
+    """Return the shapes of the fields of a run of T output times and n coordinates, with room for some events."""
+    E, K = plan.count, room
+    return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K,), (K,), (K, E), (), (E,), (E,), (), (4,))
+
+
+class MemberRuns(NamedTuple):
+    """Everything that changes in runs."""
+
+    t: Float[Any, "B"]
+    q: Float[Any, "B n"]
+    v: Float[Any, "B n"]
+    phase: Int[Any, "B"]
+    joints: Any
+    event: Int[Any, "B"]  # at this time: its number, from E on of a contact that lets go; or `NO_EVENT`, `BEGIN`, `AGAIN`
+    sides: Int[Any, "B 2E"]  # the last known side of zero of each condition and contact force: -1, 1, or 0: not known
+    scale: Float[Any, "B E"]  # of conditions, as in `ConditionValues`
+    carried: Bool[Any, "B E"]  # the contacts that are held at zero by others that are at rest
+    running: Bool[Any, "B"]
+    code: Int[Any, "B"]
+    undefined: Bool[Any, "B E"]  # the conditions that are not a number where the run ends by that
+    totals: Int[Any, "B 4"]
+    qs: Float[Any, "B T n"]
+    vs: Float[Any, "B T n"]
+    count: Int[Any, "B"]  # of events
+    record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with room for one more, which takes what is not to be noted
+    window: Any  # of the plain form
+
+    def state(self, some: Members) -> RunState:
+        """Return the states of some members."""
+        return RunState(take(self.t, some), take(self.q, some), take(self.v, some), take(self.phase, some), self.joints)
+
+    def put(self, some: Members, **new: Any) -> "MemberRuns":
+        """Return the runs with new values of some members."""
+        if some is None:
+            return self._replace(**new)
+        for name, x in new.items():
+            getattr(self, name)[some] = x
+        return self
+
+    def note(self, some: Members, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
+        """Return the runs with values of `RECORD`, each (b or 1, k or 1, ...), in some rows of the record."""
+        members = (np.arange(len(self.t)) if some is None else some)[:, None]
+        if isinstance(self.t, np.ndarray):
+            for array, x in zip(self.record, new, strict=True):
+                array[members, rows] = x
+            return self
+        return self._replace(record=tuple(x.at[members, rows].set(y) for x, y in zip(self.record, new, strict=True)))
+
+
+Change = Callable[[MemberRuns, Members], MemberRuns]  # of some members
+
+
+def take(x: Any, some: Members) -> Any:
+    """Return the rows of some members."""
+    return x if some is None else x[some]
+
+
+def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], xp: ModuleType, window: Any = None) -> MemberRuns:
+    """Return runs before their start, each with a `Result` that is known before."""
+    (B, n), E = state.q.shape, plan.count
+    shapes = shapes_of_run(plan, T, n, plan.max_events + 1)._asdict()
+    values = dict.fromkeys(RECORD[:3], np.inf) | {"event_index": -1, "event_phase": -1, "together": False, "closed": 0}
+    no = xp.zeros((B, E), bool)
+    return MemberRuns(
+        *state,
+        event=xp.full(B, BEGIN),
+        sides=xp.zeros((B, 2 * E), int),
+        scale=xp.zeros((B, E)),
+        carried=no,
+        running=code == Result.successful,
+        code=code,
+        undefined=no.copy(),
+        totals=xp.zeros((B, 4), int),
+        qs=xp.full((B, *shapes["q"]), np.inf),
+        vs=xp.full((B, *shapes["v"]), np.inf),
+        count=xp.zeros(B, int),
+        record=tuple(xp.full((B, *shapes[name]), value) for name, value in values.items()),
+        window=window,
+    )
+
+
+def results(plan: EventPlan, runs: MemberRuns, ts: Float[Any, "B T"], unresolved: Float[Any, "B E"], xp: ModuleType) -> EventRun:
+    """Return the results of runs at their ends, whose outputs are those of their last states."""
+    last, record = (ts == runs.t[:, None])[..., None], (x[:, : plan.max_events] for x in runs.record)
+    q, v = xp.where(last, runs.q[:, None], runs.qs), xp.where(last, runs.v[:, None], runs.vs)
+    ends = runs.count, unresolved, runs.undefined, runs.code, runs.totals
+    return EventRun._make([q, v, runs.t, *record, *ends])

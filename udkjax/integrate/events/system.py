@@ -1,0 +1,72 @@
+"""The motion that runs with events follow: conditions at states, and the way to the next crossing."""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple, Protocol
+
+from jaxtyping import Bool, Float, Int
+
+from udkjax.integrate.events.event_plan import EventPlan
+from udkjax.integrate.events.impacts import Contacts
+from udkjax.integrate.events.runs import Change, MemberRuns, Members, RunState
+
+
+class StateValues(NamedTuple):
+    """Conditions at some states, with their derivatives and what impulses along them do."""
+
+    a: Float[Any, "*m n"]
+    g: Float[Any, "*m E"]
+    rate: Float[Any, "*m E"]
+    rate_2: Float[Any, "*m E"]  # 0 of conditions that depend on velocities
+    by_t: Float[Any, "*m E"]
+    by_q: Float[Any, "*m E n"]
+    by_v: Float[Any, "*m E n"]
+    directions: Float[Any, "*m E n"]  # of impulses; of events that are no impacts, of any value
+
+
+class System(Protocol):
+    """The motion of the members of a batch: by machine code and NumPy, or, of one member, by JAX.
+
+    Attributes:
+        xp: jax.numpy, or NumPy.
+        plan: the phases and events.
+        end: the last output times (B,).
+        rate: of the system and the run (1/s) (B,).
+        coordinates: the units of all coordinates (B, n).
+        inverse_mass: one over the mass of each coordinate (B, n).
+    """
+
+    xp: ModuleType
+    plan: EventPlan
+    end: Float[Any, "B"]
+    rate: Float[Any, "B"]
+    coordinates: Float[Any, "B n"]
+    inverse_mass: Float[Any, "B n"]
+
+    def contacts(self, some: Members) -> Contacts:
+        """Return the contacts of some members."""
+        ...
+
+    def look(self, some: Members, at: RunState, is_free: bool = False) -> StateValues:
+        """Evaluate some members at states, of phases in which no contact is at rest where `is_free`."""
+        ...
+
+    def project(self, some: Members, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
+        """Return positions and velocities that the phases of states allow."""
+        ...
+
+    def add_joints(self, some: Members, event: Int[Any, "b"], q: Float[Any, "b n"], joints: Any) -> Any:
+        """Return the joints that events have added, with those that some events add at q; -1: none."""
+        ...
+
+    def advance(self, runs: MemberRuns, some: Members) -> MemberRuns:
+        """Take some members on, no farther than to the next crossing, which is then their `event`."""
+        ...
+
+    def when(self, those: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
+        """Return the runs with a change of those members."""
+        ...
+
+    def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
+        """Return the runs after as many changes as it takes until none is running."""
+        ...
