@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.wasm_host import Host
+from udkjax.native import machine
 from udkjax.native.ir import POINTER, Function
 from udkjax.native.wasm import compile_wasm
 from udkjax.native.wasm.object_code import MAGIC, Reader, leb128, link
@@ -62,6 +63,16 @@ def test_constants_are_at_the_beginning_of_memory():
     y = host.put([0.0])
     host.call("read", host.put([1.0]), y)
     assert host.numbers(y, 1)[0] == 2.5
+
+
+def test_what_is_compiled_once_is_read_from_disk(monkeypatch, tmp_path):
+    monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
+    linked = compile_wasm(doubled("run", 2.0).text(), ("run",))
+    monkeypatch.setattr(machine, "object_code", lambda *_: pytest.fail("it is compiled again"))
+    assert compile_wasm(doubled("run", 2.0).text(), ("run",)) == linked
+    (tmp_path / next(iter(tmp_path.iterdir())).name).write_bytes(b"half")
+    with pytest.raises(pytest.fail.Exception):
+        compile_wasm(doubled("run", 2.0).text(), ("run",))
 
 
 def test_what_is_missing_is_named():

@@ -1,4 +1,4 @@
-"""The compiler for WebAssembly: 32-bit addresses, registers of two float64, and no fused multiply-add.
+"""The compiler for WebAssembly: 32-bit addresses, registers of two float64, no fused multiply-add. Its code is stored on disk.
 
 The same text of LLVM holds there: the record that `run` is called with has fields of 8 bytes, of which addresses take
 four; a product and a sum are rounded each. Functions that are no instructions (exp, pow, atan2) and the memory of a run (malloc,
@@ -8,7 +8,7 @@ free) are imports.
 from functools import cache
 from typing import Any, NamedTuple
 
-from udkjax.native import machine
+from udkjax.native import code_cache, machine
 from udkjax.native.module import Module
 from udkjax.native.operations import Operation
 from udkjax.native.wasm.object_code import LinkedModule, link
@@ -44,11 +44,15 @@ def wasm_module(operation: Operation) -> WasmModule:
 
 
 def compile_wasm(text: str, exports: tuple[str, ...]) -> LinkedModule:
-    """Compile LLVM's text to a module that exports some of its functions."""
-    llvm = _llvm()
-    target = llvm.Target.from_triple(TRIPLE)
-    options = {"cpu": "generic", "features": FEATURES, "opt": machine.LEVEL, "reloc": "static", "codemodel": "small"}
-    return link(machine.object_code(text, target.create_target_machine(**options), TRIPLE), exports)
+    """Return a module that exports some functions of LLVM's text: from disk, or compiled and put there."""
+    key = machine.digest("\0".join((TRIPLE, FEATURES, text)))
+    code = code_cache.read(key)
+    if code is None:
+        target = _llvm().Target.from_triple(TRIPLE)
+        options = {"cpu": "generic", "features": FEATURES, "opt": machine.LEVEL, "reloc": "static", "codemodel": "small"}
+        code = machine.object_code(text, target.create_target_machine(**options), TRIPLE)
+        code_cache.write(key, code)
+    return link(code, exports)
 
 
 @cache
