@@ -1,6 +1,7 @@
 """A design as a least-squares problem, evaluated for batches of trials by machine code in lanes."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,8 +65,8 @@ class DesignProblem:
         self.data, self.reach = goal.targets, float(np.max(bounds.last - bounds.first, initial=self.scale)) / 4
         self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # of the free numbers
         self.local = goal.values is None  # values are unknowns, too
-        self._compile()
         self.terms = self._compile_terms(terms)
+        self._compile()
         self._require_effects()
 
     def _compile_terms(self, terms: Sequence[MotionTerm]) -> list[CompiledTerm]:
@@ -98,12 +99,18 @@ class DesignProblem:
             programs = compile_programs(self.mechanism, traced, self.unknowns, self.coordinates, **choices)
             return programs, position_code(self.mechanism, programs)
 
+        self._made, self._residual_count = made, G
         self._fit, self._fit_code = made(slice(G), True)
         self._turn, self._turn_code = made(slice(G, None), False)
-        _, self._residual_code = made(slice(G), False)
-        if self.rotation:
-            self._margin, self._margin_code = made(slice(0, 0), True)
-        self._points = self._point_program()
+
+    @cached_property
+    def _residual_code(self):
+        return self._made(slice(self._residual_count), False)[1]
+
+    @cached_property
+    def _margin(self):
+        """The programs of the transmission and its derivatives."""
+        return self._made(slice(0, 0), True)
 
     def _require_effects(self):
         """Raise `SceneError` where a free number cannot change what is measured, such as a mass."""
@@ -114,8 +121,9 @@ class DesignProblem:
             listed = ", ".join(map(quote, idle))
             raise SceneError([f"free: {listed} cannot change what the goal measures: leave it out"], self.mechanism.name)
 
-    def _point_program(self) -> ScalarProgram:
-        """Return the program of the measures, then of the places of all pins, or without a drawing of q and the unknowns."""
+    @cached_property
+    def _points(self) -> ScalarProgram:
+        """The program of the measures, then of the places of all pins, or without a drawing of q and the unknowns."""
         names = [] if self.mechanism.drawing is None else list(self.mechanism.drawing.groups["pin"])  # pyright: ignore
 
         def points(x: Array, q: Array) -> Array:
@@ -294,13 +302,11 @@ class DesignProblem:
         worst, step = square.argmin(1), self.period / CHECK_VALUES
         before, at, after = (square[all_of_them, (worst + k) % CHECK_VALUES] for k in (-1, 0, 1))
         bend = np.maximum(before - 2.0 * at + after, np.finfo(float).tiny)
-        centre, s = (
-            turn.s[all_of_them, worst],
-            turn.s[all_of_them, worst] + step * np.clip(0.5 * (before - after) / bend, -0.5, 0.5),
-        )
-        guess, place = np.where(turns[:, None], turn.q[all_of_them, worst], 0.0)[:, None], self._margin.places[-1]
+        (programs, code), centre = self._margin, turn.s[all_of_them, worst]
+        s = centre + step * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+        guess, place = np.where(turns[:, None], turn.q[all_of_them, worst], 0.0)[:, None], programs.places[-1]
         for last in (False, True):
-            found = self._margin_code(x, s[:, None], self._unit, None, guess, threads=threads)
+            found = code(x, s[:, None], self._unit, None, guess, threads=threads)
             value, slope = found.out[:, 0, place.value], found.out[:, 0, place.by_value]
             if not last:
                 moved = s - np.where(np.isfinite(slope), value * slope, 0.0) * step**2 / bend

@@ -12,6 +12,7 @@ from jaxtyping import Array
 from udkjax.equations.motion_measures import MotionModel
 from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.equations.position_programs import trace_model
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate.native_positions import compile_programs, position_code
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
@@ -147,7 +148,7 @@ class CompiledTerm:
             y = b @ jnp.linalg.pinv(jacobian) if len(b) else jnp.zeros((0, len(jacobian)))
             return measures(x, s, q, u, w, y, jnp.zeros(0))[0]
 
-        return jax.jit(jax.vmap(one, (None, 0, 0, 0, 0)))
+        return deferred(jax.vmap(one, (None, 0, 0, 0, 0)))
 
 
 def _speed(mechanism: Mechanism, driver: str) -> float:
