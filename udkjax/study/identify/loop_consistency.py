@@ -21,6 +21,7 @@ from jaxtyping import Array
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
 from udkjax.equations.scales import known_scales
+from udkjax.expressions.deferred import deferred
 from udkjax.integrate.assembly import close, require_closed
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Numbers
@@ -58,7 +59,7 @@ def loop_problems(
     redundant = analyse(mechanism).redundant_rows
     if redundant == () or not names:
         return []
-    placed = jax.jit(lambda x: apply(mechanism, x).without_origin)  # traced: no step of differences is refused for its sign
+    placed = deferred(lambda x: apply(mechanism, x).without_origin)  # traced: no step of differences is refused for its sign
     x = np.asarray(x, float)
     steps = DIFFERENCE_STEP * np.where(x != 0.0, np.abs(x), min(_length(placed(x)), 1.0))
     moving = [
