@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.show.player.pages import Pages
 
 OMEGA = 4.0  # rad/s: the crank of the slider-crank turns by OMEGA t
 CRANK, ROD = 0.5, 1.5
@@ -72,3 +73,9 @@ def hostile():
     joint = udk.Revolute(("ground", names[1]), [(0.0, 0.0), (-0.5, 0.0)])
     mechanism = udk.Mechanism({names[1]: body}, {names[2]: joint, names[3]: joint}, name=names[0])
     return SimpleNamespace(mechanism=mechanism, names=names)
+
+
+@pytest.fixture(scope="module")
+def opened(browser, tmp_path_factory):
+    """Open an animation in a browser: a function of it, and of the window's properties."""
+    return Pages(browser, tmp_path_factory)

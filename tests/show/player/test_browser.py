@@ -1,94 +1,17 @@
 """The player in headless Chromium: what is on the screen is where the closed form says, and everything can be operated."""
 
-import io
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
-from PIL import Image
 
 import udkjax as udk
 from tests.show.player.conftest import Motion
-from udkjax.show.player.page import module
+from tests.show.player.pages import PLAYER, on_screen, picture, plain, rgb, ring_centre, until
 from udkjax.show.player.sketch import THEMES
-
-REACH = 8  # px around a pin's centre within which its ring is
-PLAYER = "document.getElementById('player').player"
-
-
-@pytest.fixture(scope="module")
-def shown(browser, tmp_path_factory):
-    """Open an animation: a function of it and of the window's properties."""
-    contexts = []
-
-    @contextmanager
-    def opened(animation, width=1000, height=700, **options):
-        path = tmp_path_factory.mktemp("pages") / "page.html"
-        animation.save(path)
-        context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        contexts.append(context)
-        page = context.new_page()
-        problems, requests = [], []
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda message: problems.append(message.text) if message.type in ("error", "warning") else None)
-        page.on("request", lambda request: requests.append(request.url))
-        page.goto(path.as_uri())
-        until(page, f"Boolean({PLAYER})")
-        yield page
-        assert problems == []
-        assert requests == [path.as_uri()]  # the page itself, and nothing else
-        context.close()
-
-    yield opened
-    for context in contexts:
-        context.close()
-
-
-def until(page, condition):
-    """Wait for a condition; Playwright's own way evaluates text, which the page forbids."""
-    for _ in range(200):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(25)
-    raise AssertionError(f"{condition} did not come true")
-
-
-def rgb(colour):
-    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
-
-
-def picture(page):
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
-
-
-def on_screen(page, panel, place):
-    """Where a place in metres is on the screen (px)."""
-    x, y = page.evaluate(f"{PLAYER}.pixel({panel}, {place[0]}, {place[1]})")
-    box = page.locator(".panel canvas").nth(panel).bounding_box()
-    return np.array([box["x"] + x, box["y"] + y])
-
-
-def ring_centre(pixels, place, colour):
-    """The centroid of what has a colour near a place (px): the ring of a pin."""
-    x, y = np.rint(place).astype(int)
-    rows, columns = slice(y - REACH, y + REACH + 1), slice(x - REACH, x + REACH + 1)
-    weight = np.clip(1 - np.abs(pixels[rows, columns] - rgb(colour)).max(axis=2) / 100, 0, 1)
-    assert weight.sum() > 8, "there is no pin"
-    grid = np.mgrid[rows, columns] + 0.5
-    return np.array([(weight * grid[1]).sum(), (weight * grid[0]).sum()]) / weight.sum()
-
-
-def plain(page):
-    """Hide what lies over pins."""
-    for name in ("Traces",):
-        button = page.get_by_role("button", name=name)
-        if button.get_attribute("aria-pressed") == "true":
-            button.click()
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_pixels_are_where_the_closed_form_says(shown, animation, closed_form, theme):
-    with shown(animation, color_scheme=theme) as page:
+def test_pixels_are_where_the_closed_form_says(opened, animation, closed_form, theme):
+    with opened(animation, color_scheme=theme) as page:
         plain(page)
         for t in (0.0, 0.3125, 1.19, 2.0):
             page.evaluate(f"{PLAYER}.seek({t})")
@@ -99,9 +22,9 @@ def test_pixels_are_where_the_closed_form_says(shown, animation, closed_form, th
         np.testing.assert_allclose(pixels[90, 500], rgb(THEMES[theme]["back"]), atol=1)
 
 
-def test_the_scale_is_the_same_in_both_directions_and_all_is_in_view(shown, animation):
+def test_the_scale_is_the_same_in_both_directions_and_all_is_in_view(opened, animation):
     left, bottom, right, top = animation.data["bounds"]
-    with shown(animation, 390, 844) as page:
+    with opened(animation, width=390, height=844) as page:
         (x0, y0), (x1, y1) = on_screen(page, 0, (left, bottom)), on_screen(page, 0, (right, top))
         assert (x1 - x0) / (right - left) == pytest.approx((y0 - y1) / (top - bottom))
         box = page.locator(".panel canvas").bounding_box()
@@ -112,12 +35,12 @@ def test_the_scale_is_the_same_in_both_directions_and_all_is_in_view(shown, anim
             assert area["x"] >= 0 and area["x"] + area["width"] <= 390 and area["height"] >= 30
 
 
-def test_two_runs_move_in_step(shown, slider_crank, closed_form):
+def test_two_runs_move_in_step(opened, slider_crank, closed_form):
     one = closed_form.run(np.linspace(0, 2, 81))
     ts = np.linspace(0, 2, 41)  # the same motion a quarter of a second later, at other instants
     late = closed_form.run(ts + 0.25)
     animation = udk.animate(slider_crank, {"one": one, "late": Motion(ts=ts, q=late.q, v=late.v)}, measures=())
-    with shown(animation) as page:
+    with opened(animation) as page:
         plain(page)
         page.evaluate(f"{PLAYER}.seek(0.7)")
         pixels = picture(page)
@@ -127,8 +50,8 @@ def test_two_runs_move_in_step(shown, slider_crank, closed_form):
         assert page.locator("figcaption").all_text_contents() == ["one", "late"]
 
 
-def test_it_plays_at_its_speed_and_pauses(shown, animation):
-    with shown(animation) as page:
+def test_it_plays_at_its_speed_and_pauses(opened, animation):
+    with opened(animation) as page:
         assert page.evaluate(f"[{PLAYER}.time, {PLAYER}.playing]") == [0, False]
         page.get_by_role("combobox", name="speed").select_option("0.5")
         page.get_by_role("button", name="play").click()
@@ -148,8 +71,8 @@ def test_it_plays_at_its_speed_and_pauses(shown, animation):
         assert page.evaluate(f"[{PLAYER}.time, {PLAYER}.playing]") == [stopped, False]
 
 
-def test_it_repeats_or_stops_at_the_end(shown, animation):
-    with shown(animation) as page:
+def test_it_repeats_or_stops_at_the_end(opened, animation):
+    with opened(animation) as page:
         page.evaluate(f"{PLAYER}.seek(1.95); {PLAYER}.speed = 1; {PLAYER}.play()")
         until(page, f"{PLAYER}.time < 1")
         page.get_by_role("button", name="repeat").click()
@@ -158,8 +81,8 @@ def test_it_repeats_or_stops_at_the_end(shown, animation):
         assert page.evaluate(f"{PLAYER}.time") == 2
 
 
-def test_keys_and_scrubbing(shown, animation):
-    with shown(animation) as page:
+def test_keys_and_scrubbing(opened, animation):
+    with opened(animation) as page:
         time = lambda: page.evaluate(f"{PLAYER}.time")  # noqa: E731
         page.locator(".panel canvas").focus()
         page.keyboard.press("End")
@@ -189,8 +112,8 @@ def test_keys_and_scrubbing(shown, animation):
         assert page.evaluate(f"{PLAYER}.playing")
 
 
-def test_the_view_moves_zooms_and_comes_back(shown, animation):
-    with shown(animation) as page:
+def test_the_view_moves_zooms_and_comes_back(opened, animation):
+    with opened(animation) as page:
         before = on_screen(page, 0, (1, 0))
         page.mouse.move(*before)
         page.mouse.wheel(0, -400)
@@ -205,8 +128,8 @@ def test_the_view_moves_zooms_and_comes_back(shown, animation):
         np.testing.assert_allclose(on_screen(page, 0, (1, 0)), before, atol=0.1)
 
 
-def test_a_finger_plays_pauses_and_seeks(shown, animation):
-    with shown(animation, 390, 844, has_touch=True, is_mobile=True, device_scale_factor=2) as page:
+def test_a_finger_plays_pauses_and_seeks(opened, animation):
+    with opened(animation, width=390, height=844, has_touch=True, is_mobile=True, device_scale_factor=2) as page:
         page.locator(".panel canvas").tap()
         assert page.evaluate(f"{PLAYER}.playing")
         page.locator(".panel canvas").tap()
@@ -215,8 +138,8 @@ def test_a_finger_plays_pauses_and_seeks(shown, animation):
         assert page.evaluate(f"{PLAYER}.time") == pytest.approx(1.0, abs=0.02)
 
 
-def test_dark_and_light_by_the_system_and_by_hand(shown, animation):
-    with shown(animation, color_scheme="dark") as page:
+def test_dark_and_light_by_the_system_and_by_hand(opened, animation):
+    with opened(animation, color_scheme="dark") as page:
         back = lambda: picture(page)[90, 500]  # noqa: E731
         np.testing.assert_allclose(back(), rgb(THEMES["dark"]["back"]), atol=1)
         page.emulate_media(color_scheme="light")
@@ -225,9 +148,9 @@ def test_dark_and_light_by_the_system_and_by_hand(shown, animation):
         np.testing.assert_allclose(back(), rgb(THEMES["dark"]["back"]), atol=1)
 
 
-def test_the_strip_shows_the_measure(shown, animation):
+def test_the_strip_shows_the_measure(opened, animation):
     """Where the curve of the crank's angle, 4 t, meets the line of now: at half of its height at half of the time."""
-    with shown(animation) as page:
+    with opened(animation) as page:
         page.evaluate(f"{PLAYER}.seek(1.0)")
         strip = page.locator(".strip canvas").bounding_box()
         pixels = picture(page)
@@ -239,21 +162,21 @@ def test_the_strip_shows_the_measure(shown, animation):
         assert page.get_by_role("combobox", name="measure").locator("option").all_text_contents() == ["crank angle", "speed"]
 
 
-def test_arrows_of_reactions(shown, slider_crank, run):
+def test_arrows_of_reactions(opened, slider_crank, run):
     animation = udk.animate(slider_crank, run, measures=(), reactions=True)
     colour = rgb("#b3261e")
-    with shown(animation) as page:
+    with opened(animation) as page:
         red = lambda: (np.abs(picture(page)[60:620] - colour).max(axis=2) < 40).sum()  # noqa: E731
         with_arrows = red()
         page.get_by_role("button", name="Reactions").click()
         assert with_arrows > red() + 100
 
 
-def test_modes_swing(shown, slider_crank):
+def test_modes_swing(opened, slider_crank):
     q, shape = np.asarray(slider_crank.q0), np.zeros((1, 3, 3))
     shape[0, 2, 0] = 1.0  # the slider alone moves along x
     animation = udk.animate_modes(slider_crank, q, shape, [1.25])
-    with shown(animation) as page:
+    with opened(animation) as page:
         assert page.locator("figcaption").text_content() == "mode 1 1.25 Hz"
         for t, amplitude in ((0.25, 1.0), (0.75, 1.0), (0.25, 0.5)):
             page.evaluate(f"{PLAYER}.seek({t})")
@@ -267,14 +190,12 @@ def test_modes_swing(shown, slider_crank):
             assert (edges[0] + edges[-1]) / 2 + 0.5 - 40 == pytest.approx(expected[0] - round(expected[0]), abs=1.0)
 
 
-def test_markup_and_script_in_names_are_text(shown, hostile):
+def test_markup_and_script_in_names_are_text(opened, hostile):
     still = Motion(ts=np.zeros(1), q=np.asarray(hostile.mechanism.q0)[None], v=np.zeros((1, 1, 3)))
     animation = udk.animate(
-        hostile.mechanism,
-        dict.fromkeys(hostile.names[:2], still),
-        measures={"<u>x</u> (<i>)": {hostile.names[0]: np.ones(1)}},
+        hostile.mechanism, dict.fromkeys(hostile.names[:2], still), measures={"<u>x</u> (<i>)": {hostile.names[0]: np.ones(1)}}
     )
-    with shown(animation) as page:
+    with opened(animation) as page:
         page.get_by_role("button", name="Names").click()
         page.wait_for_timeout(100)
         assert page.evaluate("window.hit") is None
@@ -296,42 +217,16 @@ def test_a_frame_in_another_page(browser, animation):
     page.close()
 
 
-HOST = """
-<!doctype html><meta charset="utf-8"><div id="one"></div><script type="module">
-const source = SOURCE;
-const {default: widget} = await import(URL.createObjectURL(new Blob([source], {type: "text/javascript"})));
-const state = {data: DATA, time: 0.5, playing: false, theme: "light"}, listeners = {};
-window.model = {
-  get: name => state[name],
-  set: (name, value) => { state[name] = value; },
-  save_changes: () => { window.saved = {...state, data: null}; },
-  on: (name, listener) => { (listeners[name] ??= []).push(listener); },
-  off: name => { delete listeners[name]; },
-  change: (name, value) => { state[name] = value; for (const listener of listeners[`change:${name}`] ?? []) listener(); },
-};
-window.cleanup = widget.render({model: window.model, el: document.getElementById("one")});
-window.listeners = listeners;
-</script>
-"""
-
-
-def test_the_widgets_module_follows_its_model(browser, animation, tmp_path):
+def test_the_widgets_module_follows_its_model(opened, animation):
     """In a page that has the interface of anywidget's model; test_notebook.py runs it in a real notebook."""
-    from udkjax.show.player.page import as_json
-
-    path = tmp_path / "host.html"
-    path.write_text(HOST.replace("SOURCE", as_json(module())).replace("DATA", as_json(animation.data)), encoding="utf-8")
-    page = browser.new_page()
-    page.goto(path.as_uri())
-    until(page, "Boolean(window.cleanup)")
-    player = "document.getElementById('one').player"
-    assert page.evaluate(f"{player}.time") == 0.5
-    page.evaluate("model.change('time', 1.25)")
-    assert page.evaluate(f"{player}.time") == 1.25
-    page.evaluate("model.change('playing', true)")
-    assert page.evaluate(f"{player}.playing")
-    page.evaluate(f"{player}.pause(); {player}.seek(0.75)")
-    assert page.evaluate("[saved.time, saved.playing]") == [0.75, False]
-    page.evaluate("cleanup()")
-    assert page.evaluate("Object.keys(listeners).length") == 0 and page.locator("canvas").count() == 0
-    page.close()
+    with opened.widget(animation.data) as page:
+        player = "document.getElementById('one').player"
+        assert page.evaluate(f"{player}.time") == 0.5
+        page.evaluate("model.change('time', 1.25)")
+        assert page.evaluate(f"{player}.time") == 1.25
+        page.evaluate("model.change('playing', true)")
+        assert page.evaluate(f"{player}.playing")
+        page.evaluate(f"{player}.pause(); {player}.seek(0.75)")
+        assert page.evaluate("[saved.time, saved.playing]") == [0.75, False]
+        page.evaluate("cleanup()")
+        assert page.evaluate("Object.keys(listeners).length") == 0 and page.locator("canvas").count() == 0

@@ -1,7 +1,5 @@
 """Live pages in headless Chromium: they simulate what Python simulates, and sliders, a hand and addresses do what they say."""
 
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -9,10 +7,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from tests.integrate.event_scenes import BALL, PENDULUM
 from tests.show.player.conftest import Motion
-from tests.show.player.test_browser import HOST, PLAYER, on_screen, picture, plain, ring_centre, until
+from tests.show.player.pages import PLAYER, on_screen, picture, plain, ring_centre, until
 from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.measure_curves import reaction_arrows
-from udkjax.show.player.page import as_json, module
 from udkjax.show.player.sketch import THEMES
 
 TS = np.linspace(0.0, 2.0, 41)
@@ -20,33 +17,6 @@ LIVE = f"{PLAYER}.live"
 SCENES = sorted(udk.library.__all__)
 FAST = ("slider_crank",)
 every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
-
-
-@pytest.fixture(scope="module")
-def opened(browser, tmp_path_factory):
-    """Open an animation: a function of it, with what is behind the address, and of the window's properties."""
-
-    @contextmanager
-    def open_page(animation, address="", script="", width=1000, height=700, **options):
-        path = tmp_path_factory.mktemp("pages") / "page.html"
-        animation.save(path)
-        context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        page = context.new_page()
-        problems, requests = [], []
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda message: problems.append(message.text) if message.type in ("error", "warning") else None)
-        page.on("request", lambda request: requests.append(request.url))
-        if script:
-            page.add_init_script(script)
-        page.goto(path.as_uri() + address)
-        until(page, f"Boolean({PLAYER})")
-        page.evaluate(f"{LIVE}.ready")
-        yield page
-        assert problems == []
-        assert requests == [path.as_uri()]  # the page itself, and nothing else
-        context.close()
-
-    return open_page
 
 
 @pytest.fixture(scope="module")
@@ -502,7 +472,7 @@ def test_beside_the_bodies_a_drag_moves_the_view(opened, pendulum):
 
 
 def test_a_finger_pulls(opened, pendulum):
-    with opened(pendulum[1], "", "", 390, 844, has_touch=True, is_mobile=True) as page:
+    with opened(pendulum[1], width=390, height=844, has_touch=True, is_mobile=True) as page:
         q = page.evaluate(f"[...{LIVE}.runs[0].run.pose(0)]")
         x, y = on_screen(page, 0, (q[3], q[4]))
         client = page.context.new_cdp_session(page)
@@ -591,15 +561,10 @@ def contrast(one, two):
     return (bright + 0.05) / (dark + 0.05)
 
 
-def test_the_widget_simulates_without_python(browser, live, tmp_path):
-    path = tmp_path / "host.html"
-    path.write_text(HOST.replace("SOURCE", as_json(module())).replace("DATA", as_json(live.data)), encoding="utf-8")
-    page = browser.new_page()
-    page.goto(path.as_uri())
-    until(page, "Boolean(window.cleanup)")
-    widget = "document.getElementById('one').player"
-    page.evaluate(f"{widget}.live.ready")
-    page.evaluate(f"{widget}.live.change({{'motor.motor.speed': 2.0}})")
-    angle = np.array(page.evaluate(f"[...{widget}.live.runs[0].run.q]")).reshape(len(TS), -1)[:, 2]
-    assert_allclose(angle, 2.0 * TS, atol=1e-7)
-    page.close()
+def test_the_widget_simulates_without_python(opened, live):
+    with opened.widget(live.data) as page:
+        widget = "document.getElementById('one').player"
+        page.evaluate(f"{widget}.live.ready")
+        page.evaluate(f"{widget}.live.change({{'motor.motor.speed': 2.0}})")
+        angle = np.array(page.evaluate(f"[...{widget}.live.runs[0].run.q]")).reshape(len(TS), -1)[:, 2]
+        assert_allclose(angle, 2.0 * TS, atol=1e-7)

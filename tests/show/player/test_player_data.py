@@ -254,12 +254,20 @@ def test_it_shows_itself(animation):
     assert animation._repr_html_().startswith("<iframe")
 
 
+def shown_by_ipython(animation):
+    return pytest.importorskip("IPython.core.formatters").DisplayFormatter().format(animation)
+
+
 def test_a_notebook_keeps_the_player(animation):
     """A cell shows nothing that needs Python again: nbconvert would take that, such as a widget, and leave it empty."""
-    formatters = pytest.importorskip("IPython.core.formatters")
-    data, metadata = formatters.DisplayFormatter().format(animation)
-    assert set(data) == {"text/plain", "text/html"}
+    data, _ = shown_by_ipython(animation)
+    assert set(data) == {"text/plain", "text/html"} and embedded(unescape(data["text/html"]))["runs"]
+
+
+@pytest.mark.slow
+def test_nbconvert_keeps_the_player(animation):
     nbformat, nbconvert = pytest.importorskip("nbformat"), pytest.importorskip("nbconvert")
+    data, metadata = shown_by_ipython(animation)
     output = nbformat.v4.new_output("display_data", data, metadata=metadata)
     cell = nbformat.v4.new_code_cell("animation", outputs=[output])
     text, _ = nbconvert.HTMLExporter().from_notebook_node(nbformat.v4.new_notebook(cells=[cell]))
