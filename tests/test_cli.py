@@ -1,5 +1,4 @@
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import get_args
@@ -11,6 +10,7 @@ import xarray
 
 import udkjax as udk
 from tests.command_line import udkjax
+from tests.fresh_process import python
 from udkjax.cli import COMMANDS
 from udkjax.cli.datasets import save
 from udkjax.extras import MissingExtraError
@@ -22,16 +22,18 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
-def test_help_is_printed_without_importing_jax(command):
+def test_help_is_printed_without_importing_jax_and_offers_json():
+    """One process asks for the help of every command."""
     code = (
-        "import sys, atexit; from udkjax.cli import main\n"
-        "atexit.register(lambda: print('HEAVY', {'jax', 'numpy', 'diffrax', 'xarray', 'matplotlib'} & set(sys.modules)))\n"
-        f"main({[*command, '--help']})"
+        "import sys; from udkjax.cli import COMMANDS, main\n"
+        "for command in [[], *([name] for name in COMMANDS)]:\n"
+        "    try:\n        main([*command, '--help'])\n    except SystemExit as end:\n        assert not end.code\n"
+        "    print('HEAVY', *sorted({'jax', 'numpy', 'diffrax', 'xarray', 'matplotlib'} & set(sys.modules)), 'END', sep=',')\n"
     )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "usage: udkjax" in shown
-    assert "HEAVY set()" in shown
+    every, *shown = python(code).split("HEAVY,END")[:-1]
+    assert "usage: udkjax" in every and len(shown) == len(COMMANDS)
+    for name, text in zip(COMMANDS, shown, strict=True):
+        assert f"usage: udkjax {name}" in text and "--json" in text, name
 
 
 def test_simulate_writes_a_file_that_can_be_trusted_and_a_picture(tmp_path, capsys):
@@ -291,9 +293,3 @@ def test_a_defect_keeps_its_traceback(monkeypatch, error):
 def test_the_version_is_said_without_importing_anything(capsys):
     assert udkjax("--version") == 0
     assert capsys.readouterr().out == f"udkjax {udk.__version__}\n"
-
-
-def test_every_command_offers_json(capsys):
-    for command in COMMANDS:
-        assert udkjax(command, "--help") == 0
-        assert "--json" in capsys.readouterr().out, command

@@ -34,8 +34,7 @@ def test_kinematics(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("driver", "problem"),
-    [("motr", 'did you mean "motor"'), ("body.slider.x", 'body.slider.x is held by driver "motor"')],
+    ("driver", "problem"), [("motr", 'did you mean "motor"'), ("body.slider.x", 'body.slider.x is held by driver "motor"')]
 )
 def test_kinematics_refuses_what_cannot_be_driven(capsys, driver, problem):
     assert udkjax("kinematics", EXAMPLES / "slider_crank.toml", "--driver", driver) == 2
