@@ -127,26 +127,14 @@ def test_its_links_lead_somewhere(page):
 # --- names
 
 
-SOURCES = {
-    path: ast.parse(path.read_text())
-    for folder in ("udkjax", "experiments", "benchmarks")
-    for path in (ROOT / folder).rglob("*.py")
-}
-ELSEWHERE = (
-    "jax",
-    "jnp",
-    "numpy",
-    "np",
-    "scipy",
-    "diffrax",
-    "equinox",
-    "eqx",
-    "optax",
-    "pandas",
-    "lineax",
-    "optimistix",
-    "equinox.internal",
-)
+@cache
+def sources() -> dict[Path, ast.Module]:
+    """The modules of the package and of its studies."""
+    files = (path for folder in ("udkjax", "experiments", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
+    return {path: ast.parse(path.read_text()) for path in files}
+
+
+ELSEWHERE = "jax jnp numpy np scipy diffrax equinox eqx optax pandas lineax optimistix equinox.internal".split()
 LONG = {"jnp": "jax.numpy", "np": "numpy", "eqx": "equinox", "eqxi": "equinox.internal"}
 
 
@@ -159,7 +147,7 @@ def identifiers() -> set[str]:
     tests = {
         path: ast.parse(path.read_text()) for path in [ROOT / "tests" / "elements.py", *(ROOT / "tests").glob("*/methods.py")]
     }
-    for path, tree in (SOURCES | tests).items():
+    for path, tree in (sources() | tests).items():
         found |= {path.stem, path.parent.name}
         for node in ast.walk(tree):
             for field in ("id", "attr", "arg", "name", "asname"):
@@ -219,7 +207,7 @@ def missing(text: str) -> Iterator[str]:
     for code in CODE.findall(text):
         if PATH.fullmatch(code):
             if not any(
-                (base / code).exists() for base in (ROOT, ROOT / "udkjax", ROOT / "docs", *{p.parent for p in SOURCES})
+                (base / code).exists() for base in (ROOT, ROOT / "udkjax", ROOT / "docs", *{p.parent for p in sources()})
             ) and not (
                 ("." not in code and exists(code.replace("/", ".")))
                 or re.match(r"[A-Za-z]\w*\.(toml|py|md)$|[\w/]*[A-Z]+[/.]", code)
@@ -236,7 +224,7 @@ def test_its_names_and_files_exist(page):
 
 def prose() -> Iterator[tuple[str, str]]:
     """Each docstring and each comment of the package and its studies, and where it is."""
-    for path, tree in SOURCES.items():
+    for path, tree in sources().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
                 yield f"{name_of(path)}: {getattr(node, 'name', 'module')}", text
@@ -247,7 +235,7 @@ def prose() -> Iterator[tuple[str, str]]:
 
 def test_names_in_docstrings_and_comments_exist():
     assert [(where, name) for where, text in prose() for name in missing(text)] == []
-    files = {path.name for path in [*SOURCES, *(ROOT / "tests").rglob("*.py")]}
+    files = {path.name for path in [*sources(), *(ROOT / "tests").rglob("*.py")]}
     assert [(where, file) for where, text in prose() for file in re.findall(r"\w+\.py\b", text) if file not in files] == []
 
 

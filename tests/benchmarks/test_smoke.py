@@ -1,82 +1,62 @@
 """The benchmarks run, and their baselines compute what they are compared with."""
 
 import json
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.choices import fast
+
 benchmarks = pytest.importorskip("benchmarks", reason="not in a source tree")
 
-from benchmarks import (  # noqa: E402
-    batch,
-    gradients,
-    identification,
-    integrators,
-    measurements,
-    mechanisms,
-    methods,
-    right_hand_side,
-    sweep,
-    table,
-    trajectory,
-    uniqueness,
-)
+from benchmarks import identification, measurements, mechanisms, table  # noqa: E402
 from benchmarks.__main__ import main  # noqa: E402
 from benchmarks.common import Compiled, Work, alternate, at_equal_error, frontier, ratio  # noqa: E402
 from benchmarks.scripts import by_cholesky, by_pinv  # noqa: E402
 
 
-@pytest.mark.slow
-def test_methods():
-    names = [row["name"] for row in methods.main(smoke=True)]
-    assert names[0] == "Auto" and "jit of a mechanism" in names
+def names(rows):
+    return [row["name"] for row in rows]
 
 
-@pytest.mark.slow
-def test_right_hand_side(capsys):
-    figures = right_hand_side.main(smoke=True)
-    names = [row["name"] for row in figures]
-    assert "udkjax Elimination" in names and names[0] == "script, jnp.linalg.pinv"
-    assert all(row["us"] > 0 for row in figures)
-    assert "udkjax Elimination" in capsys.readouterr().out
+SMALL = {  # what must be true of the figures of a small run; most hold their programs against each other inside
+    "methods": lambda rows: names(rows)[0] == "Auto" and "jit of a mechanism" in names(rows),
+    "right_hand_side": lambda rows: (
+        names(rows)[0] == "script, jnp.linalg.pinv" and "udkjax Elimination" in names(rows) and all(row["us"] > 0 for row in rows)
+    ),
+    "uniqueness": lambda rows: names(rows)[-1] == "udkjax, vmap" and all(row["us"] > 0 for row in rows),
+    "trajectory": lambda rows: (
+        {*names(rows)} >= {"udkjax", "script, 1e-04"}
+        and all(row["error"] < (1e-7 if row["name"] == "udkjax" else 1e-3) and row["seconds"] > 0 for row in rows if "tol" in row)
+    ),
+    "batch": lambda rows: (
+        all(row["error"] < 1e-3 and row["per_second"] > 0 for row in rows if "tol" in row)
+        and names(rows)[-1] == "two cores"
+        and rows[-1]["speedup"] > 0
+    ),
+    "sweep": lambda rows: (  # killed and resumed
+        [rows[0][name] for name in ("kept_when_killed", "resumed_members", "members")] == [1, 64, 128] and 0 < rows[0]["gib"] < 4
+    ),
+    "gradients": lambda rows: "udkjax" in names(row for row in rows if row["mode"] == "forward"),
+    "integrators": lambda rows: (
+        {row["solver"] for row in rows} == {"VODE", "DOP853", "Adams", "LSODA", "Radau", "BDF"}
+        and all(0 < row["error"] < 200 * row["tol"] and row["calls"] > 100 for row in rows)
+        and all(row["ratio"] < 1.5 for row in rows if row["solver"] in ("Adams", "BDF"))
+    ),
+    "mechanisms": lambda rows: (
+        all(row.get("per_second", row.get("ms", 0.0)) > 0 for row in rows)
+        and {*names(rows)} >= {"SciPy's fsolve", "udkjax: kinematics() in a batch"}
+    ),
+}
 
 
-def test_uniqueness():
-    """The scripts are held against the package inside."""
-    figures = uniqueness.main(smoke=True)
-    assert [row["name"] for row in figures][-1] == "udkjax, vmap" and all(row["us"] > 0 for row in figures)
-
-
-@pytest.mark.slow
-def test_trajectory():
-    figures = trajectory.main(smoke=True)
-    runs = [row for row in figures if "tol" in row]
-    assert all(row["error"] < (1e-7 if row["name"] == "udkjax" else 1e-3) and row["seconds"] > 0 for row in runs)
-    assert {row["name"] for row in runs} >= {"udkjax", "script, 1e-04"}
-
-
-@pytest.mark.slow
-def test_batch():
-    figures = batch.main(smoke=True)
-    assert all(row["error"] < 1e-3 and row["per_second"] > 0 for row in figures if "tol" in row)
-    assert figures[-1]["name"] == "two cores" and figures[-1]["speedup"] > 0
-
-
-@pytest.mark.slow
-def test_sweep():
-    """Killed and resumed: which is held against the whole one inside."""
-    (row,) = sweep.main(smoke=True)
-    assert row["kept_when_killed"] == 1 and row["resumed_members"] == 64 and row["members"] == 128
-    assert 0 < row["gib"] < 4
-
-
-@pytest.mark.slow
-def test_gradients():
-    """Which are held against the C++ program's inside."""
-    figures = gradients.main(smoke=True)
-    assert {"udkjax"} <= {row["name"] for row in figures if row["mode"] == "forward"}
+@pytest.mark.parametrize("name", fast(["uniqueness", "integrators"], SMALL))
+def test_a_benchmark_runs_in_small(name):
+    rows = import_module(f"benchmarks.{name}").main(smoke=True)
+    assert SMALL[name](rows), rows
 
 
 @pytest.mark.slow
@@ -132,13 +112,6 @@ def test_the_command_writes_figures_table_and_page(tmp_path):
     assert "Not measured here: right_hand_side, methods, integrators, trajectory" in page
 
 
-def test_integrators():
-    figures = integrators.main(smoke=True)
-    assert {row["solver"] for row in figures} == {"VODE", "DOP853", "Adams", "LSODA", "Radau", "BDF"}
-    assert all(0 < row["error"] < 200 * row["tol"] and row["calls"] > 100 for row in figures)
-    assert all(row["ratio"] < 1.5 for row in figures if row["solver"] in ("Adams", "BDF"))
-
-
 def test_work_at_equal_error():
     """Between two points that were measured, on a straight line in logarithms; not beyond them."""
     work = Work([(1e-4, 100), (1e-8, 400)])
@@ -191,11 +164,3 @@ def test_candidates_take_turns():
 def test_the_scripts_of_mechanisms_agree():
     values = mechanisms.START + np.linspace(0.0, 1.0, 5)
     np.testing.assert_allclose(mechanisms.by_fsolve(values), mechanisms.rocker(values), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_mechanisms():
-    """Which are held against each other inside."""
-    figures = mechanisms.main(smoke=True)
-    assert all(row.get("per_second", row.get("ms", 0.0)) > 0 for row in figures)
-    assert {"SciPy's fsolve", "udkjax: kinematics() in a batch"} <= {row["name"] for row in figures}

@@ -22,6 +22,7 @@ SLOW: set[str] = {
     "threshold_map",
     "tune_gains",
     "nine_points",
+    "spread",
     "properties",  # a slice of it: tests/properties
 }
 README = (HERE / "README.md").read_text(encoding="utf-8")
