@@ -268,14 +268,15 @@ test("whatever stands in a file is drawn, or said not to be a drawing", () => {
     motor: [{pin: "A", speed: "60 rpm", of: ["ground", "crank"]}, {slide: "slide1", speed: 1}], spring: [{between: ["A", "C"], stiffness: 1}, {pin: "A", stiffness: 1}],
     damper: [{between: ["A", "C"], damping: 1}, {pin: "A", damping: 1}], load: [{pin: "C", force: ["1 N", "2 N"]}, {link: "plate", torque: 1}],
   };
-  const look = document => {
+  let refused = 0, drawn = 0;
+  const look = document => { // of each kind one is removed, another one each time
     symbolsOf(document, 1e-3);
     shapes.extentPoints(document);
     d.settle(document);
-    for (const kind of d.LISTS) d.list(document, kind).forEach((_, index) => d.removeElements(document, [{kind, index}]));
-    for (const pin of Object.keys(d.pinsOf(document))) d.removeElements(document, [{kind: "pin", name: pin}]);
+    for (const kind of d.LISTS) d.removeElements(document, [{kind, index: drawn % Math.max(1, d.list(document, kind).length)}]);
+    const pins = Object.keys(d.pinsOf(document));
+    d.removeElements(document, [{kind: "pin", name: pins[drawn % pins.length]}]);
   };
-  let refused = 0, drawn = 0;
   const attempt = document => {
     if (shapeProblem(document)) refused++;
     else { look(document); drawn++; }
