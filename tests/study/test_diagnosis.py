@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 
 import udkjax as udk
-from udkjax.scene import GROUND, Prismatic, Revolute, Slot
+from tests.scaling import scaled
+from udkjax.scene import GROUND
 from udkjax.study.accuracy import pendulum
 from udkjax.study.diagnosis import fixes
 
@@ -41,58 +42,19 @@ def exact_rank(matrix: list[list[Fraction]]) -> int:
 
 
 def exact_jacobian(mechanism, rotations: dict[str, tuple[Fraction, Fraction]], names=None) -> list[list[Fraction]]:
-    """Psi_q of revolutes, and of slots and guides on the axes of bodies at right angles to the ground, in rational numbers.
-
-    `rotations` are cos and sin of each body. A guide's and a slot's bodies stand straight: their line is x or y of the ground.
-    """
+    """Psi_q of revolutes in rational numbers; `rotations` are cos and sin of each body."""
     places = {name: k for k, name in enumerate(mechanism.body_names)}
-    rotations = {GROUND: (Fraction(1), Fraction(0)), **rotations}
     rational = lambda x: Fraction(round(float(x) * 10**6), 10**6)  # noqa: E731
     matrix = []
-
-    def arms(joint):
-        for k, body in enumerate(joint.bodies):
-            (c, s), (x, y) = rotations[body], map(rational, joint.points[k])
-            yield body, (1 if k else -1), c * x - s * y, s * x + c * y
-
-    for name in names or mechanism.joints:
-        joint = mechanism.joints[name]
+    for joint in (mechanism.joints[name] for name in names or mechanism.joints):
         rows = [[Fraction(0)] * (3 * len(places)) for _ in range(2)]
-        for body, sign, x, y in arms(joint):
+        for sign, body, point in zip((-1, 1), joint.bodies, joint.points, strict=True):
             if body != GROUND:
-                k = 3 * places[body]
-                rows[0][k], rows[0][k + 2] = Fraction(sign), -sign * y
-                rows[1][k + 1], rows[1][k + 2] = Fraction(sign), sign * x
-        if isinstance(joint, Revolute):
-            matrix += rows
-            continue
-        across = 1 if abs(np.sin(float(joint.axis))) < 0.5 else 0  # the component that the line forbids
-        own = rows[across]
-        # Of a turn of body 1 the line turns with it, through point 2: that is what its own point moves by, and along it by more.
-        if joint.bodies[0] != GROUND:
-            raise_arm(own, joint, places, across, mechanism)
-        matrix.append(own if across else [-x for x in own])  # to the left of the line is up, or to the left
-        if isinstance(joint, Prismatic):
-            turn = [Fraction(0)] * (3 * len(places))
-            for k, body in enumerate(joint.bodies):
-                if body != GROUND:
-                    turn[3 * places[body] + 2] = Fraction(1 if k else -1)
-            matrix.append(turn)
-        assert isinstance(joint, Slot | Prismatic)
+                (c, s), (x, y), k = rotations[body], map(rational, point), 3 * places[body]
+                rows[0][k], rows[0][k + 2] = Fraction(sign), -sign * (s * x + c * y)
+                rows[1][k + 1], rows[1][k + 2] = Fraction(sign), sign * (c * x - s * y)
+        matrix += rows
     return matrix
-
-
-def raise_arm(row, joint, places, across, mechanism):
-    """The arm of body 1 about its line reaches to where the pin is, not to its own point."""
-    one, two = (mechanism.q0[places[body]] for body in joint.bodies)
-    angle = float(two[2])
-    pin = np.asarray(two[:2]) + [
-        np.cos(angle) * float(joint.points[1][0]) - np.sin(angle) * float(joint.points[1][1]),
-        np.sin(angle) * float(joint.points[1][0]) + np.cos(angle) * float(joint.points[1][1]),
-    ]
-    arm = pin - np.asarray(one[:2])
-    value = Fraction(round(float(arm[0 if across else 1]) * 10**6), 10**6)
-    row[3 * places[joint.bodies[0]] + 2] = -value if across else value
 
 
 def double_parallelogram(angles=(ANGLE, ANGLE)):
@@ -117,16 +79,6 @@ def double_parallelogram(angles=(ANGLE, ANGLE)):
 def doubled():
     plain = udk.library.four_bar()
     return udk.Mechanism(plain.bodies, {**plain.joints, "again": plain.joints["B"]}, name="doubled")
-
-
-def scaled(mechanism, unit):
-    """The same mechanism in another unit of length."""
-    values = {}
-    for name, value in mechanism.parameters().items():
-        power = 2 if name.endswith("inertia") else 1 if name.endswith(("position", "points", "velocity", "gravity")) else 0
-        if not name.endswith("angular_velocity"):
-            values[name] = value * unit**power
-    return mechanism.with_parameters(values)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +174,9 @@ def test_a_double_parallelogram_in_exact_arithmetic():
     """Of each stage its own six pins: rank 22, by elimination in rational numbers at 3-4-5; and so each set without a pin."""
     mechanism = double_parallelogram()
     rotations = {n: (COS, SIN) if n.startswith("link") else (Fraction(1), Fraction(0)) for n in mechanism.body_names}
-    assert exact_rank(exact_jacobian(mechanism, rotations)) == 22
+    exact = exact_jacobian(mechanism, rotations)
+    assert_allclose(np.array(exact, float), psi_q(mechanism.without_origin, mechanism.q0), atol=1e-12)
+    assert exact_rank(exact) == 22
     found = udk.diagnose(mechanism, fixes=False)
     assert (found.gruebler, found.rank, found.degrees_of_freedom) == (0, 22, 2)
     sets = [r.constraints for r in found.redundancies]
@@ -233,26 +187,6 @@ def test_a_double_parallelogram_in_exact_arithmetic():
         for name in names:  # minimal: without any of them nothing is redundant
             rest = exact_jacobian(mechanism, rotations, [n for n in names if n != name])
             assert exact_rank(rest) == len(rest)
-
-
-def test_a_scissor_lift_in_exact_arithmetic():
-    """At 3-4-5: rank 14 of 16 rows; its sets are minimal; and its cure is one."""
-    mechanism = udk.library.scissor_lift(angle=ANGLE)
-    rotations = {n: (COS, SIN if n.startswith("rising") else -SIN) for n in mechanism.body_names[:-1]}
-    rotations["platform"] = (Fraction(1), Fraction(0))
-    exact = exact_jacobian(mechanism, rotations)
-    assert_allclose(np.array(exact, float), psi_q(mechanism.without_origin, mechanism.q0), atol=1e-12)
-    found = udk.diagnose(mechanism, walk=False)
-    assert exact_rank(exact) == found.rank == 14 and found.degrees_of_freedom == 1 and found.gruebler == -1
-    for redundancy in found.redundancies:
-        rows = exact_jacobian(mechanism, rotations, redundancy.constraints)
-        assert exact_rank(rows) == len(rows) - redundancy.count
-        for name in redundancy.constraints:
-            rest = exact_jacobian(mechanism, rotations, [n for n in redundancy.constraints if n != name])
-            assert exact_rank(rest) == len(rest)
-    assert found.cured is not None
-    cured = udk.analyse(found.cured)
-    assert cured.redundant == () and cured.degrees_of_freedom == 1
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e3])

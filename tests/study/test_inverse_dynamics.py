@@ -11,30 +11,6 @@ from tests.choices import fast
 SCENES = {"driven pendulum": udk.library.driven_pendulum, "slider crank": lambda: udk.library.slider_crank(0.3, 4.0)}
 
 
-@pytest.mark.slow
-def test_the_torque_of_a_slider_crank_is_that_of_its_closed_form():
-    """By energy: crank, rod and slider have V(s) and T = J(s) s_dot^2 / 2, so the torque is J'(s) s_dot^2 / 2 + V'(s)."""
-    r, rod, (m1, m2, m3), g, omega = 0.5, 1.5, (1.0, 1.5, 2.0), 9.81, 4.0
-    mech = udk.library.slider_crank(0.3, omega)
-    ts = np.linspace(0.0, 1.5, 16)
-    found = udk.inverse_dynamics(mech, ts)
-
-    def pose(s):
-        tilt = -jnp.arcsin(r * jnp.sin(s) / rod)
-        pin = r * jnp.stack([jnp.cos(s), jnp.sin(s)])
-        middle = pin + 0.5 * rod * jnp.stack([jnp.cos(tilt), jnp.sin(tilt)])
-        return jnp.concatenate([0.5 * pin, middle, jnp.stack([pin[0] + rod * jnp.cos(tilt), s, tilt])])
-
-    masses = jnp.array([m1, m1, m2, m2, m3, m1 * r**2 / 12, m2 * rod**2 / 12])
-    inertia = lambda s: masses @ jax.jvp(pose, (s,), (1.0,))[1] ** 2  # noqa: E731
-    potential = lambda s: g * (m1 * pose(s)[1] + m2 * pose(s)[3])  # noqa: E731
-    effort = lambda s: 0.5 * jax.grad(inertia)(s) * omega**2 + jax.grad(potential)(s)  # noqa: E731
-    exact = jax.jit(jax.vmap(effort))(0.3 + omega * ts)
-    np.testing.assert_allclose(found.efforts["motor"], exact, atol=1e-11)
-    np.testing.assert_allclose(found.power, omega * exact, atol=1e-10)
-    assert float(jnp.max(found.residual)) < 1e-12
-
-
 @pytest.mark.parametrize("name", fast(["driven pendulum"], SCENES))
 def test_what_is_fed_forward_reproduces_the_motion(name):
     mech = SCENES[name]()
@@ -65,19 +41,6 @@ def test_redundant_joints_and_redundant_drivers():
     assert float(jnp.max(three.residual)) < 1e-11
 
 
-@pytest.mark.parametrize("name", fast(["driven pendulum"], SCENES))
-@pytest.mark.slow
-def test_efforts_are_what_the_drivers_reactions_say(name):
-    """For as many drivers as degrees of freedom: -lambda of the driver's row, found by forward dynamics."""
-    mech = SCENES[name]()
-    ts = np.linspace(0.0, 0.4, 3)
-    found = udk.inverse_dynamics(mech, ts)
-    moved = found.motion
-    assert moved is not None
-    forces = jax.jit(jax.vmap(lambda t, q, v: udk.accelerations(mech, t, q, v, multipliers=True)[1]))(ts, moved.q, moved.v)
-    np.testing.assert_allclose(found.efforts["motor"], -forces[:, -1], rtol=0, atol=1e-10)
-
-
 def test_derivatives_of_a_torque_are_those_of_its_closed_form():
     """(I + m r^2) theta'' + m g r cos(theta) of a driven pendulum on its motion, by the mass and by gravity."""
     mech, ts = udk.library.driven_pendulum(), np.array([0.2])
@@ -95,20 +58,6 @@ def test_derivatives_of_a_torque_are_those_of_its_closed_form():
     found, expected = (jax.jit(jax.value_and_grad(f))(x) for f in (torque, exact))
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_torque():
-    mech = udk.library.slider_crank(0.3, 4.0)
-
-    def torque(x):
-        changed = mech.with_parameters({"body.slider.mass": x[0], "joint.P.points[0][0]": x[1]})
-        return udk.inverse_dynamics(changed, jnp.array([0.2])).efforts["motor"][0]
-
-    x, h = jnp.array([2.0, 0.25]), 1e-5
-    both = jax.jit(jax.jacfwd(lambda x: (torque(x),) * 2, has_aux=True))
-    differences = [(both(x + h * d)[1] - both(x - h * d)[1]) / (2 * h) for d in np.eye(2)]
-    np.testing.assert_allclose(both(x)[0], differences, rtol=1e-7)
 
 
 def test_nothing_drives():

@@ -26,7 +26,7 @@ def off(estimate):
 # --- without noise
 
 
-@pytest.mark.parametrize("factors", [(1.5, 0.5), (0.5, 1.5), (0.6, 0.6)])
+@pytest.mark.parametrize("factors", [(1.5, 0.5), (0.6, 0.6)])
 def test_values_are_found_again(measured, factors):
     first = pendulum(0.375 * factors[0], 0.2 * factors[1])
     estimate = found(first, {"time": TS, ANGLE: measured[1]})
@@ -86,8 +86,7 @@ def test_noise_that_is_given_and_noise_that_is_estimated(measured):
     assert estimated.uncertainty.standard_errors == pytest.approx(ratio * given.uncertainty.standard_errors, rel=1e-6)
 
 
-@pytest.mark.parametrize("loss", ["huber", "soft_l1"])
-@pytest.mark.parametrize("noise", [0.003, None])
+@pytest.mark.parametrize(("loss", "noise"), [("huber", 0.003), ("soft_l1", None)])
 def test_wrong_numbers_count_less(measured, loss, noise):
     angle = measured[1] + 0.003 * np.random.default_rng(6).standard_normal(len(TS))
     angle[5::9] += 0.5
@@ -312,7 +311,7 @@ def test_progress_is_that_of_every_other_function(measured, capsys):
 # --- initial states
 
 
-@pytest.mark.parametrize("metre", [1e-6, 1.0, 1e3])
+@pytest.mark.parametrize("metre", [1e-6, 1e3])
 def test_initial_states_are_found_whatever_the_size(metre):
     """A slider on a spring that begins a hundredth of its way farther out, and moving: the fit is the same at every size."""
     k, m, x0, v0 = 30.0, 2.0, 0.31 * metre, 0.5 * metre

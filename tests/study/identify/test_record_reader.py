@@ -231,10 +231,7 @@ def test_records_keep_what_they_know(mech):
 def test_a_dataset_reads_as_a_file_does_and_so_does_its_file(mech, tmp_path):
     angle = [[90.0, 180.0, np.nan], [np.nan, 45.0, 0.0]]
     data = xarray.Dataset(
-        {
-            "body.crank.angle": (("record", "time"), angle, {"units": "degrees"}),
-            "body.crank.angle.noise": ("record", [1.8, 3.6]),
-        },
+        {"body.crank.angle": (("record", "time"), angle, {"units": "degrees"}), "body.crank.angle.noise": ("record", [1.8, 3.6])},
         {"time": ("time", [0.0, 100.0, 200.0], {"units": "ms"}), "record": ["up", "down"], "run": ("record", [1, 2])},
     )
     data.to_netcdf(tmp_path / "motion.nc")

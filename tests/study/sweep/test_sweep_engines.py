@@ -1,4 +1,4 @@
-"""Sweeps on several devices, in lanes, through other redundant rows, and the paper's table as one sweep."""
+"""Sweeps on several devices, in lanes, through other redundant rows, and with methods as numbers of one program."""
 
 import os
 import subprocess
@@ -13,8 +13,6 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.integrate.assembly import close
-from udkjax.study.accuracy import exact_coordinates
 from udkjax.study.sweep.chunks import members_to_compute
 from udkjax.study.sweep.executors import run
 from udkjax.study.sweep.groups import group_run
@@ -133,62 +131,6 @@ def test_a_sweep_takes_what_a_plain_batch_takes(spread):
     # Eight chunks are cut, called and joined in Python: 1.09 to 1.20 times the plain batch on a busy machine.
     times = np.array([[cpu(candidate) for candidate in candidates] for _ in range(9)])
     assert times[:, 0].min() < 1.3 * times[:, 1].min(), times
-
-
-@pytest.mark.slow
-def test_members_of_a_random_design_are_as_by_themselves(spread):
-    chunk, found, _ = run(spread, Chunk(0, 0, np.arange(64), 1.0))
-    mass, length, angle, tol = (column.values for column in spread.columns)
-    for k, member in enumerate(chunk.members[:3].tolist()):
-        mechanism = spread.mechanism.with_parameters({"body.coupler.mass": mass[member]})
-        mechanism = udk.with_angle(udk.with_length(mechanism, LINKS, length[member]), LINKS, angle[member])
-        assert np.abs(close(mechanism).state.q - mechanism.q0).max() < 1e-12
-        alone = udk.simulate(mechanism, [0.0, 10.0], rtol=tol[member], atol=tol[member])
-        assert_allclose(found["q_end"][k], alone.q[-1], rtol=0, atol=1e-8)
-        assert abs(int(found["steps"][k]) - int(alone.stats["steps"])) <= 2
-
-
-@pytest.mark.slow
-def test_the_papers_table_is_one_sweep():
-    """Five methods with its rule for the rank, three tolerances, with its gains and without, by its kind of integrator."""
-    linkage, ts = udk.library.parallelogram(), np.linspace(0.0, 0.2, 5)
-    methods = [method.absolute(0.0) for method in (udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt)]
-    axes = {
-        "method": methods,
-        "tol": udk.Axis([1e-10, 1e-8, 1e-6], of=["rtol", "atol", "rank_tol"]),
-        "stabilization": [udk.Baumgarte(0.0, 0.0), udk.Baumgarte(1000.0, 100.0)],
-    }
-    settings = {"solver": udk.Adams(), "dt0": 0.66e-2, "drift_tol": np.inf, "max_steps": 200_000}
-    exact = exact_coordinates(linkage, ts, linkage.q0, linkage.v0)
-    assert exact is not None
-    plan = make_plan(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, **settings)
-    assert len(plan.groups) == 5  # gains are numbers
-    data = udk.sweep(linkage, axes, ts, ["error", "counts", "rank"], reference=exact, progress=False, **settings)
-    assert data.angle_error.shape == (5, 3, 2) and np.all(data.result == 0)
-    assert np.all(data.angle_error <= 100 * data.tol)
-    assert np.all(data.steps[..., 1] > 2 * data.steps[..., 0])  # stiff
-    gains, method = data.stabilization.values.tolist(), udk.Varga.absolute(1e-8)
-    assert gains == ["Baumgarte(alpha=0, beta=0)", "Baumgarte(alpha=1000, beta=100)"]
-    assert data.method.values.tolist() == ["SVD", "Varga", "Greville", "Householder", "GramSchmidt"]
-    alone = udk.simulate(linkage, ts, None, 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0), **settings)
-    member = data.sel({"method": "Varga", "tol": 1e-8, "stabilization": gains[0]})  # sel has a method of its own
-    assert int(member.steps) == int(alone.stats["steps"])
-
-    # A batch and a single run round differently. From rest the first estimates of errors are rounding themselves, and say where
-    # steps end: the error is that of another run at the same tolerance. A unit of rounding in the initial angles does the same, a
-    # thousand units no more: they change an error of 4e-12 by up to 1.5e-12, whatever the method is.
-    def error_from(q):
-        given = linkage, ts, udk.State(q, linkage.v0), 1e-8, 1e-8, method, udk.Baumgarte(0.0, 0.0)
-        return np.abs(udk.simulate(*given, **settings).q - exact)[..., 2].max()
-
-    random, q = np.random.default_rng(0), np.asarray(linkage.q0)
-    errors = [error_from(q + np.spacing(np.abs(q)) * random.choice([-1, 0, 1], q.shape)) for _ in range(8)]
-    own = np.abs(alone.q - exact)[..., 2].max()
-    assert (
-        np.ptp(errors) < np.min(errors) and np.max(errors) < 1e-3 * 1e-8
-    )  # others err by other powers of ten of their tolerance
-    assert np.min(errors) - np.ptp(errors) < min(float(member.angle_error), own)
-    assert max(float(member.angle_error), own) < np.max(errors) + np.ptp(errors)
 
 
 @pytest.mark.slow
