@@ -2,6 +2,7 @@
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 # All of these runs have events; wrong arguments are meant.
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,6 +74,36 @@ def test_gradients_of_what_comes_to_rest():
 
     x = -1.0, 0.3, 0.1
     assert np.abs(np.array(jax.grad(end, (0, 1, 2))(*x)) - np.array([1.0, 0.0, 0.0])).max() < 1e-9
+
+
+class Table(eqx.Module):
+    """How high the ball is above a table that shakes."""
+
+    amplitude: jax.Array
+
+    def __call__(self, t, at):
+        return at["ball"].y - self.amplitude * jnp.sin(15.0 * t)
+
+
+@pytest.mark.slow
+def test_gradients_of_a_contact_that_lets_go():
+    """A shaking table throws the ball where its own acceleration is -g; the time of that, and the end, by its amplitude."""
+    ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})
+
+    def run(a):
+        sol = udk.simulate(
+            ball, np.linspace(0.0, 0.2, 3), events=udk.Event(Table(a), udk.Impact(0.0), name="table"), max_events=4
+        )
+        return jnp.stack([sol.events.time[1], sol.q[-1, 0, 1]])
+
+    def exact(a):
+        t = jnp.arcsin(G / (a * 15**2)) / 15
+        later = 0.2 - t
+        return jnp.stack([t, a * jnp.sin(15 * t) + a * 15 * jnp.cos(15 * t) * later - G / 2 * later**2])
+
+    found, expected = (jax.jit(jax.jacfwd(lambda a, f=f: (f(a),) * 2, has_aux=True))(0.1) for f in (run, exact))
+    assert np.abs(found[1] - expected[1]).max() < 1e-8
+    assert np.abs(found[0] - expected[0]).max() < 1e-6 * np.abs(expected[0]).max()
 
 
 def test_conditions_do_not_close_over_traced_numbers():
