@@ -13,7 +13,7 @@ import udkjax as udk
 from udkjax.equations.quantities import Energy
 from udkjax.integrate import Result, Solution
 from udkjax.show import plots
-from udkjax.show.plots import attachments, farthest_instants, outline, to_ground, trajectory
+from udkjax.show.plots import farthest_instants, trajectory
 from udkjax.show.style import COLOURS
 from udkjax.study.accuracy import exact_coordinates
 
@@ -31,28 +31,6 @@ def exact(linkage):
     return exact_coordinates(linkage, np.linspace(0, 1, 21), linkage.q0, linkage.v0)
 
 
-def test_attachments_are_the_points_of_the_joints(linkage):
-    points = attachments(linkage)
-    assert list(points) == [*linkage.bodies, "ground"]
-    np.testing.assert_allclose(points["ground"], [[0, 0], [1, 0], [2, 0]])
-    np.testing.assert_allclose(sorted(points["coupler"].tolist()), [[-1, 0], [0, 0], [1, 0]])
-
-
-def test_outline_visits_points_in_turn():
-    np.testing.assert_allclose(outline(np.array([[1.0, 2.0]])), [[1, 2], [0, 0]])
-    np.testing.assert_allclose(np.sort(outline(np.array([[0.0, 0], [2, 2], [1, 1]]))[:, 0]), [0, 1, 2])
-    assert abs(np.diff(outline(np.array([[0.0, 0], [2, 2], [1, 1]]))[:, 0])) == pytest.approx(1)
-    square = outline(np.array([[0.0, 0], [1, 1], [1, 0], [0, 1]]))
-    assert np.hypot(*np.diff(square, axis=0).T) == pytest.approx(1)  # sides only, no diagonal
-    np.testing.assert_array_equal(square[0], square[-1])
-
-
-def test_to_ground_turns_anticlockwise():
-    np.testing.assert_allclose(
-        to_ground(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([3.0, 4.0, np.pi / 2])), [[3, 5], [2, 4]], atol=1e-15
-    )
-
-
 def test_trajectory_draws_the_mechanism_where_it_is(linkage, exact):
     figure = trajectory(linkage, solution(linkage, exact))
     scene, angles, constraints, energy = figure.axes
@@ -66,6 +44,19 @@ def test_trajectory_draws_the_mechanism_where_it_is(linkage, exact):
     assert angles.get_legend_handles_labels()[1] == ["link1, link2, link3", "coupler"]
     assert constraints.get_yscale() == "log" and np.asarray(constraints.lines[0].get_ydata()).max() < 1e-14
     assert energy.get_xlabel() == "time (s)"
+
+
+def test_the_pin_of_one_link_alone_is_drawn_with_its_path():
+    mech = udk.Drawing(
+        pins={"O": (0, 0), "A": (1, 0), "P": (3, 1)}, links={"plate": udk.Link(["O", "A", "P"], mass=1)}, ground=["O"]
+    ).mechanism()
+    q = np.repeat(np.asarray(mech.q0)[None], 2, axis=0)
+    q[1] += [0.1, 0.2, 0.0]
+    (scene, *_) = trajectory(mech, solution(mech, q)).axes
+    drawn = [np.asarray(line.get_xydata()) for line in scene.lines if line.get_alpha() in (1, 0.6)]
+    assert (
+        sum(bool((abs(points - [3, 1]).max(axis=1) < 1e-12).any()) for points in drawn) == 2
+    )  # the plate's corner, and the path
 
 
 def test_poses_are_far_apart(exact):

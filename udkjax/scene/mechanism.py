@@ -74,6 +74,15 @@ class AbstractDrawing(PrintsTable):
     def shapes(self) -> dict[str, Array]:
         """Return the points (n, 2) through which bodies are drawn, by name, in their own frames (m)."""
 
+    @property
+    @abstractmethod
+    def polygons(self) -> list[str]:
+        """The bodies whose shape is the polygon of these points, as corners in their order."""
+
+    @abstractmethod
+    def free_pins(self) -> dict[str, tuple[str, Array]]:
+        """Return the pins that belong to one body alone: the body of each, and its place in the body's frame (m)."""
+
     @abstractmethod
     def mechanism(self) -> "Mechanism":
         """Return the mechanism that is drawn."""

@@ -9,18 +9,20 @@ Every axis has its unit. Everyone can distinguish the colours, and where curves 
 that is made here (`trajectory`) belongs to nobody else.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations import energy, violation
+from udkjax.equations import analyse, energy, violation
 from udkjax.equations.quantities import Energy
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
 from udkjax.scene import GROUND, Mechanism
 from udkjax.show import fit_figures, sweep_figures
+from udkjax.show.player.marks import body_points, marks, to_ground
+from udkjax.show.player.player_data import trace_anchors
 from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
 from udkjax.study.accuracy import largest_violation
 
@@ -34,12 +36,14 @@ if TYPE_CHECKING:
 WIDE_SCENE_RATIO = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
 SMALLEST_VIOLATION = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
 SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
+MOST_TICKS = 6  # along an axis of the plane: more would touch one another
+_CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 73)[:-1]) for f in (np.cos, np.sin)])
 
 
 def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
     """Draw one simulation: the mechanism at its start and in `ghosts` later poses, and its angles, constraints and energy.
 
-    Links are drawn through the points at which joints hold them; the fine lines are the paths of the centres of mass.
+    Links are drawn as the player draws them; the fine lines are the paths of pins that move.
     """
     ts, q = np.asarray(sol.ts), np.asarray(sol.q)
     alive = q[np.isfinite(q).all((1, 2))]  # a run that failed has no values after its end
@@ -64,20 +68,24 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
 
 
 def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int = 5) -> Axes:
-    """Draw the mechanism in the first of the configurations `q`, fainter in `ghosts` others, and the paths of its bodies."""
-    held = attachments(mech)
-    for place in range(len(mech.bodies)):
-        axes.plot(*q[:, place, :2].T, color=COLOURS[place % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
+    """Draw the mechanism in the first of the configurations `q`, fainter in `ghosts` others, and the paths of its pins."""
+    held, drawn = body_points(mech), list(_outlines(mech, q))
+    for place, *point in trace_anchors(mech, q, None, float(analyse(mech).length)):
+        path = to_ground(point, q[:, int(place)])
+        axes.plot(*path.T, color=COLOURS[int(place) % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
     for instant in reversed(farthest_instants(q, ghosts + 1)):
         strength = 1.0 if instant == 0 else 0.22
-        for place, body in enumerate(mech.bodies):
+        for place, points, closed in drawn:
             colour = COLOURS[place % len(COLOURS)]
-            x, y = to_ground(outline(held[body]), q[instant, place]).T
-            axes.fill(x, y, facecolor=colour, alpha=0.25 * strength, lw=0, zorder=2)
+            x, y = to_ground(np.append(points, points[:1], axis=0) if closed else points, q[instant, place, None]).T
+            if closed:
+                axes.fill(x, y, facecolor=colour, alpha=0.25 * strength, lw=0, zorder=2)
             axes.plot(x, y, color=colour, alpha=strength, lw=2.6, solid_capstyle="round", solid_joinstyle="round", zorder=3)
-            if instant == 0:
-                axes.plot(*to_ground(held[body], q[0, place]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
-                axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
+    for place, body in enumerate(mech.bodies):
+        colour = COLOURS[place % len(COLOURS)]
+        if len(held[body]):
+            axes.plot(*to_ground(held[body], q[0, place, None]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
+        axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
     axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
     return _plane(axes)
 
@@ -206,33 +214,16 @@ def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[in
     return chosen
 
 
-def attachments(mech: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
-    """Return the points at which joints hold each body, in its own frame, each of them once; the ground is one of the bodies."""
-    points: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mech.bodies, GROUND)}
-    for joint in mech.joints.values():
-        for body, point in zip(joint.bodies, np.asarray(getattr(joint, "points", np.empty((0, 2)))), strict=False):
-            points[body].append((float(point[0]), float(point[1])))
-    return {body: np.array(list(dict.fromkeys(held))).reshape(-1, 2) for body, held in points.items()}
-
-
-def outline(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """Return a line through the points that hold a body, closed where they span an area; a single one is joined to its centre."""
-    if len(points) < 2:
-        points = np.concatenate([points, np.zeros((1, 2))])
-    spread = points - points.mean(axis=0)
-    along = spread @ np.linalg.svd(spread, full_matrices=False)[2][0]
-    flat = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max()) < 2
-    order = np.argsort(along if flat else np.arctan2(spread[:, 1], spread[:, 0]))
-    return points[order if flat else np.append(order, order[0])]
-
-
-def to_ground(points: Float[np.ndarray, "points 2"], coordinates: Float[np.ndarray, "3"]) -> Float[np.ndarray, "points 2"]:
-    """Return points of a body's own frame in ground coordinates."""
-    x, y, angle = coordinates
-    cos, sin = np.cos(angle), np.sin(angle)
-    return points @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+def _outlines(mech: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> Iterator[tuple[int, Float[np.ndarray, "points 2"], bool]]:
+    """Iterate over the lines of which bodies are drawn: the body's number, points in its frame (m), and whether they are closed."""
+    for mark in marks(mech, q):
+        if mark["kind"] in ("link", "outline"):
+            yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)
+        elif mark["kind"] in ("wheel", "disc"):
+            yield mark["body"], np.add(mark["at"], mark["radius"] * _CIRCLE), True
 
 
 def _plane(axes: Axes) -> Axes:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.locator_params(nbins=MOST_TICKS)
     return plain(axes)

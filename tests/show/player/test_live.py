@@ -5,10 +5,21 @@ import pytest
 
 import udkjax as udk
 from tests.show.player.conftest import Motion
+from udkjax.integrate.portable import drawn_points
 from udkjax.scene.checks import SceneError
 from udkjax.show.player.followers import followers
 from udkjax.show.player.live_parameters import label_of, section_of, sliders_of, usual_range
 from udkjax.show.player.player_data import run_record
+
+COUPLER_POINT = udk.Drawing(
+    pins={"A": (0, 0), "B": (1, 2), "C": (3, 2), "D": (4, 0), "P": (2, 3)},
+    links={
+        "crank": udk.Link(["A", "B"], mass=1),
+        "coupler": udk.Link(["B", "P", "C"], mass=1),
+        "rocker": udk.Link(["C", "D"], mass=1),
+    },
+    ground=["A", "D"],
+)  # P is a pin of no other link
 
 
 @pytest.fixture(scope="module")
@@ -56,27 +67,31 @@ def test_what_a_slider_is_called(name, label, section):
     assert (label_of(name), section_of(name)) == (label, section)
 
 
-def test_symbols_follow_the_numbers_that_they_are_made_of():
+@pytest.mark.parametrize("mechanism", [udk.library.four_bar(), COUPLER_POINT.mechanism()], ids=["four-bar", "coupler point"])
+def test_symbols_follow_the_numbers_that_they_are_made_of(mechanism):
     """With other numbers every place that follows is where the symbols of the changed mechanism have it."""
-    mechanism = udk.library.four_bar()
     other = mechanism.with_parameters({"pin.C": [2.9, 1.8]})
 
     def symbols(m):
         still = Motion(ts=np.zeros(1), q=np.asarray(m.q0)[None], v=np.zeros((1, len(m.bodies), 3)))
-        record, poses = run_record(m, still, "", (), False, None)
-        return record, udk.animate(m, still, measures=()).data["runs"][0]["symbols"], poses
+        record, _ = run_record(m, still, "", (), False, m.drawing.free_pins())
+        return record, udk.animate(m, still, measures=()).data["runs"][0]["symbols"], record["traces"]
 
-    (record, before, _), (_, after, _) = symbols(mechanism), symbols(other)
-    rows = followers(mechanism, record, before)
-    numbers = np.concatenate([np.ravel(x) for x in other.numbers])
+    (record, before, _), (_, after, traces) = symbols(mechanism), symbols(other)
+    count = sum(np.size(x) for x in mechanism.numbers)
+    rows = followers(mechanism, record, before, count)
+    numbers = np.concatenate([np.ravel(x) for x in (*other.numbers, *(points for _, points in drawn_points(other)))])
     assert len(rows["frames"]) > 10 and len(rows["points"]) > 10
     for k, which, x, y in rows["frames"]:
         anchor = after[k]["frame"] if which < 0 else after[k]["frame"][which]
         np.testing.assert_allclose(anchor[1:3], numbers[[x, y]], atol=1e-12)
     for k, row, x, y in rows["points"]:
         np.testing.assert_allclose(after[k]["points"][row], numbers[[x, y]], rtol=1e-6, atol=1e-6)  # seven digits are written
+    for k, _, x, y in rows["traces"]:
+        np.testing.assert_allclose(traces[k][1:], numbers[[x, y]], atol=1e-12)
     links = [k for k, s in enumerate(before) if s["layer"] == "link"]
     assert {k for k, *_ in rows["points"]} == set(links)  # all of them
+    assert len(rows["points"]) == sum(len(before[k]["points"]) for k in links)
 
 
 def test_a_run_that_begins_elsewhere_keeps_its_beginning():

@@ -194,6 +194,19 @@ def test_traces_are_pins_that_move_or_those_that_are_named(slider_crank, run):
         udk.animate(slider_crank, run, measures=(), traces=("Q",))
 
 
+def test_a_plate_is_drawn_as_its_polygon_and_its_free_pins_are_traced():
+    """A bell crank has a corner that goes inwards; its end T is a pin of no other link."""
+    corners = {"O": (0, 0), "S": (2, 0.5), "B": (0.5, 0.5), "T": (0.5, 2)}
+    bent = udk.Drawing(pins=corners, links={"bent": udk.Link(list(corners), mass=1)}, ground=["O"]).mechanism()
+    poses = np.stack([np.asarray(bent.q0), np.asarray(bent.q0)])
+    poses[1, 0, :2] += 1.0
+    (link,) = (mark for mark in marks(bent, poses) if mark["kind"] == "link")
+    at = np.array(link["points"]) - link["points"][0]
+    np.testing.assert_allclose(np.linalg.norm(at, axis=1), np.linalg.norm(list(corners.values()), axis=1))
+    still = Motion(ts=np.arange(2.0), q=poses, v=0 * poses)
+    assert len(udk.animate(bent, still, measures=()).data["runs"][0]["traces"]) == 4
+
+
 def test_bounds_hold_every_pose(animation, run):
     left, bottom, right, top = animation.data["bounds"]
     assert left <= -0.499 and right >= 1.999 and bottom <= -0.499 and top >= 0.499

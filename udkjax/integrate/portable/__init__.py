@@ -6,7 +6,7 @@ format       1
 bodies       names; a state is q and v, x, y (m), angle (rad) of each body in turn, and their rates
 parameters   a list of {name, unit, value}: numbers of the scene that may change, in the order in which they are given
 numbers      base64 of float64: all numbers of the scene, `count` of them, then the times (s) where its motion is not smooth,
-             `knots` of them, and the numbers of the conditions of events
+             `knots` of them, the numbers of the `conditions` of events, and the `drawn_points` where these are wanted
 events       {names, directions: in which zeros count, 0 for either, by_velocity: masks, stops: whether each ends the run,
              restitution: of an impact, else null, ends_at_rest: whether its rest ends the run, slowest: rate of the scene (1/s),
              most: how many may happen, head: how many numbers a run tells before the sides of conditions, tolerances: of
@@ -35,7 +35,7 @@ udkjax/show/player/engine.js runs it: `loadEngine(data)` gives an object with `c
 `run(parameters, state, times)`, which say there what they return.
 """
 
-from udkjax.integrate.portable.engine import PortableEngine, portable_engine
+from udkjax.integrate.portable.engine import PortableEngine, drawn_points, portable_engine
 from udkjax.integrate.portable.parameters import scalar_parameters
 
-__all__ = ["PortableEngine", "portable_engine", "scalar_parameters"]
+__all__ = ["PortableEngine", "drawn_points", "portable_engine", "scalar_parameters"]

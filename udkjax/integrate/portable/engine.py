@@ -60,6 +60,7 @@ def portable_engine(
     pull: bool = True,
     runs: bool = True,
     events: Sequence[ExpandsToEvents] = (),
+    drawn: bool = False,
 ) -> PortableEngine:
     """Compile the engine of a mechanism for pages.
 
@@ -71,6 +72,7 @@ def portable_engine(
         pull: whether a hand may pull bodies: each gets a spring, without stiffness until it does.
         runs: whether it integrates motions; without them it closes positions and evaluates energies, and is compiled faster.
         events: of its runs, as `simulate` takes them.
+        drawn: whether it evaluates `drawn_points` as well.
 
     Returns:
         The `PortableEngine`.
@@ -87,7 +89,9 @@ def portable_engine(
     if _may_move_by_redundancy(mechanism, analysis):
         analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page finds them
     watched = PortableEvents(events, mechanism)
-    numbers = NumberProgram(mechanism, values, dress, watched.numbers)
+    numbers = NumberProgram(
+        mechanism, values, dress, lambda given: [*watched.numbers(given), *(x for _, x in drawn_points(given) if drawn)]
+    )
     data: Json = {
         "format": 1,
         "bodies": list(mechanism.body_names),
@@ -95,6 +99,7 @@ def portable_engine(
         "numbers": floats(numbers.base),
         "count": numbers.count,
         "knots": numbers.knots,
+        "conditions": sum(np.size(x) for x in watched.numbers(mechanism)),
         "events": watched.data(analysis),
         "marks": len(analysis.scales.rows) if analysis.redundant_rows is None else 0,
         "sampled": [],
@@ -115,6 +120,13 @@ def portable_engine(
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
     modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
     return PortableEngine(data | {"modules": modules}, numbers, dressed)
+
+
+def drawn_points(mechanism: Mechanism) -> list[tuple[str, Any]]:
+    """Return the points (n, 2) through which each link of a drawing is drawn, and pins of one link alone, in their frames (m)."""
+    if mechanism.drawing is None:
+        return []
+    return [*mechanism.drawing.shapes().items(), *((body, place[None]) for body, place in mechanism.drawing.free_pins().values())]
 
 
 def _may_move_by_redundancy(mechanism: Mechanism, analysis: Analysis) -> bool:

@@ -144,12 +144,26 @@ class Drawing(AbstractDrawing):
         body = placement.members(name)[-1]
         return body, number(placement.local(body, placement.places[name]))
 
+    @property
+    def polygons(self) -> list[str]:
+        """The links whose shape is the polygon of its corners: plates and outlines."""
+        return [name for name, link in self.links.items() if link.kind in ("plate", "outline")]
+
     def shapes(self) -> dict[str, Array]:
         """Return the points (n, 2) through which links are drawn, their pins or outlines, by name, in their own frames (m)."""
         placement, found = placement_of(known_elements(self.groups), self.ground), {}
         for name, link in placement.links.items():
             places = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
             found[name] = number([placement.local(name, place) for place in places])
+        return found
+
+    def free_pins(self) -> dict[str, tuple[str, Array]]:
+        """Return the pins that belong to one link alone: the link of each, and its place in the link's frame (m)."""
+        placement, found = placement_of(known_elements(self.groups), self.ground), {}
+        for pin, place in placement.places.items():
+            members = placement.members(pin)
+            if len(members) == 1 and members[0] in placement.links:
+                found[pin] = members[0], number(placement.local(members[0], place))
         return found
 
     def _table(self) -> PrintedTable:

@@ -99,6 +99,11 @@ class Engine {
     return module.view(to, this.base.length).slice();
   }
 
+  conditionNumbers(numbers) {
+    const {count, knots, conditions} = this.data;
+    return numbers.subarray(count + knots, count + knots + conditions);
+  }
+
   breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
 
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
@@ -190,11 +195,11 @@ class Engine {
   /** The conditions of events at a state: g, their first and second rates, derivatives by t, q and v, and for each impact the
    *  velocities that a unit impulse along it gives. */
   conditions(numbers, settings, state) {
-    const {data: {count, knots, events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
+    const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
     const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
     const marks = state.marks ?? this.markRows(numbers, state), total = n + 4 * E + 2 * E * n + impacts.length * n;
     const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows, breaks: [],
-      settings: states.module.settings.map(name => settings[name]), event_numbers: [...numbers.subarray(count + knots), ...this.inverseMasses(numbers)]};
+      settings: states.module.settings.map(name => settings[name]), event_numbers: [...this.conditionNumbers(numbers), ...this.inverseMasses(numbers)]};
     const {found} = states.run(inputs, {found: total}, {times: 2, knots: 0});
     let place = n;
     const take = size => found.slice(place, place += size), rowsOf = () => Array.from({length: E}, () => take(n));

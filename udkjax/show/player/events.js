@@ -33,8 +33,8 @@ function hit(engine, numbers, settings, at, watch, k) {
 
 /** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. */
 export function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
-  const {data: {events, count, knots, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
-  const {zero} = events.tolerances, own = numbers.subarray(count + knots), isImpact = k => events.restitution[k] !== null;
+  const {data: {events, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
+  const {zero} = events.tolerances, own = engine.conditionNumbers(numbers), isImpact = k => events.restitution[k] !== null;
   const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: [],
     steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
   let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0;

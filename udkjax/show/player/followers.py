@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from udkjax.integrate.portable import drawn_points
 from udkjax.scene import GROUND, Gear, Mechanism, Rack
 from udkjax.show.player.packing import Json
 
@@ -24,10 +25,14 @@ SAME_DIGITS = 7  # significant digits of the points of symbols
 Point = tuple[int, float, float]  # the number of a body, and a place in its frame, with so many digits
 
 
-def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[Json]) -> Json:
-    """Return how the symbols, marks and traces of a run follow the numbers of the mechanism."""
+def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[Json], drawn: int) -> Json:
+    """Return how the symbols, marks and traces of a run follow the numbers of the mechanism; its drawn points begin at `drawn`."""
     places: Mechanism = _places(mechanism)
     known = _points(mechanism, places)
+    for body, points in drawn_points(mechanism):
+        for x, y in np.asarray(points, float):
+            known.setdefault(_key(mechanism.body_names.index(body), x, y), (drawn, drawn + 1))
+            drawn += 2
     angles = {_rounded(e.axis): int(places.joints[name].axis) for name, e in mechanism.joints.items() if hasattr(e, "axis")}
     radii = _radii(mechanism, places)
     found: Json = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": [], "arrows": []}

@@ -56,7 +56,9 @@ def live_data(
         if key not in engines:
             engines[key] = len(engines)
             data["engines"].append(_engine(mechanism, own, rtol, atol, events))
-        follow = followers(mechanism, record, record["symbols"])
+        engine = data["engines"][engines[key]]
+        drawn = engine["count"] + engine["knots"] + engine["conditions"]
+        follow = followers(mechanism, record, record["symbols"], drawn)
         start, times = _start(mechanism, solution), _times(solution)
         data["runs"].append({"engine": engines[key], "sliders": own, "follow": follow, "start": start, "times": times})
     order = {slider.name: k for k, slider in enumerate(in_sections(sliders.values()))}
@@ -79,7 +81,7 @@ def _require_solvable(mechanism: Mechanism, solution: ShownMotion, events: Seque
 
 def _engine(mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: float, events: Sequence[ExpandsToEvents]) -> Json:
     try:
-        engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol, events=events)
+        engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol, events=events, drawn=True)
     except UnsupportedError as error:
         raise ArgumentError(f"live: a page has no instruction for {error}: name the numbers to change, without those") from None
     if engine.data["why"]:

@@ -77,8 +77,7 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) 
     unknown = [name for name in shapes or {} if name not in mechanism.bodies]
     if unknown:
         raise ValueError(f"shapes: there is no body {unknown[0]!r}")
-    drawn = {} if mechanism.drawing is None else mechanism.drawing.shapes()
-    drawing = _Drawing(mechanism, np.asarray(poses, float), {**drawn, **(shapes or {})})
+    drawing = _Drawing(mechanism, np.asarray(poses, float), shapes or {})
     links = drawing.links()
     plates = [mark for mark in links if mark.get("closed")]
     bars = [mark for mark in links if not mark.get("closed")]
@@ -88,7 +87,7 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) 
 
 
 def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
-    """Return the points at which joints, drivers and springs hold each body, in its own frame (m), each of them once."""
+    """Return the points at which joints, drivers and springs hold each body, and pins of its own, in its frame (m), each once."""
     held: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mechanism.bodies, GROUND)}
     springs = [force for force in mechanism.forces.values() if isinstance(force, Spring)]
     for element in (*mechanism.constraints.values(), *springs):
@@ -97,6 +96,9 @@ def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]
             continue
         for body, (x, y) in zip(element.bodies, np.asarray(points, float).tolist()):
             held[body].append((x, y))
+    if mechanism.drawing is not None:
+        for body, place in mechanism.drawing.free_pins().values():
+            held[body].append(tuple(np.asarray(place, float).tolist()))
     return {body: _distinct(points) for body, points in held.items()}
 
 
@@ -114,9 +116,12 @@ class _Drawing:
 
     def __init__(self, mechanism: Mechanism, poses: Poses, shapes: Shapes):
         self.mechanism, self.poses = mechanism, poses
+        drawn = {} if mechanism.drawing is None else mechanism.drawing.shapes()
+        polygons = () if mechanism.drawing is None else mechanism.drawing.polygons
+        self.polygons = {body: np.asarray(drawn[body], float) for body in polygons if body not in shapes}
         self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
         self.points = body_points(mechanism)
-        for body, points in shapes.items():
+        for body, points in {**drawn, **shapes}.items():
             self.points[body] = _distinct(
                 [*map(tuple, self.points[body].tolist()), *map(tuple, np.asarray(points, float).tolist())]
             )
@@ -147,7 +152,7 @@ class _Drawing:
             if single and reach > SAME_PLACE * self.size:
                 points = np.concatenate([points, -points if rod else np.zeros((1, 2))])
             if len(points) > 1:
-                corners, closed = corners_of(points)
+                corners, closed = corners_of(points, self.polygons.get(body))
                 found.append({"kind": "link", "body": k, "points": corners.tolist(), "closed": closed})
             if len(self.points[body]) < 2 and body not in self.shaped and not rod:
                 radius = min(np.sqrt(inertia / mass), self.size / 4)
@@ -285,20 +290,29 @@ class _Drawing:
 
 
 def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
-    """Return a point of a body's frame in ground coordinates (m), for each of its coordinates x, y, angle."""
-    x, y = np.asarray(point, float)
+    """Return a point of a body's frame in ground coordinates (m), for each of its coordinates x, y, angle; or points for one."""
+    x, y = np.asarray(point, float).T
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
     return frames[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
 
 
-def corners_of(points: Float[np.ndarray, "points 2"]) -> tuple[Float[np.ndarray, "corners 2"], bool]:
-    """Return the ends of a bar through points that are in line, or else, and True, the corners of the plate that holds them."""
+def corners_of(
+    points: Float[np.ndarray, "points 2"], polygon: Float[np.ndarray, "corners 2"] | None = None
+) -> tuple[Float[np.ndarray, "corners 2"], bool]:
+    """Return the ends of a bar through points that are in line, or else, and True, the corners of the plate that holds them.
+
+    It is the polygon, if there is one and no point lies beyond the corners' convex hull; else the convex hull of the points.
+    """
     from scipy.spatial import ConvexHull  # importing SciPy takes longer than the call
 
     spread = points - points.mean(axis=0)
     if np.linalg.matrix_rank(spread, tol=SAME_PLACE * np.abs(spread).max()) < 2:
         return points[np.argsort(spread @ np.linalg.svd(spread, full_matrices=False)[2][0])], False
-    return points[ConvexHull(points).vertices], True
+    hull = points[ConvexHull(points).vertices]
+    is_whole = polygon is not None and all(
+        np.abs(polygon - corner).max(axis=1).min() <= SAME_PLACE * np.abs(points).max() for corner in hull
+    )
+    return (polygon if is_whole else hull), True
 
 
 def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
