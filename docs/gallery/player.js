@@ -684,8 +684,8 @@ function hit(engine, numbers, settings, at, watch, k) {
 }
 /** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. */
 function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
-  const {data: {events, count, knots, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
-  const {zero} = events.tolerances, own = numbers.subarray(count + knots), isImpact = k => events.restitution[k] !== null;
+  const {data: {events, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
+  const {zero} = events.tolerances, own = engine.conditionNumbers(numbers), isImpact = k => events.restitution[k] !== null;
   const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: [],
     steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
   let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0;
@@ -825,6 +825,10 @@ class Engine {
     module.exports.numbers(given, to);
     return module.view(to, this.base.length).slice();
   }
+  conditionNumbers(numbers) {
+    const {count, knots, conditions} = this.data;
+    return numbers.subarray(count + knots, count + knots + conditions);
+  }
   breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
    *  that hold at a time. */
@@ -907,11 +911,11 @@ class Engine {
   /** The conditions of events at a state: g, their first and second rates, derivatives by t, q and v, and for each impact the
    *  velocities that a unit impulse along it gives. */
   conditions(numbers, settings, state) {
-    const {data: {count, knots, events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
+    const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
     const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
     const marks = state.marks ?? this.markRows(numbers, state), total = n + 4 * E + 2 * E * n + impacts.length * n;
     const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows, breaks: [],
-      settings: states.module.settings.map(name => settings[name]), event_numbers: [...numbers.subarray(count + knots), ...this.inverseMasses(numbers)]};
+      settings: states.module.settings.map(name => settings[name]), event_numbers: [...this.conditionNumbers(numbers), ...this.inverseMasses(numbers)]};
     const {found} = states.run(inputs, {found: total}, {times: 2, knots: 0});
     let place = n;
     const take = size => found.slice(place, place += size), rowsOf = () => Array.from({length: E}, () => take(n));

@@ -308,11 +308,10 @@ def corners_of(
     spread = points - points.mean(axis=0)
     if np.linalg.matrix_rank(spread, tol=SAME_PLACE * np.abs(spread).max()) < 2:
         return points[np.argsort(spread @ np.linalg.svd(spread, full_matrices=False)[2][0])], False
-    hull = points[ConvexHull(points).vertices]
-    is_whole = polygon is not None and all(
-        np.abs(polygon - corner).max(axis=1).min() <= SAME_PLACE * np.abs(points).max() for corner in hull
-    )
-    return (polygon if is_whole else hull), True
+    hull, near = points[ConvexHull(points).vertices], SAME_PLACE * np.abs(points).max()
+    if polygon is not None and all(np.abs(polygon - corner).max(axis=1).min() <= near for corner in hull):
+        return polygon, True
+    return hull, True
 
 
 def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
