@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import xarray
 
 from tests.command_line import udkjax
 from udkjax.cli.datasets import save
+from udkjax.cli.exits import exit_codes
+from udkjax.integrate.assembly import AssemblyWarning
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -121,3 +124,42 @@ def test_inverse_and_simulate_draw_what_they_find(tmp_path, capsys):
     assert [Path(name).name for name in found["files"]] == ["s.csv", "s.png", "s-channels.png"]
     for row in csv.DictReader(out.open()):
         assert float(row["driver.motor.load [N m]"]) == pytest.approx(float(row["effort.motor [N m or N]"]), rel=1e-9)
+
+
+def test_kinematics_says_what_the_links_do(tmp_path, capsys):
+    """Of a crank of 50 and a ground of 100 between arms of 125, by hand; and what still moves where positions do not follow."""
+    hoeken = """
+format = 2
+units = {length = "mm"}
+ground = ["O", "C"]
+pins = {O = [0, 0], A = [-50, 0], B = [25, 100], C = [100, 0]}
+motor = [{pin = "O", speed = "60 rpm"}]
+[[link]]
+name = "crank"
+pins = ["O", "A"]
+mass = 1
+[[link]]
+name = "coupler"
+pins = ["A", "B"]
+mass = 1
+[[link]]
+name = "rocker"
+pins = ["C", "B"]
+mass = 1
+"""
+    scene = tmp_path / "hoeken.toml"
+    scene.write_text(hoeken)
+    assert udkjax("kinematics", scene) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "crank turns all the way round" in said and "from 3.14159 rad (180 deg)" in said and "angle at A" not in said
+    assert "angle at B 23.07 to 73.74 deg" in said  # 2 asin(50 / 250), 2 asin(150 / 250)
+    loose = hoeken.replace('name = "rocker"\npins = ["C", "B"]', 'name = "wheel"\npins = ["B"]\nwidth = 9')
+    scene.write_text(loose.replace('ground = ["O", "C"]', 'ground = ["O"]').replace(", C = [100, 0]", ""))
+    assert udkjax("kinematics", scene) == 2
+    assert "drive or hold what still moves, coupler and wheel, by drivers" in capsys.readouterr().err
+
+
+def test_warnings_are_said_without_places_in_the_code(capsys):
+    with exit_codes(), warnings.catch_warnings(action="always"):
+        warnings.warn(AssemblyWarning("assembly moved lever"), stacklevel=1)
+    assert capsys.readouterr().err == "udkjax: assembly moved lever\n"

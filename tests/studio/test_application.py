@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.templates import TEMPLATES
 from udkjax.studio.worker import Worker
@@ -236,9 +237,19 @@ def test_the_engine_takes_places_of_pins_and_a_hand_that_nothing_drives(client):
     assert len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
 
 
-def test_a_motor_at_rest_has_a_finite_duration(client):
+def test_what_is_at_rest_has_a_finite_duration(client):
     scene = client.ask("compile", text=SIX_BAR.replace("60 rpm", "0 rpm")).json()["scene"]
     assert 0 < scene["duration"] < 100
+    nothing_moves_it = ARMS.replace('motor = [{pin = "O", speed = 1}]', "gravity = [0, 0]")
+    assert client.ask("compile", text=nothing_moves_it).json()["scene"]["duration"] == 1.0
+
+
+def test_all_pins_of_a_line_are_named_once():
+    pins = {"A": (0, 0), "B": (1, 0), "C": (2, 0), "D": (3, 0)}
+    links = {f"{a}{b}": udk.Link([a, b], mass=1) for a, b in ("AB", "BC", "CD")}
+    chain = udk.Drawing(pins=pins, links=links, ground=["A", "D"]).mechanism()
+    (line,) = pins_in_line(chain, np.asarray(chain.q0))
+    assert sorted(line) == list(pins)
 
 
 @pytest.mark.parametrize("document", [[1], "x", 3, True])

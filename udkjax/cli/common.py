@@ -136,5 +136,7 @@ def choose_driver(mech: "Mechanism", given: str | None) -> str:
     if given is None and len(mech.driver_names) > 1:
         refuse(f"--driver: the scene has {len(mech.driver_names)}; name one of {', '.join(mech.driver_names)}")
     if given is None and not mech.driver_names:
-        refuse(f"--driver: the scene has none; name a coordinate, such as body.{mech.body_names[0]}.angle")
+        from udkjax.study.drive import suggested_coordinate
+
+        refuse(f"--driver: the scene has none; name a coordinate, such as {suggested_coordinate(mech)}")
     return next(iter(mech.drivers)) if given is None else given

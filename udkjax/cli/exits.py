@@ -1,6 +1,7 @@
 """Ends of commands: the exit codes, and what is said on stderr."""
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -29,11 +30,18 @@ def fail(problem: object) -> NoReturn:
     sys.exit(BAD_RUN)
 
 
+def _show_warning(message: Warning | str, category: type[Warning], *place: object) -> None:
+    """Say a warning of ours without the place in our code; a warning of others has its kind."""
+    say(f"{message}" if category.__module__.startswith("udkjax.") else f"{category.__name__}: {message}")
+
+
 @contextmanager
 def exit_codes() -> Iterator[None]:
-    """Turn what a command may raise into a line on stderr and an exit code; a defect of ours keeps its traceback."""
+    """Turn what a command may raise, or warn of, into a line on stderr and an exit code; a defect of ours keeps its traceback."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            yield
     except MissingExtraError as error:
         refuse(error)
     except KeyboardInterrupt:

@@ -11,6 +11,9 @@ from udkjax.extras import OptionalImport
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from udkjax import Mechanism
+    from udkjax.study.kinematics import Kinematics, Travel
+
 with OptionalImport():
     import tyro
 
@@ -55,23 +58,26 @@ def kinematics(
 
     travel = udk.travel(mech, driver)
     first = _default(first, float(travel.lower), float(value_of(mech, driver)(udk.assemble(mech).q)))
-    last = _default(last, float(travel.upper), first + 2 * math.pi)
+    last = _default(last, float(travel.upper), first + (2 * math.pi if travel.unit == "rad" else float(udk.analyse(mech).length)))
     found = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
     others = udk.branches(mech, driver, first) if branches else None
     names = [udk.Reached(int(code)).name for code in np.asarray(found.status)]
     reached = int(np.sum(np.asarray(found.reached)))
-    free = math.isinf(float(travel.lower)) and math.isinf(float(travel.upper))
+    free = (
+        math.isinf(float(travel.lower)) and math.isinf(float(travel.upper)) and udk.Reached.lost not in np.asarray(travel.status)
+    )
     lines = {
-        "travel": "no limits" if free else f"{float(travel.lower):.15g} to {float(travel.upper):.15g} {travel.unit}",
-        "reached": f"{reached} of {count} values from {first:g} to {last:g}",
+        "travel": "no limits" if free else f"{_end(travel, 0)} to {_end(travel, 1)}",
+        "reached": f"{reached} of {count} values from {_value(first, travel.unit)} to {_value(last, travel.unit)}",
     }
     if math.isfinite(float(found.limit)):
-        lines["toggle"] = f"{float(found.limit):.15g}"
-    for name, words in (("singular", "singular at"), ("not_determined", "velocities open at")):
+        lines["toggle"] = f"{float(found.limit):.15g} {travel.unit}"
+    for name, words in (("singular", "singular at"), ("not_determined", "rates unknown at")):
         if name in names:
             lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(found.values), names, strict=True) if n == name)
     if others is not None:
         lines["branches"] = f"{len(others)} at {first:g}"
+    lines |= outputs(mech, found, driver)
     columns = measure_channels(mech, found, measured)
     results: dict[str, object] = {
         "driver": driver,
@@ -104,6 +110,52 @@ def kinematics(
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:
         fail(f"{count - reached} values are not reached: {names[int(np.argmin(np.asarray(found.reached)))].replace('_', ' ')}")
+
+
+def outputs(mech: "Mechanism", found: "Kinematics", driver: str) -> dict[str, str]:
+    """Return how far each link turns or slides on the ground along a motion, and between what its transmission angles are."""
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.study.drive import element_of
+
+    lines, q, driving = {}, np.asarray(found.q)[np.asarray(found.reached)], element_of(mech, driver).bodies
+    for name, joint in mech.joints.items():
+        if not isinstance(joint, udk.Revolute | udk.Prismatic) or not len(q):
+            continue
+        moving = [body for body in joint.bodies if body != "ground"]
+        if len(moving) == 2 and isinstance(joint, udk.Revolute) and not set(moving) & set(driving):
+            try:
+                angles = np.degrees(np.asarray(udk.transmission_angle(mech, found, name))[np.asarray(found.reached)])
+            except udk.SceneError:  # of links with more pins there is none
+                continue
+            if angles.max() > 0:  # else all pins of a link are in one place
+                lines[f"angle at {name}"] = f"{angles.min():.4g} to {angles.max():.4g} deg between its links"
+        elif len(moving) == 1:
+            x, y, turned = np.ptp(q[:, mech.body_names.index(moving[0])], axis=0)
+            whole = turned > 2 * math.pi * (1 - 1e-9)
+            turns = "turns all the way round" if whole else f"turns by {math.degrees(turned):.4g} deg"
+            lines[moving[0]] = turns if isinstance(joint, udk.Revolute) else f"slides by {math.hypot(x, y):.4g} m"
+    return lines
+
+
+def _end(travel: "Travel", side: int) -> str:
+    """Return an end of travel in words: its value; or that nothing ends it, or that the way there could not be followed."""
+    import numpy as np
+
+    import udkjax as udk
+
+    lost = np.asarray(travel.status)[side] == udk.Reached.lost
+    value = float((travel.lower, travel.upper)[side])
+    return "an end that could not be found" if lost else "no limit" if math.isinf(value) else _value(value, travel.unit)
+
+
+def _value(x: float, unit: str) -> str:
+    """Return a value with its unit; of an angle in degrees, too."""
+    from udkjax.printing import format_number
+
+    degrees = f" ({format_number(math.degrees(x), scale=360.0)} deg)" if unit == "rad" else ""
+    return f"{format_number(x, scale=1.0)} {unit}{degrees}"
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:

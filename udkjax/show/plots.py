@@ -215,7 +215,7 @@ def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[in
 
 
 def _outlines(mech: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> Iterator[tuple[int, Float[np.ndarray, "points 2"], bool]]:
-    """Iterate over the lines of which bodies are drawn: the body's number, points in its frame (m), and whether they are closed."""
+    """Iterate over the lines of which bodies are drawn: the body's number, points in its frame (m), whether closed."""
     for mark in marks(mech, q):
         if mark["kind"] in ("link", "outline"):
             yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)

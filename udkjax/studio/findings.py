@@ -11,6 +11,7 @@ from udkjax.scene import GROUND, Mechanism, SceneError
 from udkjax.scene.joints import Revolute, Slot
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import force_curves, holding_curves
+from udkjax.study.continuation import Reached
 from udkjax.study.diagnosis import Diagnosis, diagnose
 from udkjax.study.diagnosis.fixes import Fix
 from udkjax.study.equilibrium import equilibrium
@@ -132,12 +133,13 @@ def motor_travel(mechanism: Mechanism) -> Json:
         for limit, q in ((ends_of.lower, ends_of.lower_q), (ends_of.upper, ends_of.upper_q)):
             if np.isfinite(float(limit)):
                 ends.append({"value": float(limit) - start, "in_line": pins_in_line(mechanism, np.asarray(q))})
-        found.append({"motor": name, "unit": ends_of.unit, "ends": ends})
+        lost = [side for side, code in zip(("back", "ahead"), np.asarray(ends_of.status), strict=True) if code == Reached.lost]
+        found.append({"motor": name, "unit": ends_of.unit, "ends": ends, "lost": lost})
     return {"travel": found}
 
 
 def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
-    """Return the triples of pins, two links that share the middle one, that are in line in a position."""
+    """Return the pins that are in line in a position: of two links that share one, and of further ones on that line."""
     frames = dict(zip(mechanism.bodies, q, strict=True))
     pins = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Revolute)}
     places = {}
@@ -147,7 +149,7 @@ def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
         x, y, angle = frames[body]
         c, s = math.cos(angle), math.sin(angle)
         places[name] = np.array([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
-    found = []
+    found: list[list[str]] = []
     for middle, joint in pins.items():
         one, two = joint.bodies
         if "ground" in (one, two):
@@ -158,5 +160,16 @@ def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
                     u, w = places[a] - places[middle], places[c] - places[middle]
                     size = np.linalg.norm(u) * np.linalg.norm(w)
                     if size > 0 and abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE * size:
-                        found.append([a, middle, c])
+                        _add_to_line(found, [a, middle, c], places)
     return found
+
+
+def _add_to_line(lines: list[list[str]], pins: list[str], places: dict[str, np.ndarray]) -> None:
+    """Put three pins in line on the line that has two of these places already, or on a new one; each place once."""
+    near = IN_LINE * np.ptp(list(places.values()), axis=0).max()
+    for line in lines:
+        new = [pin for pin in pins if all(np.linalg.norm(places[pin] - places[other]) > near for other in line)]
+        if len(new) <= len(pins) - 2:
+            line += new
+            return
+    lines.append(pins)

@@ -17,6 +17,7 @@ from udkjax.study.reaction_peaks import pin_reactions
 Json = dict[str, Any]
 TURNS = 2  # of the slowest motor that a run shows
 SWINGS = 12  # characteristic times that a run without a motor shows
+STILL = 1.0  # s: of a run in which no load and no motor moves anything
 INSTANTS = 401  # of a run: two hundred of each of two turns
 DIGITS = 2  # of a duration
 TOLERANCE = 1e-8  # of a run, relative
@@ -30,7 +31,8 @@ def duration_of(mechanism: Mechanism) -> float:
         if driver.coordinate == "angle" and isinstance(driver.motion, Polynomial) and len(driver.motion.coefficients) == 2
     ]
     rates = [rate for rate in rates if rate > 0]
-    exact = TURNS * 2 * math.pi / min(rates) if rates else SWINGS * float(analyse(mechanism).time)
+    swing = float(analyse(mechanism).time)
+    exact = TURNS * 2 * math.pi / min(rates) if rates else SWINGS * swing if math.isfinite(swing) else STILL
     return float(f"{exact:.{DIGITS}g}")
 
 

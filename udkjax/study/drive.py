@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.annotations import Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
-from udkjax.equations.dense_rows import DenseTerms
+from udkjax.equations.dense_rows import DenseTerms, KinematicRows
 from udkjax.equations.redundancy import kinematic_rows, ordinary_position, owners_of_row
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
@@ -29,9 +29,11 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.study.channels import channel_of, point_of_pin
 from udkjax.study.report import join_names
+from udkjax.study.row_spaces import null_space
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
+MOVES = 1e-6  # of the longest direction that is free, in the metric of the links' arms and radians: less is rounding
 
 
 class Coordinate(PrintsLine):
@@ -107,7 +109,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Sc
         analysis = analyse(mechanism)
         if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # nor where that is not known, of traced numbers
             problem = "driver is None, and the scene has no driver: name a coordinate that drives it, such as"
-            raise SceneError([f"{problem} body.{mechanism.body_names[0]}.angle"], mechanism.name)
+            raise SceneError([f"{problem} {suggested_coordinate(mechanism)}"], mechanism.name)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
@@ -275,7 +277,24 @@ def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) 
     free = analysis.degrees_of_freedom
     if free:
         problem = f"driven by {driven}, it keeps {free} degree{'s' * (free > 1)} of freedom: its positions do not follow"
-        raise SceneError([f"{problem}; drive or hold the others, by drivers of the scene"], mechanism.name)
+        loose = [body for body, moves in free_motion(mechanism).items() if moves.any()] if mechanism.is_concrete else []
+        those = f"what still moves, {join_names(loose)}," if 0 < len(loose) < len(mechanism.bodies) else "the others"
+        raise SceneError([f"{problem}; drive or hold {those} by drivers of the scene"], mechanism.name)
+
+
+def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
+    """Return which coordinates x, y, angle of each body may move at the initial guess of known numbers."""
+    rows = KinematicRows(mechanism)
+    free = null_space(rows.at(0.0, np.ravel(mechanism.q0))[2], MOVES)
+    moves = np.linalg.norm(free, axis=0).reshape(-1, 3) > MOVES
+    return dict(zip(mechanism.body_names, moves, strict=True))
+
+
+def suggested_coordinate(mechanism: Mechanism) -> str:
+    """Return the name of a coordinate that moves and may drive: an angle if there is one; any, of numbers that are not known."""
+    moves = free_motion(mechanism) if mechanism.is_concrete else {}
+    free = [f"body.{body}.{name}" for k, name in ((2, "angle"), (0, "x"), (1, "y")) for body in moves if moves[body][k]]
+    return (free or [f"body.{mechanism.body_names[0]}.angle"])[0]
 
 
 def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:

@@ -65,7 +65,7 @@ class Equilibrium(PrintsTable):
         rows = [
             ("omega²", format_numbers(self.omega2, "(rad/s)²")),
             ("frequency", frequencies or "no degree of freedom is left"),
-            ("loads left over", f"{format_number(self.residual, scale=1.0)} of them"),
+            ("unbalanced loads", f"{format_number(self.residual, scale=1.0)} of the scale of forces"),
         ]
         poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
         rows += zip(self.bodies or map(str, range(len(poses))), poses, strict=True)
@@ -94,7 +94,7 @@ class Equilibrium(PrintsTable):
     def kind(self) -> str:
         """Kind of one position: "stable", "indifferent" or "unstable", or that it is none of rest."""
         if not self.balanced:
-            return "not at rest: loads are left over"
+            return "not at rest: loads are not balanced"
         return "stable" if self.stable else "indifferent" if self.indifferent else "unstable"
 
 

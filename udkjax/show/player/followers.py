@@ -26,7 +26,7 @@ Point = tuple[int, float, float]  # the number of a body, and a place in its fra
 
 
 def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[Json], drawn: int) -> Json:
-    """Return how the symbols, marks and traces of a run follow the numbers of the mechanism; its drawn points begin at `drawn`."""
+    """Return how the symbols, marks and traces of a run follow its mechanism, whose drawn points begin at `drawn`."""
     places: Mechanism = _places(mechanism)
     known = _points(mechanism, places)
     for body, points in drawn_points(mechanism):

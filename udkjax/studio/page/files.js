@@ -89,6 +89,7 @@ export class FileActions {
   openTemplate(template) { return this.open({template}, error => this.fail(error)); }
 
   async open(request, failed) {
+    this.studio.say(`opening ${request.path ?? request.template} …`);
     try {
       const {text, document, path, revision, problems: said, drawn} = await ask("open", request);
       const problems = document ? [shapeProblem(document)].filter(Boolean) : said;

@@ -119,11 +119,12 @@ function changeWords({change, drawn}) {
   return drawn?.kind === "slot" ? `make it a slot of ${of(drawn.on)} that guides the pin of ${of(drawn.link)}` : change;
 }
 
-function travelWords(motor, unit, ends) {
+function travelWords({motor, unit, ends, lost}) {
   const value = x => (unit === "rad" ? `${(x * 180 / Math.PI).toFixed(1)}°` : `${+(1e3 * x).toPrecision(4)} mm`).replace("-", "−");
-  if (!ends.length) return `${motor} turns all the way round.`;
+  const unknown = lost.length ? ` How far it goes ${lost.join(" and ")} could not be found.` : "";
+  if (!ends.length) return unknown ? `${motor}:${unknown.toLowerCase()}` : `${motor} ${unit === "rad" ? "turns all the way round" : "has no limits"}.`;
   const line = triples => (triples.length ? `: ${triples.map(names => names.join(", ")).join("; ")} in line` : "");
-  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(", and at ")}.`;
+  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(", and at ")}.${unknown}`;
 }
 
 /** The pin or the element that a constraint is of, by its name; undefined where there is none. */
