@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
+from udkjax.scene.drawing import Drawing
 from udkjax.scene.units import read_quantity
 
 HEAD = "format = 2\n"
@@ -141,6 +143,18 @@ def test_what_a_drawing_no_longer_says_is_written_by_hand():
     assert udk.dumps(mech).startswith("format = 2") and udk.dumps(heavier).startswith("format = 1")
     assert udk.loads(udk.dumps(heavier)).bodies["crank"].mass == 2.0
     assert udk.dumps(mech.with_parameters({"link.crank.mass": 2.0})).startswith("format = 2")
+
+
+def test_numbers_of_numpy_and_jax_are_plain_numbers():
+    """Whole arrays, single numbers of them, and those that are traced, in the units of the others."""
+    link = {"link": {"pins": ["O", "A"], "mass": 1}}
+
+    def length(pin):
+        return Drawing({"O": (0, 0), "A": pin}, link, ground=["O"], units={"length": "mm"}).pins["A"]
+
+    for pin in (np.array([3, 4]), (np.int64(3), np.float32(4)), jnp.array([3.0, 4.0])):
+        assert_allclose(length(pin), [0.003, 0.004])
+    assert_allclose(jax.jacfwd(length)(jnp.array([3.0, 4.0])), 1e-3 * np.eye(2))
 
 
 def test_the_text_of_a_drawing_without_units_is_in_si_units():

@@ -7,6 +7,7 @@ from typing import Any, Literal, get_origin
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.fields import Table, vector_as_angle
@@ -78,10 +79,10 @@ class Units:
             return None
 
     def _plain(self, value: object, unit: str) -> object:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not unit:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | jax.Array) or not unit:
             return value
         factor = self._factor(unit)
-        if factor is None and value:
+        if factor is None and (isinstance(value, Tracer) or np.any(value)):
             kind = _KIND_OF.get(unit)
             which = " and ".join(f"{k} is in {u}" for k, u in self._changed(unit).items())
             under = f", or choose a unit for {kind} under units" if kind else ""
