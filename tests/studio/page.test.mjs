@@ -291,3 +291,15 @@ test("whatever stands in a file is drawn, or said not to be a drawing", () => {
   for (const [key, value] of Object.entries(whole)) vary(value, other => ({...whole, [key]: other}));
   assert.ok(refused > 100 && drawn > 500, `${refused} ${drawn}`);
 });
+
+test("a name never covers a sign: it stands elsewhere, or is left out", async () => {
+  const {Labels} = await page("player/labels"), written = [];
+  const context = {canvas: {clientWidth: 400, clientHeight: 400}, measureText: words => ({width: 8 * words.length})};
+  const names = new Labels();
+  names.begin({context, pt: 1, text: words => written.push(words)}, []);
+  names.put("sign", "R", [[100, 100, "left"]], "red", 700, true);
+  names.put("there", "crank", [[80, 100, "left"]], "ink", 500);
+  names.put("elsewhere", "rod", [[80, 100, "left"], [80, 200, "left"]], "ink", 500);
+  names.put("chosen", "bar", [[80, 100, "left"]], "ink", 700);
+  assert.deepEqual(written, ["R", "rod", "bar"]);
+});

@@ -4,6 +4,7 @@ const SIZE = 12, HIGH = 14;  // px
 const PIN = 7;  // px around the middle of a pin, where no name stands
 const BESIDE = 14;  // px from a bar to its name
 const ROUNDING = 1e-6;  // px2
+const BOLD = 700;  // the weight of signs, and of the names of what is selected
 const PLACES = [[9, -12, "left"], [9, 14, "left"], [-9, -12, "right"], [-9, 14, "right"], [0, -20, "center"], [0, 22, "center"]];  // around a pin (px)
 
 export class Labels {
@@ -18,14 +19,16 @@ export class Labels {
     this.boxes = Array.from(places, ([x, y]) => [x - PIN, y - PIN, x + PIN, y + PIN]);
   }
 
-  /** Write words at the first free one of some places [x, y, align], or where they cover least of others; `key` names them. */
-  put(key, words, places, colour, weight) {
+  /** Write words at the first free one of some places [x, y, align], or where they cover least of others; `key` names them. A sign
+   *  is never covered: a name that would have to is left out, unless it is bold. */
+  put(key, words, places, colour, weight, isSign = false) {
     const {painter, last, boxes, unit, whole} = this, high = HIGH * unit;
     painter.context.font = `${weight} ${SIZE * unit}px system-ui`;
     const wide = painter.context.measureText(words).width;
     const boxOf = ([x, y, align]) => { const left = x - {left: 0, center: wide / 2, right: wide}[align]; return [left, y - high / 2, left + wide, y + high / 2]; };
     const shared = (a, b) => [0, 1].reduce((area, k) => area * Math.max(0, Math.min(a[k + 2], b[k + 2]) - Math.max(a[k], b[k])), 1);
-    const covered = k => { const box = boxOf(places[k]); return boxes.reduce((sum, b) => sum + shared(box, b), wide * high - shared(box, whole)); };
+    const cost = (area, sign) => (sign && area > ROUNDING ? Infinity : area);
+    const covered = k => { const box = boxOf(places[k]); return boxes.reduce((sum, b) => sum + cost(shared(box, b), b.isSign), wide * high - shared(box, whole)); };
     const before = Math.min(last.get(key) ?? 0, places.length - 1);
     let found = before, least = covered(before);
     for (let k = 0; k < places.length && least > ROUNDING; k++) {
@@ -33,7 +36,8 @@ export class Labels {
       if (now < least) [found, least] = [k, now];
     }
     last.set(key, found);
-    boxes.push(boxOf(places[found]));
+    if (least === Infinity && weight < BOLD) return;
+    boxes.push(Object.assign(boxOf(places[found]), {isSign}));
     const [x, y, align] = places[found];
     painter.text(words, [x, y], colour, {size: SIZE, weight, align});
   }

@@ -117,7 +117,7 @@ export class DrawingCanvas {
       const place = this.places.get(name);
       if (!place) continue;
       painter.circle(place, 10, {stroke: theme.force, width: strong ? 2.6 : 1.3});
-      this.names.put(`sign ${name}`, sign, SIGN_PLACES.map(([x, y, align]) => [place[0] + x, place[1] + y, align]), theme.force, 700);
+      this.names.put(`sign ${name}`, sign, SIGN_PLACES.map(([x, y, align]) => [place[0] + x, place[1] + y, align]), theme.force, 700, true);
     }
     if (preview?.onto) {
       const place = this.places.get(preview.onto);
