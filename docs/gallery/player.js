@@ -135,6 +135,7 @@ const SIZE = 12, HIGH = 14;  // px
 const PIN = 7;  // px around the middle of a pin, where no name stands
 const BESIDE = 14;  // px from a bar to its name
 const ROUNDING = 1e-6;  // px2
+const BOLD = 700;  // the weight of signs, and of the names of what is selected
 const PLACES = [[9, -12, "left"], [9, 14, "left"], [-9, -12, "right"], [-9, 14, "right"], [0, -20, "center"], [0, 22, "center"]];  // around a pin (px)
 class Labels {
   constructor() { this.last = new Map(); }
@@ -146,14 +147,16 @@ class Labels {
     this.unit = Math.max(1, painter.pt);
     this.boxes = Array.from(places, ([x, y]) => [x - PIN, y - PIN, x + PIN, y + PIN]);
   }
-  /** Write words at the first free one of some places [x, y, align], or where they cover least of others; `key` names them. */
-  put(key, words, places, colour, weight) {
+  /** Write words at the first free one of some places [x, y, align], or where they cover least of others; `key` names them. A sign
+   *  is never covered: a name that would have to is left out, unless it is bold. */
+  put(key, words, places, colour, weight, isSign = false) {
     const {painter, last, boxes, unit, whole} = this, high = HIGH * unit;
     painter.context.font = `${weight} ${SIZE * unit}px system-ui`;
     const wide = painter.context.measureText(words).width;
     const boxOf = ([x, y, align]) => { const left = x - {left: 0, center: wide / 2, right: wide}[align]; return [left, y - high / 2, left + wide, y + high / 2]; };
     const shared = (a, b) => [0, 1].reduce((area, k) => area * Math.max(0, Math.min(a[k + 2], b[k + 2]) - Math.max(a[k], b[k])), 1);
-    const covered = k => { const box = boxOf(places[k]); return boxes.reduce((sum, b) => sum + shared(box, b), wide * high - shared(box, whole)); };
+    const cost = (area, sign) => (sign && area > ROUNDING ? Infinity : area);
+    const covered = k => { const box = boxOf(places[k]); return boxes.reduce((sum, b) => sum + cost(shared(box, b), b.isSign), wide * high - shared(box, whole)); };
     const before = Math.min(last.get(key) ?? 0, places.length - 1);
     let found = before, least = covered(before);
     for (let k = 0; k < places.length && least > ROUNDING; k++) {
@@ -161,7 +164,8 @@ class Labels {
       if (now < least) [found, least] = [k, now];
     }
     last.set(key, found);
-    boxes.push(boxOf(places[found]));
+    if (least === Infinity && weight < BOLD) return;
+    boxes.push(Object.assign(boxOf(places[found]), {isSign}));
     const [x, y, align] = places[found];
     painter.text(words, [x, y], colour, {size: SIZE, weight, align});
   }
@@ -665,12 +669,12 @@ function look(engine, numbers, settings, state, before) {
   return found;
 }
 /** The velocities behind an impact of contact k by Newton's law, g_dot+ = -e g_dot-, and whether it is over with its rebounds; or
- *  `words` where more happens than that: several contacts at once, and contacts that are held at rest, are no programs of a page. */
-function hit(engine, numbers, settings, at, watch, k) {
+ *  `words` where more happens than that: several contacts that are hit at once are no program of a page. `held` is at rest. */
+function hit(engine, numbers, settings, at, watch, k, held) {
   const {events} = engine.data, {tolerances: tol} = events, {omega} = settings, {g, rate, rate2, scales, byQ, directions} = watch;
-  const along = (i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0), W = along(k, k), unit = j => scales[j] * omega;
-  const isHit = j => j !== k && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j] && rate[j] <= tol.zero_rate * unit(j)
-    && Math.abs(along(j, k)) > tol.coupled * Math.sqrt(along(j, j) * W);
+  const W = along(watch, k, k), unit = j => scales[j] * omega;
+  const isHit = j => j !== k && j !== held && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j]
+    && rate[j] <= tol.zero_rate * unit(j) && Math.abs(along(watch, j, k)) > tol.coupled * Math.sqrt(along(watch, j, j) * W);
   const other = events.names.findIndex((_, j) => isHit(j)), name = events.names[k];
   if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which is no program of a page yet`};
   const inverse = engine.inverseMasses(numbers);
@@ -678,19 +682,30 @@ function hit(engine, numbers, settings, at, watch, k) {
   const floor = tol.zero_rate * unit(k), isPressed = acceleration => acceleration < -tol.zero_rate_2 * unit(k) * omega;
   const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
   const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
-  const v = at.v.map((x, i) => x + impulse * directions[k][i]), hits = !isSlow && rate[k] < -floor;
+  const moved = size => at.v.map((x, i) => x + size * directions[k][i]), v = moved(impulse), hits = !isSlow && rate[k] < -floor;
   const stays = after <= Math.max(floor, tol.still * Math.abs(rate[k])) || (isSlow && rate[k] > 0);
-  return {v, hits, rests: stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k])};
+  const rests = stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k]);
+  return {v: rests ? moved(-rate[k] / W) : v, hits, rests};
 }
-/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. */
-function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
-  const {data: {events, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
-  const {zero} = events.tolerances, own = engine.conditionNumbers(numbers), isImpact = k => events.restitution[k] !== null;
-  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: [],
-    steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
-  let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0;
-  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; };
-  const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch}, marks: at.marks, ...more});
+/** How much a unit impulse along contact j changes the rate of contact i. */
+const along = ({byQ, directions}, i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0);
+/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. While a
+ *  contact is at rest, the engine that holds it runs; `numbersOf` an engine are its numbers. */
+function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, limit) {
+  const {data: {events, scales, drift_tol: driftTol}, size: n} = free, T = ts.length, end = ts[T - 1], E = events.names.length;
+  const {zero, zero_rate: zeroRate, zero_rate_2: zeroRate2} = events.tolerances, isImpact = k => events.restitution[k] !== null;
+  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0,
+    events: [], steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
+  let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0, pending = -1;
+  let held, engine, numbers, settings;
+  const use = k => {
+    held = k;
+    engine = k < 0 ? free : free.held[k];
+    numbers = numbersOf(engine);
+    settings = {...engine.data.settings, smallest, omega};
+  };
+  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.held[row] = held + 1; };
+  const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch, held}, marks: held < 0 ? at.marks : null, ...more});
   const note = index => found.events.push({t: at.t, index, q: at.q, v: at.v});
   const stop = words => {  // with the state there as the last output
     if (first < T && !(first && ts[first - 1] === at.t)) {
@@ -699,11 +714,22 @@ function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
     }
     return finish(words, {stop: stops ? words : null, count: first});
   };
+  /** Goes on with a contact at rest, or with none. */
+  const rest = (k, v = at.v) => {
+    use(k);
+    at = {t: at.t, q: at.q, v};
+    const {sides} = watch;
+    watch = Object.assign(look(engine, numbers, settings, at, watch), {sides});
+  };
+  use(state.held ?? -1);
   if (!watch) {
     watch = look(engine, numbers, settings, at, null);
     const beyond = watch.sides.findIndex((side, k) => isImpact(k) && side < 0);
     if (beyond >= 0) return finish(`it begins beyond ${events.names[beyond]}`);
-    watch.sides = watch.sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
+    const {rate, rate2, scales: unit, sides} = watch, small = k => zeroRate * unit[k] * omega;
+    const falls = k => rate[k] < -small(k) || (Math.abs(rate[k]) <= small(k) && rate2[k] < -zeroRate2 * unit[k] * omega ** 2);
+    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // what is closed, and closes further
+    watch.sides = sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
   }
   for (;;) {
     while (first < T && ts[first] <= at.t) put(first++, at.q, at.v, violation);
@@ -714,34 +740,66 @@ function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
       while (first < T) put(first++, at.q, at.v, violation);
       return finish("", {done: true, count: T});
     }
-    const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => zero * x);
-    const given = [...own, ...watch.sides, ...Array(E).fill(1), ...floors, ...events.directions, events.slowest];
-    const part = engine.piece(numbers, settings, at, times, limit - found.tried, given), [event, sure, worst] = part.crossing;
-    const before = [...part.crossing.subarray(events.head, events.head + E)];
-    found.steps += part.steps;
-    found.tried += part.tried;
-    for (let k = 1; k < part.count && times[k] <= sure; k++) {
-      put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
-      found.count = ++first;
+    let event = pending, before = watch.sides, part = null;
+    pending = -1;
+    if (event < 0) {
+      const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => zero * x), isHeld = held < 0 ? [] : [1];
+      const counts = before.map((_, k) => (k === held ? 0 : 1)), force = zero * scales.mass * scales.length * omega ** 2;
+      const given = [...engine.conditionNumbers(numbers), ...before, ...isHeld, ...counts, ...isHeld, ...floors, ...isHeld.map(() => force),
+        ...events.directions, ...isHeld.map(() => -1), events.slowest];
+      part = engine.piece(numbers, settings, at, times, limit - found.tried, given);
+      const [crossed, sure, worst] = part.crossing;
+      before = [...part.crossing.subarray(events.head, events.head + E)];
+      found.steps += part.steps;
+      found.tried += part.tried;
+      for (let k = 1; k < part.count && times[k] <= sure; k++) {
+        put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
+        found.count = ++first;
+      }
+      at = {t: sure, q: part.crossing.slice(-2 * n, -n), v: part.crossing.slice(-n), marks: part.marks};
+      violation = worst;
+      if (!(worst <= driftTol)) return finish("the loops do not stay closed");
+      event = crossed;
+      watch = look(engine, numbers, settings, at, watch);
     }
-    at = {t: sure, q: part.crossing.slice(-2 * n, -n), v: part.crossing.slice(-n), marks: part.marks};
-    violation = worst;
-    if (!(worst <= driftTol)) return finish("the loops do not stay closed");
-    watch = look(engine, numbers, settings, at, watch);
-    const jump = event >= 0 && isImpact(event) ? hit(engine, numbers, settings, at, watch, event) : null;
+    if (event === E) {  // the contact would have to pull
+      before[held] = 1;
+      note(E + held);
+      watch.sides = before;
+      rest(-1);
+      continue;
+    }
+    let lifted = -1;  // by the impact of another
+    if (event >= 0 && isImpact(event) && held >= 0) {
+      const bare = look(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
+      if (along(bare, held, event) > events.tolerances.coupled * Math.sqrt(along(bare, held, held) * along(bare, event, event))) {
+        lifted = held;
+        before[held] = 1;
+        rest(-1);
+      }
+    }
+    const jump = event >= 0 && isImpact(event) ? hit(engine, numbers, settings, at, watch, event, Math.max(held, lifted)) : null;
     if (jump?.words) return finish(jump.words);
     if (event >= 0 && (!jump || jump.hits || !jump.rests)) note(event);
+    if (lifted >= 0) note(E + lifted);
     if (jump) {
       at = {...at, v: jump.v};
       if (jump.rests) {
         note(2 * E + event);
         const words = `${events.names[event]} has come to rest`;
-        return events.ends_at_rest[event] ? stop(words) : finish(`${words}, and how it is held is no program of a page yet`);
+        if (events.ends_at_rest[event]) return stop(words);
+        if (!free.held[event]) return finish(`${words}, and how it is held is no program of a page`);
+        if (held >= 0) return finish(`${words} beside ${events.names[held]}, and how both are held is no program of a page yet`);
+        before[event] = 1;
+        watch.sides = before;
+        rest(event);
+        continue;
       }
       watch = look(engine, numbers, settings, at, watch);
     }
     watch.sides = watch.sides.map((side, k) => {
       if (k === event) return jump ? 1 : -before[k];
+      if (k === held) return 1;
       return Number.isNaN(side) || (side !== 0 && !(jump && events.by_velocity[k])) ? side : before[k];
     });
     if (event < 0) {
@@ -829,6 +887,12 @@ class Engine {
     const {count, knots, conditions} = this.data;
     return numbers.subarray(count + knots, count + knots + conditions);
   }
+  /** All numbers of the scene with a hand's spring. */
+  pulled(parameters, pull) {
+    const numbers = this.numbers(parameters);
+    if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[this.data.pulls[pull.body][k]] = x; });
+    return numbers;
+  }
   breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
    *  that hold at a time. */
@@ -880,17 +944,17 @@ class Engine {
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
    *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
-   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index. Where one
-   *  ends it as it should, `stop` says so, and the last time is that of the event.
+   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index, of one that
+   *  lets go with their number. Where one ends it as it should, `stop` says so, and the last time is that of the event. `held` are
+   *  one more than the event whose contact is at rest at each time, 0 where none is.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
-    const {data} = this, numbers = this.numbers(parameters), T = times.length;
+    const {data} = this, T = times.length;
     if (data.why) throw new Error(data.why);
-    if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
     const end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1])), smallest = data.smallest * EPS * end;
-    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0])), settings = {...data.settings, smallest, omega};
-    if (data.events) return runWithEvents(this, numbers, settings, state, Float64Array.from(times), !pull, limit);
-    return {...this.piece(numbers, settings, state, Float64Array.from(times), limit), events: []};
+    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
+    if (data.events) return runWithEvents(this, engine => engine.pulled(parameters, pull), {smallest, omega}, state, Float64Array.from(times), !pull, limit);
+    return {...this.piece(this.pulled(parameters, pull), {...data.settings, smallest, omega}, state, Float64Array.from(times), limit), events: []};
   }
   /** Integrate from a state over times; with conditions to `watch`, up to the first that crosses zero, which is in `crossing`. */
   piece(numbers, settings, state, ts, limit, watch = []) {
@@ -898,7 +962,7 @@ class Engine {
     const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
       settings: Object.values({...settings, max_steps: limit}), rows: data.rows, breaks, samples: this.samples, watch};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
-    if (data.events) results.crossing = data.events.head + data.events.names.length + 2 * size;
+    if (data.events) results.crossing = data.events.head + data.events.names.length + data.forces_watched + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
@@ -928,7 +992,9 @@ class Engine {
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
    *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
    *  whose shares would be a choice. */
-  measure(parameters, {ts, q, v, count, marks = null}, efforts = false, forces = false) {
+  measure(parameters, run, efforts = false, forces = false) {
+    if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
+    const {ts, q, v, count, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
     const wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
@@ -958,6 +1024,21 @@ class Engine {
     }
     return found;
   }
+  /** What `measure` returns of a run in which contacts come to rest: of each part by the engine that holds its contact. */
+  measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
+    const n = this.size, parts = [];
+    for (let from = 0, to = 0; from < count; from = to) {
+      while (to < count && held[to] === held[from]) to++;
+      const part = {ts: ts.subarray(from, to), q: q.subarray(from * n, to * n), v: v.subarray(from * n, to * n), count: to - from, marks};
+      const engine = held[from] ? this.held[held[from] - 1] : this;
+      if (held[from]) part.marks = engine.mark(parameters, {t: ts[from], q: part.q.subarray(0, n), v: part.v.subarray(0, n)});
+      parts.push(engine.measure(parameters, part, efforts, forces));
+    }
+    const joined = of => Float64Array.from(parts.flatMap(part => [...of(part)]));
+    return {kinetic: joined(p => p.kinetic), potential: joined(p => p.potential),
+      efforts: Object.fromEntries(Object.keys(parts[0].efforts).map(name => [name, joined(p => p.efforts[name])])),
+      forces: joined(p => (parts.every(({forces}) => forces.length) ? p.forces : []))};
+  }
   /** Forces x, y of each joint at the state that was evaluated last. */
   forces(work, {x0, psi_q}) {
     const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
@@ -968,7 +1049,9 @@ class Engine {
 async function loadEngine(data) {
   if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
   const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
-  return new Engine(data, Object.fromEntries(await Promise.all(loaded)));
+  const engine = new Engine(data, Object.fromEntries(await Promise.all(loaded)));
+  engine.held = Object.fromEntries(await Promise.all(Object.entries(data.held).map(async ([k, of]) => [k, await loadEngine(of)])));
+  return engine;
 }
 /** Moves the places of a run's symbols, marks and traces to where the numbers say. */
 class Follower {
@@ -1028,7 +1111,7 @@ class Hand {
     }
     if (this.isBlocked) live.live.greet();  // what was said is over
     this.isBlocked = false;
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch};
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, held: run.last.held};
     live.append(this.state, run.violation[1], run.events);
     return null;
   }
@@ -1209,6 +1292,7 @@ class LiveRun {
     const {ts, q, v, measures, frame, reactions, forces, events} = this.first;
     this.drop();
     this.run.replace(ts, q, v, measures, frame, events);
+    this.run.held = null;
     this.showReactions(reactions, forces);
     this.follower.follow(this.engine.numbers(null));
     this.changed = false;
@@ -1218,7 +1302,7 @@ class LiveRun {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
     if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
-    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: []};
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
     this.follower.follow(engine.numbers(values));
     return "";
@@ -1233,6 +1317,7 @@ class LiveRun {
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
+    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
     run.count = job.from = from + count;
     run.events.push(...part.events);
     job.steps += part.steps;
@@ -1258,12 +1343,13 @@ class LiveRun {
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
     this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1, this.named(run.events));
+    this.run.held = run.held;
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
   /** Events as they are shown: {t, name}. */
   named(events) {
-    const names = this.engine.data.events?.names ?? [], nameOf = k => (k < names.length ? names[k] : `${names[k % names.length]} rests`);
+    const names = this.engine.data.events?.names ?? [], nameOf = k => names[k % names.length] + ["", " lets go", " rests"][Math.floor(k / names.length)];
     return events.map(({t, index}) => ({t, name: nameOf(index)}));
   }
   /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
@@ -1326,19 +1412,20 @@ class LiveRun {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
     const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
     this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
-      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length), held: Array.from({length: before}, (_, k) => this.run.held?.[k] ?? 0)};
     this.happened = this.run.events.filter(({t}) => t <= state.t);
     this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation, []);
   }
   /** Add one state to the record, and the events before it, and show it. */
-  append({t, q, v}, violation, events) {
+  append({t, q, v, held = -1}, violation, events) {
     const {past} = this;
     this.happened.push(...this.named(events));
     past.ts.push(t);
     past.q.push(...q);
     past.v.push(...v);
     past.violation.push(violation);
+    past.held.push(held + 1);
     this.showPast();
     this.player.setEnd(Math.max(t, this.player.data.end));
     this.player.t = t;
@@ -1358,6 +1445,7 @@ class LiveRun {
       past.q.push(...run.q.subarray(k * n, (k + 1) * n));
       past.v.push(...run.v.subarray(k * n, (k + 1) * n));
       past.violation.push(run.violation[k]);
+      past.held.push(run.held?.[k] ?? 0);
     }
     this.happened.push(...this.named(run.events));
     this.showPast();
@@ -1467,6 +1555,7 @@ class Live {
     const several = this.said.length > 1, words = this.said.map((said, k) => (several ? `${this.player.runs[k].label}: ` : "") + said.words);
     this.say(words.join("\n"), this.said.some(said => said.bad));
     if (this.isSolving) this.request = requestAnimationFrame(() => this.goOn());
+    else this.player.setEnd(this.end);  // of a motion that ends early, there
     this.player.draw();
   }
   /** Solve all that is still to be solved. */

@@ -23,6 +23,7 @@ NAMES = (
     "scissor_lift",
     "dwell_cam",
     "planetary_gear",
+    "hammer",
     "identification",
     "double_pendulum_map",
     "neural_friction",

@@ -113,7 +113,7 @@ def kinematics(
 
 
 def outputs(mech: "Mechanism", found: "Kinematics", driver: str) -> dict[str, str]:
-    """Return how far each link turns or slides on the ground along a motion, and between what its transmission angles are."""
+    """Return the ranges of links on the ground along a motion, and those of the angles between other links, as words."""
     import numpy as np
 
     import udkjax as udk

@@ -9,6 +9,7 @@ import pytest
 
 import udkjax as udk
 from tests.show.player.conftest import Motion
+from udkjax.integrate.events.conditions import Gap
 from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
 from udkjax.show.player.measure_curves import measures_of, rank_of, reaction_arrows, singular_values_over_time
@@ -205,6 +206,20 @@ def test_a_plate_is_drawn_as_its_polygon_and_its_free_pins_are_traced():
     np.testing.assert_allclose(np.linalg.norm(at, axis=1), np.linalg.norm(list(corners.values()), axis=1))
     still = Motion(ts=np.arange(2.0), q=poses, v=0 * poses)
     assert len(udk.animate(bent, still, measures=()).data["runs"][0]["traces"]) == 4
+
+
+def test_the_line_of_a_contact_is_drawn_where_it_is_hit():
+    """An incline to the left, on which a ball comes down: from the point that is nearest, with what is allowed to its left."""
+    ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(1.0, 2.0))})
+    (event,) = udk.Contact("ball", through=(1.0, 0.0), normal=(1.0, 1.0)).expand(ball)
+    assert isinstance(event.condition, Gap)
+    (floor,) = (
+        mark
+        for mark in marks(ball, np.array([[[1.0, 2.0, 0.0]], [[1.0, 0.0, 0.0]]]), gaps=[event.condition])
+        if mark["kind"] == "floor"
+    )
+    assert (floor["body"], floor["at"], floor["axis"]) == (-1, [1.0, 0.0], pytest.approx(-np.pi / 4))
+    assert floor["span"][0] < 0 < floor["span"][1] < 0.5
 
 
 def test_bounds_hold_every_pose(animation, run):

@@ -11,6 +11,8 @@ events       {names, directions: in which zeros count, 0 for either, by_velocity
              restitution: of an impact, else null, ends_at_rest: whether its rest ends the run, slowest: rate of the scene (1/s),
              most: how many may happen, head: how many numbers a run tells before the sides of conditions, tolerances: of
              integrate/events by their names}, or null
+held         engines of the same mechanism with the contact of one event at rest, by the number of that event; without "close"
+forces_watched  1 of such an engine, whose run ends as well where the contact would have to pull; else 0
 thresholds   of pivots, which a run takes behind the numbers; of closing, those in `closing`
 closing      {thresholds, settings, tol and rounding: what counts as closed (equations/position_closure.py)}
 guess        {q, v}: places in `numbers` of the initial guess

@@ -2,7 +2,7 @@
 
 import base64
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -84,11 +84,38 @@ def portable_engine(
             no instruction for.
     """
     values = scalar_parameters(mechanism, parameters)
-    dress: Callable[[Mechanism], Mechanism] = with_pulls if pull else lambda given: given.without_origin
-    dressed, analysis = dress(mechanism), analyse(mechanism)
-    if _may_move_by_redundancy(mechanism, analysis):
-        analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page finds them
     watched = PortableEvents(events, mechanism)
+    engine = _engine(mechanism, values, rtol, atol, pull, runs, watched, drawn)
+    if runs and not engine.data["why"]:
+        for event in watched.holding:
+            held = _engine(mechanism, values, rtol, atol, pull, runs, watched, False, event).data
+            if not held["why"]:
+                engine.data["held"][event] = held
+    return engine
+
+
+def _engine(
+    mechanism: Mechanism,
+    values: dict[str, float],
+    rtol: float,
+    atol: float,
+    pull: bool,
+    runs: bool,
+    watched: PortableEvents,
+    drawn: bool,
+    held: int | None = None,
+) -> PortableEngine:
+    """Compile the engine of a mechanism; with the contact of an event at rest, where `held` names one."""
+
+    def rest(given: Mechanism) -> Mechanism:
+        return given if held is None else watched.with_contact(given, held)
+
+    def dress(given: Mechanism) -> Mechanism:
+        return with_pulls(rest(given)) if pull else rest(given).without_origin
+
+    dressed, analysis = dress(mechanism), analyse(rest(mechanism))
+    if _may_move_by_redundancy(rest(mechanism), analysis):
+        analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page finds them
     numbers = NumberProgram(
         mechanism, values, dress, lambda given: [*watched.numbers(given), *(x for _, x in drawn_points(given) if drawn)]
     )
@@ -101,6 +128,8 @@ def portable_engine(
         "knots": numbers.knots,
         "conditions": sum(np.size(x) for x in watched.numbers(mechanism)),
         "events": watched.data(analysis),
+        "forces_watched": int(held is not None),
+        "held": {},
         "marks": len(analysis.scales.rows) if analysis.redundant_rows is None else 0,
         "sampled": [],
         "samples": "",
@@ -111,11 +140,12 @@ def portable_engine(
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
     data["why"] = problem.compiled.plan.why_not_native
-    modules = {"close": _close(dressed, analysis, data)}
+    data["closing"] = _closing(analysis)
+    modules = {"close": _close(dressed)} if held is None else {}
     if data["marks"]:
         modules["mark"] = _operation(MarkRows(scene_programs(dressed).with_all_rows))
     if runs and not data["why"]:
-        modules |= _run(problem, data, watched)
+        modules |= _run(problem, data, watched, () if held is None else (watched.row(analysis, held),))
         if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
     modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
@@ -177,7 +207,7 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
     return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))
 
 
-def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
+def _run(problem: Problem, data: Json, events: PortableEvents, rows: tuple[int, ...]) -> Json:
     """Return the module of runs; its inputs go into the data."""
     operation, inputs = problem.compiled.plan.operation, packed(problem)
     assert operation is not None  # such a page runs machine code
@@ -191,18 +221,20 @@ def _run(problem: Problem, data: Json, events: PortableEvents) -> Json:
         "sampled": list(operation.sampled),
         "samples": floats(inputs[len(INPUTS)][0]) if operation.sampled else "",
     }
-    modules = {"run": _operation(events.watched_by(operation))}
+    modules = {"run": _operation(events.watched_by(operation, rows))}
     if data["events"] is not None:
         modules["states"] = _operation(events.states_of(operation))
     return modules
 
 
-def _close(mechanism: Mechanism, analysis: Analysis, data: Json) -> Json:
-    """Return the module of closing; its inputs go into the data."""
-    tol = float(analysis.scales.rank_tol)
-    settings = [data["scales"]["length"], tol]
-    data["closing"] = {"thresholds": [tol**2, 0.0], "settings": settings, "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}
+def _close(mechanism: Mechanism) -> Json:
     return _operation(Close(scene_programs(mechanism).with_all_rows))
+
+
+def _closing(analysis: Analysis) -> Json:
+    """Return the inputs of closing."""
+    length, tol = float(analysis.scales.length), float(analysis.scales.rank_tol)
+    return {"thresholds": [tol**2, 0.0], "settings": [length, tol], "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}
 
 
 def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json) -> Json:

@@ -1,6 +1,7 @@
 """Events of a portable engine: what a page knows of them, and the operations by which it runs to the next and looks at states."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from udkjax.integrate.events.actions import Impact, Log, Stop
 from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions
 from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
+from udkjax.integrate.events.phases import HeldContact
 from udkjax.native.conditions import HEAD
 from udkjax.native.operations import EvaluateEvents
 from udkjax.native.program import UnsupportedError
@@ -20,6 +22,7 @@ from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError
 
+CONTACT = "{}.contact"  # name of the joint that holds the contact of an event
 MOST_EVENTS = 1000  # of a run in a page: beyond, nobody would look at them
 TOLERANCES = {
     "zero": ZERO,
@@ -52,6 +55,21 @@ class PortableEvents:
         if self._conditions is None and events:
             raise UnsupportedError("the condition of an event")
 
+    @property
+    def holding(self) -> list[int]:
+        """The events whose contacts are held when they come to rest."""
+        return [k for k, e in enumerate(self._events) if isinstance(e.action, Impact) and e.action.at_rest == "hold"]
+
+    def with_contact(self, mechanism: Mechanism, event: int) -> Mechanism:
+        """Return the mechanism with the contact of an event as a joint: it is at rest."""
+        held = expand_events(self._given, mechanism)[event]
+        joints = {**mechanism.joints, CONTACT.format(held.name): HeldContact.of(held, mechanism)}
+        return Mechanism(mechanism.bodies, joints, mechanism.drivers, mechanism.forces, mechanism.gravity, mechanism.name)
+
+    def row(self, analysis: Analysis, event: int) -> int:
+        """Return the row of Psi of the contact of an event."""
+        return [name for name, _ in analysis.row_names].index(CONTACT.format(self._events[event].name))
+
     def data(self, analysis: Analysis) -> dict[str, Any] | None:
         """Return the events as data of a page; None where there are none."""
         if not self._events:
@@ -75,9 +93,9 @@ class PortableEvents:
         """Return the numbers of the conditions, some of which follow from those of the mechanism."""
         return condition_numbers(expand_events(self._given, mechanism)) if self._given else ()
 
-    def watched_by(self, operation: RunStates) -> RunStates:
-        """Return the run that ends where a condition crosses zero."""
-        return operation if self._conditions is None else operation.watching(self._conditions)
+    def watched_by(self, operation: RunStates, rows: tuple[int, ...] = ()) -> RunStates:
+        """Return the run that ends where a condition crosses zero, or the force of a contact in a row of Psi."""
+        return operation if self._conditions is None else operation.watching(replace(self._conditions, rows=rows))
 
     def states_of(self, run: RunStates) -> EvaluateEvents:
         """Return the operation that finds conditions, their rates and slopes, and directions of impulses at states."""

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from udkjax.integrate.events.event import ExpandsToEvents
+from udkjax.integrate.events.conditions import Gap
+from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
 from udkjax.scene import Mechanism
 from udkjax.scene.arguments import checked, require_mechanism
@@ -150,7 +151,7 @@ def animate(
             seconds. Its measures are violation, energy and effort,
             which the page finds anew, behind those of your own, which it shows of the first motion alone; "rank" is none.
         events: of live runs, as `simulate` took them: the page finds anew when each happens. Of actions it knows `Log`, `Stop`
-            and `Impact`, of one contact at a time.
+            and `Impact`, of one contact at a time, and draws the lines of contacts.
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
@@ -172,7 +173,9 @@ def animate(
         one = require_mechanism(mechanism[label] if isinstance(mechanism, Mapping) else mechanism)
         run = _Still(one) if run is None else run
         require_history(f"solution[{label!r}]" if label else "solution", run, {"mechanism": one})
-        found.append((one, *run_record(one, run, label, measures, reactions, traces, shapes)))
+        conditions = [event.condition for event in (expand_events(events, one) if events else ())]
+        gaps = [condition for condition in conditions if isinstance(condition, Gap)]
+        found.append((one, *run_record(one, run, label, measures, reactions, traces, shapes, gaps)))
         if failure := failure_of(run):
             failures[label] = failure
             warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)

@@ -5,7 +5,8 @@
 //   engine.values                              their values as they are in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
 //   engine.mark(parameters, state)             -> a number for each row of Psi, one where it is independent near a state; or null
-//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, events, last}
+//   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, events,
+//                                                 held, last}
 //   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
@@ -104,6 +105,13 @@ class Engine {
     return numbers.subarray(count + knots, count + knots + conditions);
   }
 
+  /** All numbers of the scene with a hand's spring. */
+  pulled(parameters, pull) {
+    const numbers = this.numbers(parameters);
+    if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[this.data.pulls[pull.body][k]] = x; });
+    return numbers;
+  }
+
   breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
 
   /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
@@ -162,17 +170,17 @@ class Engine {
    *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
    *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
-   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index. Where one
-   *  ends it as it should, `stop` says so, and the last time is that of the event.
+   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index, of one that
+   *  lets go with their number. Where one ends it as it should, `stop` says so, and the last time is that of the event. `held` are
+   *  one more than the event whose contact is at rest at each time, 0 where none is.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
-    const {data} = this, numbers = this.numbers(parameters), T = times.length;
+    const {data} = this, T = times.length;
     if (data.why) throw new Error(data.why);
-    if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[data.pulls[pull.body][k]] = x; });
     const end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1])), smallest = data.smallest * EPS * end;
-    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0])), settings = {...data.settings, smallest, omega};
-    if (data.events) return runWithEvents(this, numbers, settings, state, Float64Array.from(times), !pull, limit);
-    return {...this.piece(numbers, settings, state, Float64Array.from(times), limit), events: []};
+    const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
+    if (data.events) return runWithEvents(this, engine => engine.pulled(parameters, pull), {smallest, omega}, state, Float64Array.from(times), !pull, limit);
+    return {...this.piece(this.pulled(parameters, pull), {...data.settings, smallest, omega}, state, Float64Array.from(times), limit), events: []};
   }
 
   /** Integrate from a state over times; with conditions to `watch`, up to the first that crosses zero, which is in `crossing`. */
@@ -181,7 +189,7 @@ class Engine {
     const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
       settings: Object.values({...settings, max_steps: limit}), rows: data.rows, breaks, samples: this.samples, watch};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
-    if (data.events) results.crossing = data.events.head + data.events.names.length + 2 * size;
+    if (data.events) results.crossing = data.events.head + data.events.names.length + data.forces_watched + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
@@ -214,7 +222,9 @@ class Engine {
   /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
    *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
    *  whose shares would be a choice. */
-  measure(parameters, {ts, q, v, count, marks = null}, efforts = false, forces = false) {
+  measure(parameters, run, efforts = false, forces = false) {
+    if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
+    const {ts, q, v, count, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
     const wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
@@ -245,6 +255,22 @@ class Engine {
     return found;
   }
 
+  /** What `measure` returns of a run in which contacts come to rest: of each part by the engine that holds its contact. */
+  measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
+    const n = this.size, parts = [];
+    for (let from = 0, to = 0; from < count; from = to) {
+      while (to < count && held[to] === held[from]) to++;
+      const part = {ts: ts.subarray(from, to), q: q.subarray(from * n, to * n), v: v.subarray(from * n, to * n), count: to - from, marks};
+      const engine = held[from] ? this.held[held[from] - 1] : this;
+      if (held[from]) part.marks = engine.mark(parameters, {t: ts[from], q: part.q.subarray(0, n), v: part.v.subarray(0, n)});
+      parts.push(engine.measure(parameters, part, efforts, forces));
+    }
+    const joined = of => Float64Array.from(parts.flatMap(part => [...of(part)]));
+    return {kinetic: joined(p => p.kinetic), potential: joined(p => p.potential),
+      efforts: Object.fromEntries(Object.keys(parts[0].efforts).map(name => [name, joined(p => p.efforts[name])])),
+      forces: joined(p => (parts.every(({forces}) => forces.length) ? p.forces : []))};
+  }
+
   /** Forces x, y of each joint at the state that was evaluated last. */
   forces(work, {x0, psi_q}) {
     const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
@@ -256,5 +282,7 @@ class Engine {
 export async function loadEngine(data) {
   if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
   const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
-  return new Engine(data, Object.fromEntries(await Promise.all(loaded)));
+  const engine = new Engine(data, Object.fromEntries(await Promise.all(loaded)));
+  engine.held = Object.fromEntries(await Promise.all(Object.entries(data.held).map(async ([k, of]) => [k, await loadEngine(of)])));
+  return engine;
 }

@@ -13,12 +13,12 @@ function look(engine, numbers, settings, state, before) {
 }
 
 /** The velocities behind an impact of contact k by Newton's law, g_dot+ = -e g_dot-, and whether it is over with its rebounds; or
- *  `words` where more happens than that: several contacts at once, and contacts that are held at rest, are no programs of a page. */
-function hit(engine, numbers, settings, at, watch, k) {
+ *  `words` where more happens than that: several contacts that are hit at once are no program of a page. `held` is at rest. */
+function hit(engine, numbers, settings, at, watch, k, held) {
   const {events} = engine.data, {tolerances: tol} = events, {omega} = settings, {g, rate, rate2, scales, byQ, directions} = watch;
-  const along = (i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0), W = along(k, k), unit = j => scales[j] * omega;
-  const isHit = j => j !== k && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j] && rate[j] <= tol.zero_rate * unit(j)
-    && Math.abs(along(j, k)) > tol.coupled * Math.sqrt(along(j, j) * W);
+  const W = along(watch, k, k), unit = j => scales[j] * omega;
+  const isHit = j => j !== k && j !== held && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j]
+    && rate[j] <= tol.zero_rate * unit(j) && Math.abs(along(watch, j, k)) > tol.coupled * Math.sqrt(along(watch, j, j) * W);
   const other = events.names.findIndex((_, j) => isHit(j)), name = events.names[k];
   if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which is no program of a page yet`};
   const inverse = engine.inverseMasses(numbers);
@@ -26,20 +26,32 @@ function hit(engine, numbers, settings, at, watch, k) {
   const floor = tol.zero_rate * unit(k), isPressed = acceleration => acceleration < -tol.zero_rate_2 * unit(k) * omega;
   const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
   const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
-  const v = at.v.map((x, i) => x + impulse * directions[k][i]), hits = !isSlow && rate[k] < -floor;
+  const moved = size => at.v.map((x, i) => x + size * directions[k][i]), v = moved(impulse), hits = !isSlow && rate[k] < -floor;
   const stays = after <= Math.max(floor, tol.still * Math.abs(rate[k])) || (isSlow && rate[k] > 0);
-  return {v, hits, rests: stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k])};
+  const rests = stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k]);
+  return {v: rests ? moved(-rate[k] / W) : v, hits, rests};
 }
 
-/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. */
-export function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
-  const {data: {events, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], E = events.names.length;
-  const {zero} = events.tolerances, own = engine.conditionNumbers(numbers), isImpact = k => events.restitution[k] !== null;
-  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: [],
-    steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
-  let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0;
-  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; };
-  const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch}, marks: at.marks, ...more});
+/** How much a unit impulse along contact j changes the rate of contact i. */
+const along = ({byQ, directions}, i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0);
+
+/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. While a
+ *  contact is at rest, the engine that holds it runs; `numbersOf` an engine are its numbers. */
+export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, limit) {
+  const {data: {events, scales, drift_tol: driftTol}, size: n} = free, T = ts.length, end = ts[T - 1], E = events.names.length;
+  const {zero, zero_rate: zeroRate, zero_rate_2: zeroRate2} = events.tolerances, isImpact = k => events.restitution[k] !== null;
+  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0,
+    events: [], steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
+  let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0, pending = -1;
+  let held, engine, numbers, settings;
+  const use = k => {
+    held = k;
+    engine = k < 0 ? free : free.held[k];
+    numbers = numbersOf(engine);
+    settings = {...engine.data.settings, smallest, omega};
+  };
+  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.held[row] = held + 1; };
+  const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch, held}, marks: held < 0 ? at.marks : null, ...more});
   const note = index => found.events.push({t: at.t, index, q: at.q, v: at.v});
   const stop = words => {  // with the state there as the last output
     if (first < T && !(first && ts[first - 1] === at.t)) {
@@ -48,11 +60,22 @@ export function runWithEvents(engine, numbers, settings, state, ts, stops, limit
     }
     return finish(words, {stop: stops ? words : null, count: first});
   };
+  /** Goes on with a contact at rest, or with none. */
+  const rest = (k, v = at.v) => {
+    use(k);
+    at = {t: at.t, q: at.q, v};
+    const {sides} = watch;
+    watch = Object.assign(look(engine, numbers, settings, at, watch), {sides});
+  };
+  use(state.held ?? -1);
   if (!watch) {
     watch = look(engine, numbers, settings, at, null);
     const beyond = watch.sides.findIndex((side, k) => isImpact(k) && side < 0);
     if (beyond >= 0) return finish(`it begins beyond ${events.names[beyond]}`);
-    watch.sides = watch.sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
+    const {rate, rate2, scales: unit, sides} = watch, small = k => zeroRate * unit[k] * omega;
+    const falls = k => rate[k] < -small(k) || (Math.abs(rate[k]) <= small(k) && rate2[k] < -zeroRate2 * unit[k] * omega ** 2);
+    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // what is closed, and closes further
+    watch.sides = sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
   }
   for (;;) {
     while (first < T && ts[first] <= at.t) put(first++, at.q, at.v, violation);
@@ -63,29 +86,60 @@ export function runWithEvents(engine, numbers, settings, state, ts, stops, limit
       while (first < T) put(first++, at.q, at.v, violation);
       return finish("", {done: true, count: T});
     }
-    const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => zero * x);
-    const given = [...own, ...watch.sides, ...Array(E).fill(1), ...floors, ...events.directions, events.slowest];
-    const part = engine.piece(numbers, settings, at, times, limit - found.tried, given), [event, sure, worst] = part.crossing;
-    const before = [...part.crossing.subarray(events.head, events.head + E)];
-    found.steps += part.steps;
-    found.tried += part.tried;
-    for (let k = 1; k < part.count && times[k] <= sure; k++) {
-      put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
-      found.count = ++first;
+    let event = pending, before = watch.sides, part = null;
+    pending = -1;
+    if (event < 0) {
+      const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => zero * x), isHeld = held < 0 ? [] : [1];
+      const counts = before.map((_, k) => (k === held ? 0 : 1)), force = zero * scales.mass * scales.length * omega ** 2;
+      const given = [...engine.conditionNumbers(numbers), ...before, ...isHeld, ...counts, ...isHeld, ...floors, ...isHeld.map(() => force),
+        ...events.directions, ...isHeld.map(() => -1), events.slowest];
+      part = engine.piece(numbers, settings, at, times, limit - found.tried, given);
+      const [crossed, sure, worst] = part.crossing;
+      before = [...part.crossing.subarray(events.head, events.head + E)];
+      found.steps += part.steps;
+      found.tried += part.tried;
+      for (let k = 1; k < part.count && times[k] <= sure; k++) {
+        put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
+        found.count = ++first;
+      }
+      at = {t: sure, q: part.crossing.slice(-2 * n, -n), v: part.crossing.slice(-n), marks: part.marks};
+      violation = worst;
+      if (!(worst <= driftTol)) return finish("the loops do not stay closed");
+      event = crossed;
+      watch = look(engine, numbers, settings, at, watch);
     }
-    at = {t: sure, q: part.crossing.slice(-2 * n, -n), v: part.crossing.slice(-n), marks: part.marks};
-    violation = worst;
-    if (!(worst <= driftTol)) return finish("the loops do not stay closed");
-    watch = look(engine, numbers, settings, at, watch);
-    const jump = event >= 0 && isImpact(event) ? hit(engine, numbers, settings, at, watch, event) : null;
+    if (event === E) {  // the contact would have to pull
+      before[held] = 1;
+      note(E + held);
+      watch.sides = before;
+      rest(-1);
+      continue;
+    }
+    let lifted = -1;  // by the impact of another
+    if (event >= 0 && isImpact(event) && held >= 0) {
+      const bare = look(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
+      if (along(bare, held, event) > events.tolerances.coupled * Math.sqrt(along(bare, held, held) * along(bare, event, event))) {
+        lifted = held;
+        before[held] = 1;
+        rest(-1);
+      }
+    }
+    const jump = event >= 0 && isImpact(event) ? hit(engine, numbers, settings, at, watch, event, Math.max(held, lifted)) : null;
     if (jump?.words) return finish(jump.words);
     if (event >= 0 && (!jump || jump.hits || !jump.rests)) note(event);
+    if (lifted >= 0) note(E + lifted);
     if (jump) {
       at = {...at, v: jump.v};
       if (jump.rests) {
         note(2 * E + event);
         const words = `${events.names[event]} has come to rest`;
-        return events.ends_at_rest[event] ? stop(words) : finish(`${words}, and how it is held is no program of a page yet`);
+        if (events.ends_at_rest[event]) return stop(words);
+        if (!free.held[event]) return finish(`${words}, and how it is held is no program of a page`);
+        if (held >= 0) return finish(`${words} beside ${events.names[held]}, and how both are held is no program of a page yet`);
+        before[event] = 1;
+        watch.sides = before;
+        rest(event);
+        continue;
       }
       watch = look(engine, numbers, settings, at, watch);
     }
@@ -93,6 +147,7 @@ export function runWithEvents(engine, numbers, settings, state, ts, stops, limit
     // condition is beyond it, or that of a contact on the side where it was.
     watch.sides = watch.sides.map((side, k) => {
       if (k === event) return jump ? 1 : -before[k];
+      if (k === held) return 1;
       return Number.isNaN(side) || (side !== 0 && !(jump && events.by_velocity[k])) ? side : before[k];
     });
     if (event < 0) {

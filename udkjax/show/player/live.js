@@ -104,6 +104,7 @@ export class Live {
     const several = this.said.length > 1, words = this.said.map((said, k) => (several ? `${this.player.runs[k].label}: ` : "") + said.words);
     this.say(words.join("\n"), this.said.some(said => said.bad));
     if (this.isSolving) this.request = requestAnimationFrame(() => this.goOn());
+    else this.player.setEnd(this.end);  // of a motion that ends early, there
     this.player.draw();
   }
 

@@ -51,6 +51,7 @@ export class LiveRun {
     const {ts, q, v, measures, frame, reactions, forces, events} = this.first;
     this.drop();
     this.run.replace(ts, q, v, measures, frame, events);
+    this.run.held = null;
     this.showReactions(reactions, forces);
     this.follower.follow(this.engine.numbers(null));
     this.changed = false;
@@ -63,7 +64,7 @@ export class LiveRun {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
     if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
-    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), count: 0, events: []};
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
     this.follower.follow(engine.numbers(values));
     return "";
@@ -79,6 +80,7 @@ export class LiveRun {
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
+    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
     run.count = job.from = from + count;
     run.events.push(...part.events);
     job.steps += part.steps;
@@ -108,13 +110,14 @@ export class LiveRun {
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
     this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1, this.named(run.events));
+    this.run.held = run.held;
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
 
   /** Events as they are shown: {t, name}. */
   named(events) {
-    const names = this.engine.data.events?.names ?? [], nameOf = k => (k < names.length ? names[k] : `${names[k % names.length]} rests`);
+    const names = this.engine.data.events?.names ?? [], nameOf = k => names[k % names.length] + ["", " lets go", " rests"][Math.floor(k / names.length)];
     return events.map(({t, index}) => ({t, name: nameOf(index)}));
   }
 
@@ -189,20 +192,21 @@ export class LiveRun {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
     const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
     this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
-      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length)};
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length), held: Array.from({length: before}, (_, k) => this.run.held?.[k] ?? 0)};
     this.happened = this.run.events.filter(({t}) => t <= state.t);
     this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation, []);
   }
 
   /** Add one state to the record, and the events before it, and show it. */
-  append({t, q, v}, violation, events) {
+  append({t, q, v, held = -1}, violation, events) {
     const {past} = this;
     this.happened.push(...this.named(events));
     past.ts.push(t);
     past.q.push(...q);
     past.v.push(...v);
     past.violation.push(violation);
+    past.held.push(held + 1);
     this.showPast();
     this.player.setEnd(Math.max(t, this.player.data.end));
     this.player.t = t;
@@ -224,6 +228,7 @@ export class LiveRun {
       past.q.push(...run.q.subarray(k * n, (k + 1) * n));
       past.v.push(...run.v.subarray(k * n, (k + 1) * n));
       past.violation.push(run.violation[k]);
+      past.held.push(run.held?.[k] ?? 0);
     }
     this.happened.push(...this.named(run.events));
     this.showPast();

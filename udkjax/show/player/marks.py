@@ -9,6 +9,7 @@ mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How each kind is d
     outline   body, at, points              a cam's profile; its points are relative to `at`
     rail      body, at, axis, span, slot    the line of a prismatic joint or a slot, as far as it is used (m along `axis`)
     rack      body, at, axis, span          a rack's pitch line
+    floor     body, at, axis, span          the line of a contact, as far as it is hit; what is allowed lies to its left
     block     body, at, axis                what slides on a rail
     support   body, at                      what holds a pin to the ground
     pin       body, at, name                a revolute joint or the end of a rod
@@ -31,6 +32,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from udkjax.integrate.events.conditions import Gap
 from udkjax.scene import (
     GROUND,
     Cam,
@@ -63,13 +65,14 @@ ROD = 0.01  # of the inertia: how near to that of a uniform rod it must be for o
 MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
 
 
-def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) -> list[Mark]:
+def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None, gaps: Sequence[Gap] = ()) -> list[Mark]:
     """Return the marks of a mechanism, the farthest first.
 
     Args:
         mechanism: mechanism to draw.
         poses: all those that it will be drawn in.
         shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
+        gaps: conditions of contacts, whose lines are drawn.
 
     Raises:
         ValueError: `shapes` names what is no body.
@@ -78,6 +81,8 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None) 
     if unknown:
         raise ValueError(f"shapes: there is no body {unknown[0]!r}")
     drawing = _Drawing(mechanism, np.asarray(poses, float), shapes or {})
+    for gap in gaps:
+        drawing.add_floor(gap)
     links = drawing.links()
     plates = [mark for mark in links if mark.get("closed")]
     bars = [mark for mark in links if not mark.get("closed")]
@@ -231,6 +236,17 @@ class _Drawing:
             block = {"kind": "block", **self._at(two, joint.points[1]), "axis": axis - float(np.asarray(joint.angle))}
             self.elements.append(block)
             self.shaped.add(two)
+
+    def add_floor(self, gap: Gap) -> None:
+        """Add the line of a contact, from end to end of where its point comes near."""
+        (body, on), margin = gap.bodies, MARGIN * self.size
+        nx, ny = np.asarray(gap.normal, float)
+        axis = float(np.arctan2(-nx, ny))
+        way, turned = self._path(body, gap.point) - self._path(on, gap.through), axis + self._frames(on)[:, 2]
+        along, gaps = (way[:, 0] * np.cos(a) + way[:, 1] * np.sin(a) for a in (turned, turned + np.pi / 2))
+        near = along[gaps <= gaps.min() + margin]
+        span = [float(near.min()) - margin, float(near.max()) + margin]
+        self.rails.append({"kind": "floor", **self._at(on, gap.through), "axis": axis, "span": span})
 
     def _gear(self, joint: Gear) -> None:
         largest = int(np.argmax(np.asarray(joint.radii)))

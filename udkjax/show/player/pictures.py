@@ -16,6 +16,7 @@ DXF_LAYERS = {
     "roller": "joints",
     "weld": "joints",
     "rail": "ground",
+    "floor": "ground",
     "rack": "ground",
     "support": "ground",
 }  # others: by their kind

@@ -28,6 +28,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.equations import analyse
+from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
 from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
@@ -62,6 +63,7 @@ def run_record(
     with_reactions: bool,
     traces: Traces | None,
     shapes: Shapes | None = None,
+    gaps: Sequence[Gap] = (),
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return one run as plain data, and its poses; a run that failed is shown as far as it came."""
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -79,7 +81,7 @@ def run_record(
         "label": label,
         "note": failure_of(solution) or (getattr(solution, "cause", "") if count < len(ts) else ""),
         "bodies": list(mechanism.bodies),
-        "marks": marks(mechanism, poses, shapes),
+        "marks": marks(mechanism, poses, shapes, gaps),
         "traces": trace_anchors(mechanism, poses, traces, length),
         "time": pack(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
         "q": pack(poses.reshape(len(shown), -1), steps),
@@ -237,7 +239,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
         low, high = np.minimum(low, path.min(axis=0) - radius), np.maximum(high, path.max(axis=0) + radius)
 
     for mark in record["marks"]:
-        if mark["kind"] in ("rail", "rack"):
+        if mark["kind"] in ("rail", "rack", "floor"):
             direction = np.array([np.cos(mark["axis"]), np.sin(mark["axis"])])
             for s in mark["span"]:
                 hold(mark["body"], np.asarray(mark["at"]) + s * direction)

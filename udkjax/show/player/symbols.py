@@ -113,6 +113,12 @@ def _rail(mark: Mark, unit: float) -> Iterator[Symbol]:
         yield from _hatch(frame, np.arange(a + 5 * unit, b, 5 * unit), -9)
 
 
+def _floor(mark: Mark, unit: float) -> Iterator[Symbol]:
+    (a, b), frame = mark["span"], _at(mark, mark["axis"])
+    yield _line(frame, [(a, 0), (b, 0)], "soft" if mark["body"] < 0 else _edge(mark["body"]), 1.5)
+    yield from _hatch(frame, np.arange(a + 5 * unit, b, 5 * unit), 0)
+
+
 def _rack(mark: Mark, unit: float) -> Iterator[Symbol]:
     (a, b), body, frame = mark["span"], mark["body"], _at(mark, mark["axis"])
     teeth = [
@@ -225,5 +231,22 @@ def _force(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _head(frame, np.array([42.0, 0.0]), np.array([1.0, 0.0]))
 
 
-_PARTS = (_link, _disc, _wheel, _outline, _rail, _rack, _block, _support, _pin, _roller, _weld, _rod, _spring, _spiral, _piston)
+_PARTS = (
+    _link,
+    _disc,
+    _wheel,
+    _outline,
+    _rail,
+    _floor,
+    _rack,
+    _block,
+    _support,
+    _pin,
+    _roller,
+    _weld,
+    _rod,
+    _spring,
+    _spiral,
+    _piston,
+)
 SYMBOLS = {draw.__name__[1:]: draw for draw in (*_PARTS, _motor, _torque, _friction, _force)}
