@@ -51,32 +51,39 @@ def spring_rod():
     )
 
 
-def reduced(guess):
-    """Equilibrium and omega^2 of one coordinate, the crank's angle, in closed form: V' = 0 and V''/J."""
+def reduced_pose(s):
+    """Middles and angles of the bodies of `spring_four_bar` at the crank's angle s, and the length of its spring."""
     a, b, c = LENGTHS
+    end = a * jnp.stack([jnp.cos(s), jnp.sin(s)])
+    to = jnp.array([GROUND, 0.0]) - end
+    d2 = to @ to
+    x = (d2 + b**2 - c**2) / (2 * d2)
+    pin = end + x * to + jnp.sqrt(b**2 / d2 - x**2) * jnp.stack([-to[1], to[0]])
+    middles = jnp.stack([end / 2, (end + pin) / 2, (jnp.array([GROUND, 0.0]) + pin) / 2])
+    angles = jnp.stack([s, jnp.arctan2(pin[1] - end[1], pin[0] - end[0]), jnp.arctan2(pin[1], pin[0] - GROUND)])
+    return middles, angles, jnp.sqrt(d2)
 
-    def pose(s):
-        end = a * jnp.stack([jnp.cos(s), jnp.sin(s)])
-        to = jnp.array([GROUND, 0.0]) - end
-        d2 = to @ to
-        x = (d2 + b**2 - c**2) / (2 * d2)
-        pin = end + x * to + jnp.sqrt(b**2 / d2 - x**2) * jnp.stack([-to[1], to[0]])
-        middles = jnp.stack([end / 2, (end + pin) / 2, (jnp.array([GROUND, 0.0]) + pin) / 2])
-        angles = jnp.stack([s, jnp.arctan2(pin[1] - end[1], pin[0] - end[0]), jnp.arctan2(pin[1], pin[0] - GROUND)])
-        return middles, angles, jnp.sqrt(d2)
 
+@jax.jit
+def reduction(s):
+    """V' and V'' of one coordinate, the crank's angle, and its inertia J."""
     m = jnp.array(LENGTHS)
 
     def V(s):
-        middles, _, d = pose(s)
+        middles, _, d = reduced_pose(s)
         return 9.81 * m @ middles[:, 1] + STIFFNESS * (d - FREE_LENGTH) ** 2 / 2
 
-    s, slope, bend = guess, jax.jit(jax.grad(V)), jax.jit(jax.hessian(V))
+    middles, angles, _ = jax.jacfwd(reduced_pose)(s)
+    return jax.grad(V)(s), jax.hessian(V)(s), m @ jnp.sum(middles**2, 1) + (m**3 / 12) @ angles**2
+
+
+def reduced(s):
+    """Equilibrium and omega^2 = V''/J in closed form, where V' = 0."""
     for _ in range(20):
-        s = s - slope(s) / bend(s)
-    middles, angles, _ = jax.jit(jax.jacfwd(pose))(s)
-    J = m @ jnp.sum(middles**2, 1) + (m**3 / 12) @ angles**2
-    return float(s), float(bend(s) / J)
+        slope, bend, _ = reduction(s)
+        s = s - slope / bend
+    _, bend, J = reduction(s)
+    return float(s), float(bend / J)
 
 
 def test_a_four_bar_with_a_diagonal_spring_against_its_reduction():
@@ -135,9 +142,9 @@ def test_a_scene_without_a_degree_of_freedom_rests_where_its_drivers_hold_it():
 
 
 def test_equilibria_from_many_starts():
-    """Both assembly branches of the four-bar, each with its equilibria: the reduction finds those of the first."""
+    """On one assembly branch the reduction finds them, too."""
     mech = spring_four_bar()
-    found = udk.equilibria(mech, starts=40)
+    found = udk.equilibria(mech, starts=6, seed=1)
     assert bool(found[0].stable)
     upper = [e for e in found if np.sin(float(e.q[1, 2] - e.q[2, 2])) < 0]
     for e in upper:
@@ -184,20 +191,6 @@ def test_modes_of_a_double_pendulum():
     assert np.all(np.asarray(found.omega2) > 0)
 
 
-@pytest.mark.slow
-def test_a_redundant_lift_on_a_spring():
-    def lift(stiffness):
-        mech = udk.library.scissor_lift(2)
-        spring = udk.Spring(("ground", "platform"), [(0.5, 0.0), (0.0, 0.0)], stiffness, 1.2)
-        return udk.Mechanism(dict(mech.bodies), dict(mech.joints), {}, [spring], mech.gravity)
-
-    rest = udk.equilibrium(lift(500.0))
-    # V(h) = k (h - 1.2)^2 / 2 + (5 + 4/2) g h with bars of 1 kg each whose middles rise by h/4 and 3h/4.
-    h = 1.2 - 7.0 * 9.81 / 500.0
-    assert bool(rest.stable)
-    assert abs(float(rest.q[4, 1]) - h) < 1e-11
-
-
 VIBRATING = {"rod": (spring_rod, "rod", 0.0), "four-bar": (spring_four_bar, "coupler", GROUND)}
 
 
@@ -214,10 +207,9 @@ def test_frequencies_have_exact_derivatives(name):
         return jnp.stack([found.frequencies[0], found.s[1].imag])
 
     x, h = jnp.array([STIFFNESS, 2.5, place]), 1e-5
-    both = jax.jit(jax.jacfwd(lambda x: (frequency(x),) * 2, has_aux=True))  # derivatives and values
-    exact, _ = both(x)
-    differences = np.stack([(both(x + h * d)[1] - both(x - h * d)[1]) / (2 * h) for d in np.eye(3)], 1)
-    np.testing.assert_allclose(exact, differences, rtol=1e-6, atol=1e-8)
+    both = jax.jit(lambda x, d: jax.jvp(frequency, (x,), (d,)))
+    for d in np.eye(3):
+        np.testing.assert_allclose(both(x, d)[1], (both(x + h * d, d)[0] - both(x - h * d, d)[0]) / (2 * h), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow
