@@ -53,18 +53,15 @@ def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
         assert udk.analyse(changed).redundant_rows == udk.analyse(mechanism).redundant_rows
 
 
-def test_a_traced_mechanism_has_the_analysis_of_the_known_one_that_it_was_made_from():
-    mechanism, seen = udk.library.parallelogram(), []
-
-    @jax.jit
-    def trace(mass, whole):
-        seen.append(udk.analyse(mechanism.with_parameters({"body.coupler.mass": mass})))
-        seen.append(udk.analyse(whole))
-        return mass
-
-    trace(1.5, mechanism)
-    assert seen[0] is udk.analyse(mechanism)
-    assert seen[1].redundant_rows is None and seen[1].rank is None and seen[1].row_names == seen[0].row_names
+def test_a_traced_mechanism_has_the_rows_of_the_known_one_that_it_was_made_from_and_scales_of_its_own():
+    mechanism = udk.library.parallelogram()
+    heavy = lambda mass: mechanism.with_parameters({"body.coupler.mass": mass, "body.coupler.inertia": mass})  # noqa: E731
+    made, whole = jax.jit(lambda mass, whole: (udk.analyse(heavy(mass)), udk.analyse(whole)))(90.0, mechanism)
+    assert made.redundant_rows == udk.analyse(mechanism).redundant_rows
+    for x, y in zip(made.scales, udk.analyse(heavy(90.0)).scales, strict=True):
+        assert_allclose(x, y, rtol=1e-14)
+    assert float(made.mass) == 90.0
+    assert whole.redundant_rows is None and whole.rank is None and whole.row_names == made.row_names
 
 
 def test_a_mechanism_made_while_something_is_traced():

@@ -12,6 +12,7 @@ L, or a turn of one radian, changes in it.
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from threading import Lock
 from typing import Generic, TypeVar
 
@@ -108,9 +109,9 @@ def analyse(mechanism: Mechanism) -> Analysis:
     """Find the rank, the redundant rows and the scales of a mechanism; results are cached by structure and numbers.
 
     Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
-    the known one that it was made from by `with_parameters`: a run watches the rows that are left out, and says so where
-    numbers made one of them independent. A mechanism whose geometry is traced as an argument of a function under `jit` has no
-    origin: its redundant rows are not known here, and a run finds them when it begins.
+    the known one that it was made from by `with_parameters`, and the scales of its own numbers: a run watches the rows that are
+    left out, and says so where numbers made one of them independent. A mechanism whose geometry is traced as an argument of a
+    function under `jit` has no origin: its redundant rows are not known here, and a run finds them when it begins.
 
     Args:
         mechanism: The scene; its numbers may be traced.
@@ -120,7 +121,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:
-            return analyse(mechanism.origin.mechanism)
+            return replace(analyse(mechanism.origin.mechanism), scales=traced_scales(mechanism))
         mechanism = mechanism.without_origin
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
         return Analysis(traced_scales(mechanism), count, names, _rows_of_known_geometry(mechanism))

@@ -4,7 +4,7 @@ See analysis.py for what they mean. They are computed alike by NumPy, where all 
 """
 
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -106,12 +106,20 @@ def _guess_terms(mechanism: Mechanism, q: NumericArray, v: NumericArray, xp: Arr
     arrays = SceneArrays(programs, xp.asarray(numbers_as_vector(mechanism.numbers)), xp)
     _, rate, psi_q = arrays.geometry(0.0, q, 0 * v)
     free, b = arrays.loads(0.0, q, v)
-    gamma = (
-        np.bincount(row, psi_q * free[column], programs.row_count)
-        if xp is np
-        else jnp.zeros(programs.row_count).at[row].add(psi_q * free[column])
-    )
-    return GuessTerms(row, column, psi_q, free, rate, b + gamma)
+    moved = xp.sum(_grouped(psi_q * free[column], np.asarray(row), programs.row_count, xp), 1)
+    return GuessTerms(row, column, psi_q, free, rate, b + moved)
+
+
+def _grouped(values: Any, group: np.ndarray, count: int, xp: ArrayLibrary) -> Any:
+    """Return values by the groups that they are in, (groups, most of one), with zeros in the places that are left over.
+
+    A sum over them is a few operations that XLA fuses, where adding to the places of an array is a loop.
+    """
+    size = np.bincount(group, minlength=count)
+    order = np.argsort(group, kind="stable")
+    place = np.full((count, int(size.max(initial=0))), len(group))
+    place[group[order], np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)] = order
+    return xp.append(values, 0.0)[place]
 
 
 def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
@@ -129,13 +137,9 @@ def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales
     pair, of_entry = np.unique(rows * len(mass) + columns // 3, return_inverse=True)  # of a row and a body
     turns = columns % 3 == 2
 
-    def sum_by_pair(values: NumericArray) -> NumericArray:
-        if xp is np:
-            return np.bincount(of_entry, values, len(pair))
-        return jnp.zeros(len(pair)).at[of_entry].add(values)
-
-    moved = xp.sqrt(sum_by_pair(xp.where(turns, 0.0, psi_q**2)))
-    turned = sum_by_pair(xp.where(turns, xp.abs(psi_q), 0.0))
+    of_pair = _grouped(psi_q, of_entry, len(pair), xp), _grouped(turns, of_entry, len(pair), np) > 0
+    moved = xp.sqrt(xp.sum(xp.where(of_pair[1], 0.0, of_pair[0] ** 2), 1))
+    turned = xp.sum(xp.where(of_pair[1], xp.abs(of_pair[0]), 0.0), 1)
     if len(pair):
         by_place = moved > ROUNDING * xp.max(moved)
         arm = xp.where(by_place, turned / xp.where(by_place, moved, 1.0), 0.0)
@@ -143,12 +147,8 @@ def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales
         arm = xp.where(arm > ROUNDING * length, arm, length)
         length = xp.maximum(length, arm)
     change = xp.maximum(moved * length, turned)
-    row, count = pair // len(mass), len(psi_t)
-    if xp is np:
-        scale = np.zeros(count)
-        np.maximum.at(scale, row, change)
-    else:
-        scale = jnp.zeros(count).at[row].max(change)
+    row = pair // len(mass)
+    scale = xp.max(_grouped(change, row, len(psi_t), xp), 1, initial=0.0)
     scale = xp.where(xp.isfinite(scale), scale, 0.0)
     moves = scale > ROUNDING * xp.max(scale, initial=0.0)
     scale = xp.where(moves, scale, length)  # a row that nothing moves here: as if in metres

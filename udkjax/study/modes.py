@@ -71,9 +71,12 @@ class Modes(PrintsTable):
 def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, analysis: Analysis | None = None) -> Modes:
     """Return the modes about a position of rest: (s^2 N^T M N + s N^T C N + N^T K N) eta = 0, shape = N eta.
 
-    C = -F_v and K = -F_q + (lambda^T Psi)_qq: preload, gravity and the constraints' curvature are in it. Pure, jittable and
-    batched by `vmap`; eigenvalues and `shapes` have exact derivatives by every number of the mechanism, where they are simple
-    (those of `equilibrium` carry on how the position changes); `damped_shapes` have none.
+    C = -F_v and K = -F_q + (lambda^T Psi)_qq: preload, gravity and the constraints' curvature are in it. K is symmetric where
+    loads have a potential. One that turns with a body has none: `s` and `damped_shapes` are of all of K, also where it flutters,
+    `omega2` and `shapes` of the symmetric part alone.
+
+    Pure, jittable and batched by `vmap`; eigenvalues and `shapes` have exact derivatives by every number of the mechanism, where
+    they are simple (those of `equilibrium` carry on how the position changes); `damped_shapes` have none.
 
     Args:
         mechanism: its drivers hold the values of time t.
