@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import udkjax as udk
+from udkjax.integrate.events.conditions import Gap
 from udkjax.show.player import films
 from udkjax.show.player.marks import marks
 from udkjax.show.player.page import module
@@ -134,7 +135,7 @@ def test_every_kind_of_mark_is_drawn(tmp_path):
             udk.Torque(("ground", "pinion"), udk.Held([-1.0, 1.0], 0.1)),
         ],
     )
-    every = marks(mech, mech.q0[None])
+    every = marks(mech, mech.q0[None], gaps=[Gap(("free", "ground"), np.zeros(2), np.zeros(2), np.array([0.0, 1.0]))])
     found = {mark["kind"] for mark in every}
     assert found == SYMBOLS.keys()
     view = view_of((-1, -1, 4, 2), 600)
