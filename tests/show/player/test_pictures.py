@@ -135,7 +135,9 @@ def test_every_kind_of_mark_is_drawn(tmp_path):
             udk.Torque(("ground", "pinion"), udk.Held([-1.0, 1.0], 0.1)),
         ],
     )
-    every = marks(mech, mech.q0[None], gaps=[Gap(("free", "ground"), np.zeros(2), np.zeros(2), np.array([0.0, 1.0]))])
+    (contact,) = udk.Contact("free").expand(mech)
+    assert isinstance(contact.condition, Gap)
+    every = marks(mech, mech.q0[None], gaps=[contact.condition])
     found = {mark["kind"] for mark in every}
     assert found == SYMBOLS.keys()
     view = view_of((-1, -1, 4, 2), 600)
