@@ -8,6 +8,7 @@ the smallest change that removes the linearized residual; s limits the length of
 and is halved until the residual falls: no step makes a state worse. Velocities by v - M^(-1/2) D^+ Psi_dot, which leaves the free
 motion of the guess as it is and satisfies the drivers. D^+ is truncated, so redundant rows do no harm, and its derivative is the
 one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
+They take the characteristic length as fixed: from a guess so far away that steps are limited, it has a share in where they lead.
 """
 
 from collections.abc import Iterator, Sequence
