@@ -18,8 +18,10 @@ CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 # XLA compiles in less than half of the time what it does not optimize; no test is about how fast that runs.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 import udkjax as udk
+from tests.quick_code import optimize
 from udkjax.native import code_cache, primitive
 
+optimize(False)  # but in tests/native
 if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other
     jax.config.update("jax_compilation_cache_dir", f"{folder}/jax")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -107,25 +107,14 @@ def test_reactions_of_minimum_norm(linkage, placed, data, case):
 
 
 def test_multipliers_are_those_reactions_for_every_method(moved, data):
-    """lambda of a pin acts on the link, body 2, as -lambda, with M a + Psi_q^T lambda = F."""
+    """lambda of a pin acts on the link, body 2, as -lambda, with M a + Psi_q^T lambda = F; none of it is self-stress."""
     known = reference(data, "rest_-50deg")
-    *_, multipliers = moved[1]["known"]
+    theta, _, a, multipliers = moved[1]["known"]
+    assert a.shape[1:] == (4, 3)
     expected = np.concatenate([known["ground_joint_force_on_link"]] * 3 + [known["coupler_joint_force_on_link"]] * 3, 1)
     assert_allclose(-multipliers, expected, atol=1e-11)
-
-
-def test_accelerations_give_multipliers_when_asked(linkage, placed, data):
-    q, v = placed(np.deg2rad(-50), 0.0)
-    a, multipliers = udk.accelerations(linkage, 0.0, q, v, multipliers=True)
-    assert a.shape == (4, 3) and multipliers.shape == (12,)
-    assert_allclose(-multipliers[:2], reference(data, "rest_-50deg")["ground_joint_force_on_link"][0], atol=1e-11)
-    assert_allclose(multipliers @ data_null(np.deg2rad(-50)), 0.0, atol=1e-12)
-
-
-def data_null(theta):
-    """The state of self-stress of the linkage: what a multiplier of minimum norm has none of."""
-    axial = np.outer([1, -2, 1], [np.cos(theta), np.sin(theta)]).ravel()
-    return np.concatenate([axial, -axial]) / np.sqrt(12)
+    axial = np.stack([f * e for f in (1, -2, 1) for e in (np.cos(theta), np.sin(theta))], 1) / np.sqrt(12)
+    assert_allclose(np.sum(multipliers * np.hstack([axial, -axial]), 1), 0.0, atol=1e-12)
 
 
 # --- principles
@@ -215,7 +204,7 @@ def nearby(mechanisms):
     return states
 
 
-@pytest.mark.parametrize("name", fast(["parallelogram", "slider_crank"], ["parallelogram", "scissor_lift", "slider_crank"]))
+@pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
 def test_projection_is_the_smallest_change(nearby, name):
     mech, qs, vs = nearby(name)
     equations, t = prepare(mech), jnp.array(0.0)
@@ -234,21 +223,14 @@ def test_projection_is_the_smallest_change(nearby, name):
         assert_allclose(vt[np.sum(sigma > 1e-6) :] @ (mass * moved), 0.0, atol=1e-11)
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        pytest.param("parallelogram", udk.Auto(), id="parallelogram-Auto"),
-        pytest.param("slider_crank", udk.SVD(), id="slider_crank-SVD", marks=pytest.mark.slow),
-    ],
-)
-def test_the_tangential_part_is_what_projection_leaves(mechanisms, nearby, method, name):
+def test_the_tangential_part_is_what_projection_leaves(nearby):
     """Of small changes of a closed state; against the projection itself, which is linear in velocities."""
-    mech, (q, *_), (v, *_) = nearby(name)
+    mech, (q, *_), (v, *_) = nearby("parallelogram")
     dq, dv = 1e-7 * np.random.default_rng(3).standard_normal((2, len(q)))
 
     @eqx.filter_jit
     def parts(mech, q, v, dq, dv):
-        equations, t = prepare(mech, method), 0.0
+        equations, t = prepare(mech), 0.0
         q, v = equations.project(t, *equations.project(t, q, v))
         left = equations.tangent_part(t, q, v, dq, dv)
         moved = equations.project(t, q + dq, v)[0] - q, equations.project(t, q, v + 1e7 * dv)[1] - v
@@ -297,9 +279,8 @@ def changed(mechanism, length):
     return mechanism.with_parameters({"joint.A3.points[1][0]": -0.5 * length, "joint.B3.points[1][0]": 0.5 * length})
 
 
-@pytest.mark.parametrize("length", [1.2, 1.4])
-def test_rows_left_out_that_become_independent_count_again(linkage, length):
-    mech = changed(linkage, length)
+def test_rows_left_out_that_become_independent_count_again(linkage):
+    mech = changed(linkage, 1.2)
     other = udk.analyse(linkage)
     assert other.redundant_rows and not udk.analyse(mech).redundant_rows
     state = udk.assemble(mech)
@@ -341,14 +322,13 @@ def test_a_mechanism_made_of_traced_numbers():
 # --- derivatives
 
 
-@pytest.mark.parametrize("name", fast(["SVD"], ["Auto", "SVD", "Elimination"]))  # Auto: tests/integrate/test_gradients.py
-def test_derivatives_of_accelerations(linkage, placed, name):
+def test_derivatives_of_accelerations(linkage, placed):
     """d(theta'')/d(theta), with respect to a mass that the exact equation knows, and second derivatives."""
 
     def angular(theta, mass):
         mech = linkage.with_parameters({"body.coupler.mass": mass})
         q, v = placed(theta, 1.3)
-        return udk.accelerations(mech, 0.0, q, v, METHODS[name])[1, 2]
+        return udk.accelerations(mech, 0.0, q, v, udk.SVD())[1, 2]
 
     def exact(theta, mass):
         return -(1.5 + mass) * 9.81 * jnp.cos(theta) / (1.05 + mass)

@@ -36,12 +36,9 @@ def copied(mech, seed, copies=3):
 FAST = ("scissor lift", "linkage, copied")
 REDUNDANT = {
     "linkage": lambda: udk.library.parallelogram(),
-    "linkage in line": lambda: udk.library.parallelogram(0.0),
     "scissor lift": lambda: udk.library.scissor_lift(),
-    "planetary gear": lambda: udk.library.planetary_gear(),
     "linkage, copied": lambda: copied(udk.library.parallelogram(), 0),
     "gear, copied": lambda: copied(udk.library.planetary_gear(3), 3),
-    "pendulum, copied": lambda: copied(udk.library.double_pendulum(), 4),
 }
 
 

@@ -6,24 +6,20 @@ import numpy as np
 import pytest
 from jax import lax
 
+from tests.expressions.test_read import FUNCTIONS as READ
 from udkjax.expressions import Differential, Graph, ScalarProgram, cotangents, tangents, trace
 from udkjax.expressions.differential import common_factors
 
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
 FUNCTIONS = {
-    "arithmetic": lambda x, y: (x[0] - y[0]) / (1.0 + x[1] ** 2) - (y[1] - x[0]) * -x[2] / y,
+    "quotients": lambda x, y: (x[0] - y[0]) / (1.0 + x[1] ** 2) - (y[1] - x[0]) * -x[2] / y,
     "powers": lambda x, y: jnp.stack([x[0] ** 3, y[0] ** -2, x[1] ** 0, jnp.square(x[1]), jnp.abs(y[2]) ** 1.5]),
-    "roots": lambda x, y: jnp.sqrt(1.0 + x * x) / lax.rsqrt(1.0 + y * y) + jnp.cbrt(y),
-    "trigonometry": lambda x, y: jnp.sin(x) * jnp.cos(y) + jnp.arctan2(x, y) + jnp.tanh(x - y),
     "choice": lambda x, y: jnp.where(x > y, x * y, jnp.abs(x) - y) + jnp.clip(x, -0.5, 0.5) + jnp.maximum(x, y),
-    "constants": lambda x, y: jnp.ones(2) * 3.0,
-    # with opaque nodes, one behind the other
     "branch": lambda x, y: lax.cond(x[0] > 0, lambda a, b: a * b, lambda a, b: a + b, jnp.sin(x), y) * x,
     "loop": lambda x, y: lax.scan(lambda c, a: (c * a + 1.0, c - a), y[0] * y[1], jnp.sort(x)),
     "indices": lambda x, y: x[jnp.where(y > 0, 2, 1)] * jnp.interp(x[0], jnp.array([-2.0, 0.0, 3.0]), y),
-    "system": lambda x, y: jnp.linalg.solve(jnp.diag(2.0 + x * x) + 0.1 * jnp.outer(x, y), y),
-    "scatter": lambda x, y: x.at[1].set(y[0]).at[jnp.array([0, 2])].add(y[1]),
-}  # fmt: skip
+    **{name: READ[name] for name in ("roots", "trigonometry", "no argument at all", "linear system", "scatter")},
+}
 
 
 @pytest.fixture(params=FUNCTIONS)

@@ -171,7 +171,7 @@ def size(tree: Any) -> int:
     return (3 if tree[0] == "root" else 1) + sum(map(size, tree[1:]))
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(_trees, st.lists(st.floats(-3, 3), min_size=3, max_size=3))
 def test_simplified_expressions_have_the_same_value(tree, values):
     with np.errstate(all="ignore"):
@@ -190,7 +190,7 @@ def test_simplified_expressions_have_the_same_value(tree, values):
     assert found == pytest.approx(float(expected), rel=1e-9, abs=1e-9)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(_trees, _trees, st.lists(st.floats(-3, 3), min_size=3, max_size=3))
 def test_an_input_can_be_replaced_by_an_expression(tree, another, values):
     """As if the expression had been built of it."""

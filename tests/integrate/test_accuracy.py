@@ -204,7 +204,7 @@ def test_small_gains_hold_it(unstable, gain):
 # --- the IFToMM benchmark A02, which crosses twice a turn
 
 
-@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_n_four_bar(data, table, n):
     known = data("iftomm_A02_n_four_bar")["cases"][f"N={n}"]
     ts, row = table({"0": {"B0x": 0, "B0y": 1, "B0vx": 1, "B0vy": 0}, **known["reference"]}, (0, 0.5, 1, 2, 4, 5, 10))
@@ -276,45 +276,3 @@ def test_slider_crank(data, table):
     assert_allclose(loads["guide"]["slider"][:, 1], row["guide_N"], atol=1e-9)
     assert_allclose(loads["P"]["rod"][:, :2], np.stack([row["Px_on_rod"], row["Py_on_rod"]], 1), atol=1e-9)
     assert_allclose(loads["O"]["crank"][:, :2], np.stack([row["Ox"], row["Oy"]], 1), atol=1e-9)
-
-
-# --- derivatives of a trajectory
-
-
-PARAMETERS = ("theta0", "g", "I_link")
-
-
-def angle_over(linkage, placed, ts, adjoint):
-    def angle(p):
-        inertias = {f"body.link{k}.inertia": p[2] for k in "123"}
-        mech = linkage.with_parameters({"gravity": jnp.stack([0.0, -p[1]]), **inertias})
-        sol = udk.simulate(mech, ts, udk.State(*placed(p[0], 0.0)), rtol=1e-10, atol=1e-10, adjoint=adjoint)
-        return jnp.stack([sol.q[1:, 0, 2], sol.v[1:, 0, 2]], 1)
-
-    return angle
-
-
-def sensitivities(data, table):
-    ts, row = table(data("seed_fivebar_parallelogram")["sensitivities_rest_minus50"])
-    expected = np.array([[row[f"d{x}_d{p}"] for p in PARAMETERS] for x in ("theta", "thetad")])
-    return np.append(0.0, ts), np.moveaxis(expected, -1, 0)
-
-
-AT = jnp.array([np.deg2rad(-50), 9.81, 0.1])
-
-
-@pytest.mark.slow
-def test_sensitivities_by_forward_mode(linkage, placed, data, table):
-    """Of a redundant mechanism, with respect to its start, gravity and three tied inertias."""
-    from diffrax import ForwardMode
-
-    ts, expected = sensitivities(data, table)
-    slopes = jax.jit(jax.jacfwd(angle_over(linkage, placed, ts, ForwardMode())))(AT)
-    assert_allclose(slopes, expected, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_sensitivities_by_reverse_mode(linkage, placed, data, table):
-    ts, expected = sensitivities(data, table)
-    slopes = jax.jit(jax.jacrev(angle_over(linkage, placed, ts, None)))(AT)
-    assert_allclose(slopes, expected, atol=1e-6)

@@ -7,15 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations.written_out import WrittenOut
 from udkjax.native import primitive, runs
-from udkjax.study.accuracy import exact_coordinates
 
 TS = np.linspace(0.0, 2.0, 21)
-SOLVERS = {s.__name__: s() for s in (diffrax.Dopri8, diffrax.Tsit5, diffrax.Dopri5, diffrax.Bosh3, udk.Verner65)}
 MEMBERS = 70  # no multiple of what a vector holds
 
 
@@ -40,22 +38,8 @@ def members(size):
     return 0.05 + 0.1 * along, -1.0 + 2.0 * along, 10.0 ** (-5 - 4 * along)
 
 
-@pytest.fixture(scope="module")
-def in_lanes(pendulum):
-    return jax.jit(jax.vmap(last(pendulum)))
-
-
-@pytest.fixture(scope="module")
-def batch(in_lanes):
-    return in_lanes(*members(MEMBERS))
-
-
-@pytest.fixture(scope="module")
-def alone(pendulum):
-    return jax.jit(last(pendulum))
-
-
-def test_members_are_what_they_are_alone(batch, alone):
+def test_members_are_what_they_are_alone(pendulum):
+    alone, batch = jax.jit(last(pendulum)), jax.jit(jax.vmap(last(pendulum)))(*members(MEMBERS))
     for k in (0, 1, 33, MEMBERS - 1):
         one = alone(*(x[k] for x in members(MEMBERS)))
         assert_allclose(batch.q[k], one.q, rtol=0, atol=1e-12)
@@ -63,23 +47,6 @@ def test_members_are_what_they_are_alone(batch, alone):
         assert {name: int(x[k]) for name, x in batch.stats.items()} == {name: int(x) for name, x in one.stats.items()}
     assert np.all(np.asarray(batch.result) == udk.Result.successful)
     assert len(np.unique(np.asarray(batch.stats["steps"]))) > 5  # each takes steps of its own
-
-
-def test_no_member_depends_on_those_beside_it(batch, in_lanes):
-    """To the last bit: in another order each has another chunk and another lane."""
-    order = np.random.default_rng(0).permutation(MEMBERS)
-    found = in_lanes(*(x[order] for x in members(MEMBERS)))
-    assert_array_equal(found.q, batch.q[order])
-    assert_array_equal(found.v, batch.v[order])
-
-
-@pytest.mark.slow
-def test_a_batch_of_batches(pendulum, batch):
-    run = jax.vmap(jax.vmap(last(pendulum), (0, 0, None)), (0, 0, 0))
-    inertia, rate, tol = (x[:4].reshape(2, 2) for x in members(MEMBERS))
-    found = jax.jit(run)(inertia, rate, tol[:, 0])
-    assert_allclose(found.q[0, 0], batch.q[0], rtol=0, atol=1e-12)
-    assert found.q.shape == (2, 2, len(TS), 1, 3)
 
 
 def test_outputs_of_a_batch_are_kept_once(pendulum):
@@ -93,29 +60,11 @@ def test_outputs_of_a_batch_are_kept_once(pendulum):
     assert memory.temp_size_in_bytes < 1.5 * memory.output_size_in_bytes
 
 
-def test_a_member_that_fails_is_data(pendulum):
-    name = pendulum.body_names[0]
-
-    def run(mass, steps):
-        choices = {"rtol": 1e-9, "atol": 1e-9, "throw": False, "max_steps": steps}
-        return udk.simulate(pendulum.with_parameters({f"body.{name}.mass": mass}), TS, **choices)
-
-    by_mass = jax.jit(jax.vmap(run, (0, None)))
-    found = by_mass(jnp.array([1.0, np.nan, 2.0]), 100_000)
-    assert [int(c) for c in found.result] == [0, int(udk.Result.invalid_argument), 0]
-    assert np.all(np.isfinite(found.q[0])) and np.all(np.isnan(found.q[1, 1:]))
-    short = by_mass(jnp.array([1.0, 2.0, 3.0]), 12)
-    assert [int(c) for c in short.result] == [udk.Result.step_limit] * 3
-    assert int(short.stats["steps"][0]) == 12
-
-
-@pytest.mark.parametrize(
-    "solver", [SOLVERS["Tsit5"], *(pytest.param(s, marks=pytest.mark.slow) for n, s in SOLVERS.items() if n != "Tsit5")]
-)
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), pytest.param(udk.Verner65(), marks=pytest.mark.slow)], ids=str)
 def test_the_same_motion_as_by_diffrax(pendulum, solver):
     ours = udk.simulate(pendulum, TS, solver=solver)
     theirs = udk.simulate(pendulum, TS, solver=solver, adjoint=diffrax.DirectAdjoint(), max_steps=4096)
-    assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=2e-6 if isinstance(solver, diffrax.Bosh3) else 2e-7)
+    assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=2e-7)
     steps = int(theirs.stats["steps"])
     assert abs(int(ours.stats["steps"]) - steps) <= 2 + 0.1 * steps  # the same step size control, but that ours foresees failures
     assert int(ours.stats["right_hand_sides"]) <= int(theirs.stats["right_hand_sides"]) + 30
@@ -130,37 +79,6 @@ def test_outputs_are_as_exact_as_steps(pendulum):
     rates = np.abs(np.asarray(coarse.v - exact.v)).max(axis=(1, 2))
     assert int(coarse.stats["accepted"]) < 60
     assert error.max() < 1e-9 and rates.max() < 1e-8
-
-
-@pytest.mark.slow
-def test_forward_derivatives_in_lanes(pendulum, batch):
-    inertia, rate, _ = members(MEMBERS)
-    run = last(pendulum, adjoint=diffrax.ForwardMode())
-
-    def ends(shift):
-        return jax.vmap(run)(inertia[:10] + shift, rate[:10], np.full(10, 1e-10)).q[:, -1, 0, 2]
-
-    slope = jax.jit(jax.jacfwd(ends))(0.0)
-    change = 1e-5
-    by_differences = (ends(change) - ends(-change)) / (2 * change)
-    assert_allclose(slope, by_differences, rtol=0, atol=2e-5 * np.abs(by_differences).max())
-    single = jax.jacfwd(lambda x: run(x, rate[3], 1e-10).q[-1, 0, 2])(inertia[3])
-    assert_allclose(slope[3], single, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_no_start_is_lost_at_singular_configurations():
-    """128 starts that cross: all of them against the exact solution."""
-    angles = np.deg2rad(np.concatenate([np.linspace(55, 65, 64), np.linspace(-5, 5, 64)]))
-    ts = np.linspace(0.0, 10.0, 101)
-    scenes = [udk.library.parallelogram(angle) for angle in angles]
-    q0 = np.stack([np.asarray(udk.assemble(s).q) for s in scenes])
-    run = jax.jit(jax.vmap(lambda q: udk.simulate(scenes[0], ts, udk.State(q, 0 * q), throw=False)))
-    found = run(q0)
-    assert np.all(np.asarray(found.result) == udk.Result.successful)
-    for k, scene in enumerate(scenes):
-        exact = exact_coordinates(scene, ts, scene.q0, scene.v0)
-        assert np.abs(np.reshape(found.q[k], (len(ts), -1)) - np.reshape(exact, (len(ts), -1))).max() < 1e-5
 
 
 def test_one_direction_for_all_members(pendulum):

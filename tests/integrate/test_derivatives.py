@@ -120,19 +120,6 @@ def test_second_derivatives(f, second, slopes):
     assert_allclose(found, found.T, rtol=1e-8)
 
 
-@pytest.mark.slow
-@BOTH
-def test_batches_of_derivatives(f, slopes):
-    """Mapped, and of what is mapped, forward and reverse."""
-    xs = AT[f] + jnp.array([[0.0, 0.0], [0.1, 0.2], [-0.1, 0.1]])
-    one_by_one = np.stack([slopes[f](x) for x in xs])
-    for mode in (jax.jacfwd, jax.grad):
-        assert_allclose(jax.jit(jax.vmap(mode(f)))(xs), one_by_one, rtol=1e-7)
-    total = lambda xs: jnp.sum(jax.vmap(f)(xs))  # noqa: E731
-    for mode in (jax.jacfwd, jax.grad):
-        assert_allclose(jax.jit(mode(total))(xs), one_by_one, rtol=1e-7)
-
-
 def test_a_number_that_a_batch_shares():
     """The gradient of a sum over a batch, and of a batch of batches, is the sum of the gradients."""
     mechanism, rates = udk.library.compound_pendulum(), jnp.linspace(-1.0, 1.0, 4)
@@ -202,7 +189,11 @@ def test_second_derivatives_of_assembly_by_machine_code(opening):
     assert_allclose(found, differences(slope, x, 1e-3), rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("stabilization", [None, udk.Projection(), udk.Baumgarte(5.0, 5.0)], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "stabilization",
+    [udk.Projection(), udk.Baumgarte(5.0, 5.0), pytest.param(None, marks=pytest.mark.slow)],
+    ids=lambda x: type(x).__name__,
+)
 def test_second_derivatives_of_outputs_in_a_batch(stabilization):
     """Between steps, of states that are projected or not; members side by side are those alone."""
     mechanism = udk.library.four_bar()

@@ -72,21 +72,14 @@ def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-1
             )
 
 
-OTHER_JOINTS = [name for name in elements.JOINTS if name not in ("revolute", "angle")]
-
-
-@pytest.mark.parametrize("name", OTHER_JOINTS)
-def test_joints(name):
+@pytest.mark.parametrize("names", ["prismatic slot distance", "weld gear", "inner_gear rack cam"])
+@pytest.mark.parametrize(
+    "chosen", [METHODS[:1], pytest.param([*METHODS, *FORMULATIONS, udk.Augmented()], marks=pytest.mark.slow)], ids=["Auto", "all"]
+)
+def test_joints(names, chosen):
     """By elimination: the terms that other methods take are the same."""
-    joints = {k: elements.JOINTS[k] for k in ("revolute", name)}
-    agree(udk.Mechanism(elements.BODIES, joints), METHODS[:1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", OTHER_JOINTS)
-def test_joints_by_each_method(name):
-    joints = {k: elements.JOINTS[k] for k in ("revolute", name)}
-    agree(udk.Mechanism(elements.BODIES, joints), [*METHODS, *FORMULATIONS, udk.Augmented()])
+    joints = {k: elements.JOINTS[k] for k in ("revolute", *(name.replace("_", " ") for name in names.split()))}
+    agree(udk.Mechanism(elements.BODIES, joints), chosen)
 
 
 @pytest.mark.parametrize("kind", ["drivers", "forces"])

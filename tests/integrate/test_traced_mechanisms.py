@@ -115,7 +115,7 @@ def test_singular_configurations_at_rest_and_passed(start):
     assert_allclose(found.q, known.q, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_derivatives_by_the_geometry(derivative):
     """By the initial angle, against those of the exact motion: a pendulum's, and so a difference of its runs."""
     end = lambda a: udk.simulate(udk.library.parallelogram(angle=a), TIMES[:5], rtol=1e-11, atol=1e-11).q[-1, 0, 2]  # noqa: E731

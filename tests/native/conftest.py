@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from tests.quick_code import optimize
 from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.native import machine
 from udkjax.native.ir import POINTER, Function
@@ -32,12 +33,20 @@ def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., N
     return call
 
 
+@pytest.fixture(scope="module", autouse=True)
+def optimized_code():
+    """These tests are of the code that users run."""
+    optimize(True)
+    yield
+    optimize(False)
+
+
 @pytest.fixture(scope="session")
 def code():
     return loaded
 
 
-@pytest.fixture(params=WIDTHS, ids=lambda width: f"{width} lanes")
+@pytest.fixture(params=[pytest.param(w, id=f"{w} lanes", marks=[pytest.mark.slow] * (w == 2 < WIDTHS[-1])) for w in WIDTHS])
 def width(request):
     return request.param
 

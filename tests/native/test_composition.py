@@ -108,14 +108,6 @@ def test_a_member_whose_record_is_too_long_is_run_again(record_length):
             assert_array_equal(found, known)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("second", [jax.hessian, lambda f: jax.jacrev(jax.grad(f))], ids=["hessian", "jacrev of grad"])
-def test_second_derivatives_are_those_of_differences(second):
-    slope = jax.jit(jax.grad(angle))
-    expected = (slope(0.41) - slope(0.39)) / 0.02
-    assert_allclose(jax.jit(second(lambda x: angle(x[0])))(jnp.array([0.4]))[0, 0], expected, rtol=1e-3)
-
-
 def test_threads_share_machine_code(values):
     run = jax.jit(angle)
     for way in (angle, run):

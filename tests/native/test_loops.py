@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests import loops
+from tests.choices import fast
 from tests.programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
@@ -125,7 +126,7 @@ class At:
         return found
 
 
-@pytest.fixture(scope="module", params=SCENES)
+@pytest.fixture(scope="module", params=fast(["linkage", "gears", "loaded", "free"], SCENES))
 def at(request):
     return At(SCENES[request.param]())
 

@@ -89,7 +89,7 @@ def test_what_a_traced_number_does_not_reach_stays_known(name):
             assert _positions_are_traced(name, key, parameter.default) == (key in GEOMETRY), key
 
 
-@pytest.mark.parametrize("name", ["excavator", "slider_crank", "peaucellier"])
+@pytest.mark.parametrize("name", ["slider_crank", pytest.param("peaucellier", marks=pytest.mark.slow)])
 def test_traced_geometry_gives_the_same_numbers_by_jax_instead_of_numpy(name):
     build = getattr(library, name)
     key = next(key for key in inspect.signature(build).parameters if key in GEOMETRY)

@@ -149,9 +149,9 @@ def differences(xml, count, seed, method):
             yield from (abs(spin - omega), abs(turn - alpha) / (1 + abs(alpha)))
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_tree_has_the_accelerations_of_mujoco(seed):
-    assert max(differences(random_tree(seed), 100, seed, udk.Auto())) < 1e-10
+    assert max(differences(random_tree(seed), 25, seed, udk.Auto())) < 1e-10
 
 
 @pytest.mark.filterwarnings("error::udkjax.scene.MjcfWarning")  # what MuJoCo closes is not open here

@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.choices import fast
 from tests.wasm_host import Host, run_without_contraction
 from udkjax.equations import analyse
 from udkjax.integrate import march, native_closing, native_engine
@@ -12,9 +13,6 @@ from udkjax.integrate.events import phase_code
 from udkjax.native import operations, primitive, runs
 from udkjax.native.wasm import wasm_module
 
-SCENES = sorted(udk.library.__all__)
-FAST = ("parallelogram", "slider_crank")
-every_scene = pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in SCENES])
 TIMES = np.linspace(0.0, 2.0, 41)
 SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds
 
@@ -40,7 +38,7 @@ def known_call(monkeypatch, module, do):
     return seen[0]
 
 
-@every_scene
+@pytest.mark.parametrize("name", fast(["parallelogram"], udk.library.__all__))
 def test_a_run(monkeypatch, name):
     mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
     found = []
@@ -55,7 +53,7 @@ def test_a_run(monkeypatch, name):
     assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(TIMES), -1)[1:-1], rtol=0, atol=1e-6 * max(length, 1.0))
 
 
-@every_scene
+@pytest.mark.parametrize("name", fast(["slider_crank"], udk.library.__all__))
 def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
     mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
     body, path = mechanism.body_names[0], np.asarray(udk.simulate(mechanism, ts).q)[:, 0]
@@ -80,7 +78,7 @@ def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
     assert crossing[4 + k] == pytest.approx(middle, abs=1e-9)  # behind three numbers and one side: q
 
 
-@every_scene
+@pytest.mark.parametrize("name", fast(["parallelogram"], udk.library.__all__))
 def test_closing(name):
     mechanism = getattr(udk.library, name)()
     analysis = analyse(mechanism)
