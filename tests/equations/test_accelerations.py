@@ -12,18 +12,11 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.choices import fast
+from tests.textbook import terms
 from udkjax.equations import constraints, loads, prepare
 
 CLASSES = (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)
 METHODS = {cls.__name__: cls() for cls in CLASSES}
-SMALL = """simple_pendulum compound_pendulum double_pendulum driven_pendulum parallelogram four_bar slider_crank
-    elliptic_trammel""".split()
-LARGE = "n_four_bar scissor_lift peaucellier planetary_gear".split()
-
-
-@pytest.fixture(scope="module")
-def mechanisms():
-    return {name: getattr(udk.library, name)() for name in SMALL + LARGE}
 
 
 # --- the paper's linkage
@@ -120,46 +113,6 @@ def test_multipliers_are_those_reactions_for_every_method(moved, data):
 # --- principles
 
 
-@pytest.mark.parametrize("name", fast(["driven_pendulum", "slider_crank"], SMALL))
-def test_agrees_with_the_augmented_equations(mechanisms, kkt, closed, name):
-    """One large linear system in a and lambda, by NumPy."""
-    mech = mechanisms[name]
-    q, v = closed(mech)
-    a, multipliers = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), multipliers=True)
-    expected, forces = kkt(mech, jnp.array(0.0), q, v)
-    scale = float(1 + np.abs(expected).max())
-    assert_allclose(a.ravel(), expected, atol=1e-10 * scale)
-    assert_allclose(multipliers, forces, atol=1e-9 * float(1 + np.abs(forces).max()))
-    by_svd = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3), udk.SVD())
-    assert_allclose(a, by_svd, atol=1e-10 * scale)
-
-
-@jax.jit
-def terms(mech, t, q, v):
-    A, gamma = constraints.psi_q(mech, t, q), constraints.gamma(mech, t, q, v)
-    return A, gamma, loads.force(mech, t, q, v), constraints.psi(mech, t, q), constraints.psi_dot(mech, t, q, v)
-
-
-@pytest.mark.parametrize("name", fast(["parallelogram", "planetary_gear"], ["double_pendulum", "parallelogram", *LARGE]))
-def test_gauss_principle(mechanisms, closed, name):
-    """Among all accelerations that satisfy the constraints it is nearest to the free ones, in the metric of the masses."""
-    mech = mechanisms[name]
-    q, v = closed(mech, seed=3)
-    a = udk.accelerations(mech, 0.0, q.reshape(-1, 3), v.reshape(-1, 3)).ravel()
-    mass = np.asarray(loads.mass(mech))
-    a, A, gamma, force, *_ = map(np.asarray, (a, *terms(mech.without_origin, jnp.array(0.0), q, v)))
-    size = float(1 + np.abs(a).max())
-    assert_allclose(A @ a, gamma, atol=1e-10 * size)
-    _, sigma, vt = np.linalg.svd(A)
-    allowed = vt[np.sum(sigma > 1e-8 * sigma[0]) :]
-    offset = a - force / mass
-    assert len(allowed) == 3 * len(mech.bodies) - np.linalg.matrix_rank(A, tol=1e-8)
-    assert_allclose(allowed @ (mass * offset), 0.0, atol=1e-10 * size * float(mass.max()))
-    effort = offset @ (mass * offset)
-    for z in np.random.default_rng(4).standard_normal((5, len(allowed))) @ allowed if len(allowed) else ():
-        assert (offset + 0.1 * z) @ (mass * (offset + 0.1 * z)) > effort
-
-
 def test_a_constraint_said_many_times_changes_nothing(data):
     """Each copy of the pin carries its share."""
     single = udk.library.compound_pendulum()
@@ -176,13 +129,13 @@ def test_a_constraint_said_many_times_changes_nothing(data):
 
 
 @pytest.mark.parametrize("method", [METHODS["Auto"], METHODS["SVD"]], ids=["Auto", "SVD"])
-def test_baumgarte_feeds_the_violation_back(mechanisms, method):
+def test_baumgarte_feeds_the_violation_back(method):
     """Psi_q a = gamma - 2 alpha Psi_dot - beta^2 Psi, away from the manifold, where rows are independent."""
-    mech, random = mechanisms["four_bar"], np.random.default_rng(5)
+    mech, random = udk.library.four_bar(), np.random.default_rng(5)
     q, v = (x + 0.1 * random.standard_normal(x.shape) for x in (mech.q0, mech.v0))
     t, gains = jnp.array(0.0), udk.Baumgarte(3.0, 7.0)
     a = udk.accelerations(mech, t, q, v, method, gains).ravel()
-    A, gamma, _, psi, psi_dot = terms(mech.without_origin, t, q.ravel(), v.ravel())
+    psi, A, psi_dot, gamma, *_ = terms(mech, t, q, v)
     assert_allclose(A @ a, gamma - 6.0 * psi_dot - 49.0 * psi, atol=1e-10)
     plain = udk.accelerations(mech, t, q, v, method)
     assert_allclose(udk.accelerations(mech, t, q, v, method, udk.Baumgarte(0.0, 0.0)), plain, atol=1e-11)
@@ -193,11 +146,11 @@ def test_baumgarte_feeds_the_violation_back(mechanisms, method):
 
 
 @pytest.fixture(scope="module")
-def nearby(mechanisms):
+def nearby():
     """States almost closed, to 1e-7."""
 
     def states(name, count=4):
-        mech, random = mechanisms[name], np.random.default_rng(6)
+        mech, random = getattr(udk.library, name)(), np.random.default_rng(6)
         q, v = (np.asarray(x).ravel() + 1e-7 * random.standard_normal((count, x.size)) for x in (mech.q0, mech.v0))
         return mech, jnp.asarray(q), jnp.asarray(v)
 

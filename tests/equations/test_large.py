@@ -3,26 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import prepare, redundancy
-
-
-def side_by_side(one, copies, off=0.0):
-    """Copies of a mechanism in one scene, each body's place off by a little."""
-    random, bodies, joints = np.random.default_rng(0), {}, {}
-    for k in range(copies):
-        bodies |= {
-            f"{k} {n}": udk.Body(b.mass, b.inertia, b.position + off * random.standard_normal(2), b.angle)
-            for n, b in one.bodies.items()
-        }
-        joints |= {
-            f"{k} {n}": udk.Revolute([body if body == "ground" else f"{k} {body}" for body in j.bodies], j.points)
-            for n, j in one.joints.items()
-        }
-    return udk.Mechanism(bodies, joints)
-
+from udkjax.equations import redundancy
 
 # --- redundant rows
 
@@ -55,25 +38,6 @@ def test_sparse_analysis_finds_as_many_rows_as_singular_values_which_do_as_well(
     assert len(found[0]) == len(found[1]) == null_spaces[0].shape[1]
     one, other = (min(np.linalg.svd(N[list(rows)])[1][-1] for N in null_spaces) for rows in found)
     assert one > 0.05 and other > 0.2 * one
-
-
-@pytest.mark.slow
-def test_a_large_scene_is_closed_and_its_redundant_rows_are_found():
-    """Thirty linkages side by side, their guesses off: a row of each is left out, and all of them are closed."""
-    one = udk.library.parallelogram(-0.6)
-    mech = side_by_side(one, 30, 0.01)
-    redundant = udk.analyse(mech).redundant_rows
-    assert redundant is not None and len(redundant) == 30
-    assert {row // 12 for row in redundant} == set(range(30))
-    equations = prepare(mech)
-    state = udk.assemble(mech)
-    psi, psi_dot = equations.violation(0.0, state.q.ravel(), state.v.ravel())
-    assert jnp.abs(psi).max() < 1e-12 and jnp.abs(psi_dot).max() < 1e-12
-    a = udk.accelerations(mech, 0.0, state.q, state.v)
-    for k in (0, 29):
-        part = slice(4 * k, 4 * k + 4)
-        expected = udk.accelerations(one, 0.0, state.q[part], state.v[part])
-        assert_allclose(a[part], expected, atol=1e-9)
 
 
 # --- whole runs

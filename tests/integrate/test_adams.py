@@ -224,15 +224,6 @@ class TestDerivatives:
         found = jax.jit(jax.vmap(jax.grad(end, argnums=(0, 1))))(self.a, self.t)
         np.testing.assert_allclose(found, self.exact, rtol=0, atol=1e-7)
 
-    @pytest.mark.slow
-    def test_forward_is_reverse(self):
-        """To rounding errors: order and step are the same in both, and so is the polynomial that is integrated."""
-        forward = lambda a: self.end(a, 3.0, diffrax.ForwardMode())  # noqa: E731
-        reverse = lambda a: self.end(a, 3.0, diffrax.RecursiveCheckpointAdjoint())  # noqa: E731
-        tangent = jax.jit(lambda a: jax.jvp(forward, (a,), (1.0,))[1])(4.0)
-        assert tangent == pytest.approx(float(jax.jit(jax.grad(reverse))(4.0)), rel=1e-11)
-        assert tangent == pytest.approx(float(self.exact[0][0]), abs=1e-7)
-
 
 def test_batch_is_its_members(swing):
     """Each member has its own order and step."""

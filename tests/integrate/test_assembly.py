@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import constraints
+from tests.textbook import terms
 from udkjax.integrate import assembly, check
 
 
@@ -19,20 +19,9 @@ def motor():
     return udk.Mechanism(rod.bodies, rod.joints, {"motor": turn})
 
 
-@jax.jit
-def rows(mech, t, q, v):
-    return constraints.psi(mech, t, q), constraints.psi_dot(mech, t, q, v), constraints.psi_q(mech, t, q)
-
-
-def evaluate(mech, q, v=None, t=0.0):
-    """Psi, Psi_dot and Psi_q, as arrays of NumPy."""
-    q = np.ravel(q)
-    return [np.asarray(x) for x in rows(mech.without_origin, float(t), q, np.zeros_like(q) if v is None else np.ravel(v))]
-
-
 def violation(mech, state, t=0.0):
-    psi, psi_dot, _ = evaluate(mech, state.q, state.v, t)
-    return np.abs(psi).max(), np.abs(psi_dot).max()
+    x = terms(mech, t, state.q, state.v)
+    return np.abs(x.psi).max(), np.abs(x.psi_dot).max()
 
 
 # --- closing
@@ -109,11 +98,11 @@ def apart(mech, by):
 
 def test_names_what_stays_open_and_makes_nothing_worse():
     mech = apart(udk.library.four_bar(), 9.0)
-    before = np.linalg.norm(evaluate(mech, mech.q0)[0])
+    before = np.linalg.norm(terms(mech, 0.0, mech.q0).psi)
     with pytest.raises(udk.AssemblyError, match=r'cannot be closed.*"[ABCD]" \([0-9.]+\).*closer') as caught:
         udk.assemble(mech)
     best = caught.value.state
-    assert np.linalg.norm(evaluate(mech, best.q)[0]) < before
+    assert np.linalg.norm(terms(mech, 0.0, best.q).psi) < before
     assert_allclose(udk.assemble(mech, throw=False).q, best.q)
 
 
@@ -144,7 +133,7 @@ def test_never_worse(linkage):
     assemble = jax.jit(lambda q: udk.assemble(stuck, state=udk.State(q, jnp.zeros((4, 3)))).q)
     for seed in range(8):
         q = stuck.q0 + np.random.default_rng(seed).uniform(-2, 2, (4, 3))
-        before, after = (np.linalg.norm(evaluate(stuck, x)[0]) for x in (q, assemble(q)))
+        before, after = (np.linalg.norm(terms(stuck, 0.0, x).psi) for x in (q, assemble(q)))
         assert after <= before
 
 
@@ -319,7 +308,7 @@ def test_what_stays_has_full_rank_elsewhere(make, start):
     mech = make(start)
     redundant = list(udk.analyse(mech).redundant_rows or ())
     for angle in (start + 0.35, start + 0.7):
-        A = evaluate(mech, make(angle).q0)[2]
+        A = terms(mech, 0.0, make(angle).q0).psi_q
         kept = np.delete(A, redundant, axis=0)
         assert len(kept) == np.linalg.matrix_rank(A, tol=1e-7)
         assert np.linalg.svd(kept, compute_uv=False)[-1] > 1e-3

@@ -28,7 +28,6 @@ def called(function: Callable[[], object]) -> set[tuple[str, str]]:
         if event == "call" and Path(code.co_filename).is_relative_to(ROOT) and not code.co_name.startswith("<"):
             seen.add((code.co_filename, code.co_qualname))
 
-    gc.collect()
     gc.disable()  # what is collected meanwhile calls the package, too: caches forget it
     sys.setprofile(listen)
     try:

@@ -197,5 +197,6 @@ def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
     body = {"plate": udk.Body(1.0, 0.1, [0.2, 0.1], 0.3)}
     welds = {f"weld{k}": udk.Weld((GROUND, "plate"), [[0.0, 0.0], [0.0, 0.0]]) for k in range(3)}
     mech = udk.Mechanism(body, welds)
-    by_all = jax.jit(lambda q, v: [udk.accelerations(mech, 0.0, q, v, method) for method in METHODS.values()])
-    np.testing.assert_allclose(by_all(mech.q0, mech.v0), 0.0, atol=1e-12)
+    chosen = [METHODS[name] for name in ("Auto", "Varga", "Greville")]
+    by_each = jax.jit(lambda q, v: [udk.accelerations(mech, 0.0, q, v, method) for method in chosen])
+    np.testing.assert_allclose(by_each(mech.q0, mech.v0), 0.0, atol=1e-12)

@@ -15,27 +15,20 @@ from scipy.integrate import solve_ivp
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.equations import constraints, loads
+from tests.textbook import terms
 
 TOL = 1e-9
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
 FAST = "parallelogram", "slider_crank", "andrews_squeezer"
 
 
-@jax.jit
-def terms(mechanism, t, q, v):
-    """Psi_q, gamma, M and F."""
-    A, gamma = constraints.psi_q(mechanism, t, q), constraints.gamma(mechanism, t, q, v)
-    return A, gamma, loads.mass(mechanism), loads.force(mechanism, t, q, v)
-
-
 def by_scipy(mechanism, ts, state=None, gains=(0.0, 0.0)):
     """The motion from M a + Psi_q^T lambda = F, Psi_q a = gamma in the sense of least squares, by SciPy."""
     state = udk.assemble(mechanism) if state is None else state
-    bare, n = mechanism.without_origin, state.q.size
+    n = state.q.size
 
     def slope(t, y):
-        A, gamma, M, F = map(np.asarray, terms(bare, t, y[:n], y[n:]))
+        _, A, _, gamma, M, F = terms(mechanism, t, y[:n], y[n:])
         root = np.sqrt(M)
         a = F / M
         if len(A):
