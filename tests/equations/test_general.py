@@ -1,5 +1,7 @@
 """Systems of the user's own: other coordinates, masses that are not diagonal, rolling and gliding."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from udkjax.equations.quantities import equations_of
 G = 9.81
 METHODS = udk.Auto(), udk.Greville(), udk.Elimination()
 TS = np.linspace(0.0, 2.0, 9)
-CHOICES = {"rtol": 1e-10, "atol": 1e-10}
+CHOICES: Any = {"rtol": 1e-10, "atol": 1e-10}
 
 
 class Ball(eqx.Module):
@@ -139,7 +141,8 @@ BEAD = np.array([0.5, 0.0]), np.array([0.0, 0.5 * W])
 def side_by_side():
     """A ball on a sphere, said three times; a bead on a straight wire that turns; a body whose speed is prescribed; a blade on
     ice that a torque steers; and the double pendulum with one coordinate more."""
-    swing, fixed = double(True), jnp.diag(jnp.array([2.0, 2.0, 2.0, 0.7, 0.7, 1.0, 1.0, 1.5, 1.5, 0.4]))
+    swing: Any = double(True)
+    fixed = jnp.diag(jnp.array([2.0, 2.0, 2.0, 0.7, 0.7, 1.0, 1.0, 1.5, 1.5, 0.4]))
     order = np.array([0, 3, 5, 7, 10])
 
     def parts(x):

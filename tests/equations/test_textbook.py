@@ -118,7 +118,8 @@ def test_a_duplicated_constraint_changes_nothing(closed):
     close_to(again["psi_q"].T @ again["lambda"], once["psi_q"].T @ once["lambda"], 1e-11)
     off = q + 1e-4 * jnp.cos(jnp.arange(q.size))
     project = jax.jit(lambda m: jnp.concatenate(uk.project(m, 0.0, off, v, SVD, steps=4)))
-    close_to(*(project(m.without_origin) for m in (twice, mech)), 1e-7)  # where redundant rows disagree, copies count twice
+    projected, alone = (project(m.without_origin) for m in (twice, mech))
+    close_to(projected, alone, 1e-7)  # where redundant rows disagree, copies count twice
 
 
 def test_the_linkage_of_the_paper(placed):
