@@ -419,16 +419,16 @@ def test_a_motion_stays_on_its_branch_where_another_comes_close(gap, count, leng
 
 
 def test_a_traced_motion_stays_on_its_branch_and_has_derivatives():
-    """Of a batch in reverse mode: of a position, a velocity and an acceleration, against differences of known numbers."""
+    """Of a batch in reverse mode, of a position, a velocity and an acceleration together, against differences."""
     gaps, angle = np.array([1e-3, 1e-4, 1e-5]), np.linspace(1.0, 1.0 + 2 * np.pi, 25)
 
     def motion(gap, values=angle):
         mech = udk.library.four_bar(angle=1.0, lengths=(1.0, 2.5, 2.0), ground=3.5 - gap)
         found = udk.kinematics(mech, "body.crank.angle", values)
-        return jnp.stack([x[1, 2, 2] for x in (found.q, found.v, found.a)]), found.path("coupler", (1.25, 0.0))
+        return found.q[1, 2, 2] + 2 * found.v[1, 2, 2] - 3 * found.a[1, 2, 2], found.path("coupler", (1.25, 0.0))
 
     with jax.debug_nans(True):
-        slopes, paths = jax.jit(jax.vmap(jax.jacrev(motion, has_aux=True)))(gaps)
+        slopes, paths = jax.jit(jax.vmap(jax.grad(motion, has_aux=True)))(gaps)
     h = 1e-5
     for gap, slope, path in zip(gaps, slopes, np.asarray(paths), strict=True):
         exact = [coupler_pin(1.0, 2.5, 2.0, 3.5 - gap, angle, sign) for sign in (1, -1)]
