@@ -218,3 +218,15 @@ def test_what_is_known_beside_traced_numbers_stays_known_and_is_traced_once_for_
     with pytest.raises(ValueError, match="must not be negative"):
         jax.grad(lambda x: scaled(x, -by, ("a",))[0]["a"])(1.0)
     assert scaled(1.0, by, ("a",))[0]["a"] == 2.0
+
+
+def test_loops_of_a_batch_end_one_by_one():
+    """Under `vmap` the condition of a loop is one of each member, and one that has ended stays as it is."""
+
+    def halve(x, y):
+        return jax.lax.while_loop(lambda state: state[0] > 1.0, lambda state: (0.5 * state[0], state[1] + x * y), (x, y))
+
+    x, y = np.array([0.3, 7.0, 40.0]), np.arange(6.0).reshape(3, 2)
+    program = jax.jit(jax.vmap(halve)).trace(x, y).jaxpr
+    for one, other in zip(numpy_program(program)(Meter(np.inf), [x, y]), jax.jit(jax.vmap(halve))(x, y), strict=True):
+        np.testing.assert_allclose(one, other)

@@ -7,7 +7,7 @@ then on XLA's program serves. Both agree to rounding.
 To JAX such a program is one operation, whose derivatives and batches are such programs again.
 """
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
@@ -42,20 +42,28 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if jax.config.jax_disable_jit:
             return function(*args, **kwargs)
-        dynamic, static = eqx.partition((args, kwargs), _is_array)
-        leaves, tree = jax.tree.flatten(dynamic)
-        fixed, fixed_tree = jax.tree.flatten(static)
-        types = tuple(jax.typeof(x) for x in leaves)
         try:
-            program, out = _trace(function, tree, tuple(fixed), fixed_tree, types, jax.config.jax_enable_x64)
+            program, leaves, out = trace_once(function, args, kwargs)
         except _ClosesOverError:
             return by_jit(*args, **kwargs)
         # Bound, JAX would trace a program with rules of derivatives again, to leave them out before it is evaluated.
         is_known = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
         found = (_evaluate if is_known else deferred_p.bind)(*leaves, call_jaxpr=program)
-        return eqx.combine(jax.tree.unflatten(out.tree, found), out.static)
+        return out.rebuild(found)
 
     return run
+
+
+def trace_once(
+    function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
+) -> "tuple[Any, list[Any], Out]":
+    """Return the program of a function, traced once for each structure of its arguments, their arrays, and the result's form."""
+    dynamic, static = eqx.partition((args, kwargs or {}), _is_array)
+    leaves, tree = jax.tree.flatten(dynamic)
+    fixed, fixed_tree = jax.tree.flatten(static)
+    types = tuple(jax.typeof(x) for x in leaves)
+    program, out = _trace(function, tree, tuple(fixed), fixed_tree, types, jax.config.jax_enable_x64)
+    return program, leaves, out
 
 
 def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -123,19 +131,23 @@ class _ClosesOverError(Exception):
     """A function among the arguments knows numbers that are traced: results for it serve no other call."""
 
 
-class _Out:
+class Out:
     """The form of a result: the tree of its arrays, and all else."""
 
     tree: Any
     static: Any
 
+    def rebuild(self, arrays: Sequence[Any]) -> Any:
+        """Return the result of these arrays."""
+        return eqx.combine(jax.tree.unflatten(self.tree, arrays), self.static)
+
 
 @lru_cache(maxsize=128)
 def _trace(
     function: Callable[..., Any], tree: Any, fixed: tuple[Hashable, ...], fixed_tree: Any, types: tuple[Any, ...], x64: bool
-) -> tuple[Any, _Out]:
+) -> tuple[Any, Out]:
     del x64  # a trace is of it
-    out = _Out()
+    out = Out()
 
     def flat(*leaves: Array) -> list[Array]:
         static = jax.tree.unflatten(fixed_tree, fixed)

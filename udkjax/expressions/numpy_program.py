@@ -197,11 +197,17 @@ def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: in
     def step(meter: Meter, *xs: Any) -> Arrays:
         of_condition, of_body = xs[:cond_nconsts], xs[cond_nconsts : cond_nconsts + body_nconsts]
         state = list(xs[cond_nconsts + body_nconsts :])
-        while condition(meter, [*of_condition, *state])[0]:
-            state = body(meter, [*of_body, *state])
+        while np.any(goes_on := condition(meter, [*of_condition, *state])[0]):
+            found = body(meter, [*of_body, *state])
+            state = list(found) if np.ndim(goes_on) == 0 else [_where(goes_on, x, y) for x, y in zip(found, state, strict=True)]
         return state
 
     return step
+
+
+def _where(condition: np.ndarray, a: Any, b: Any) -> np.ndarray:
+    """Return a where the condition holds, else b: of a batch of loops, of which some have ended."""
+    return np.where(condition.reshape(condition.shape + (1,) * (np.ndim(a) - condition.ndim)), a, b)
 
 
 def _cond(branches: Sequence[Any], **_: Any) -> Callable[..., Any]:

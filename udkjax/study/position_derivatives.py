@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.equations.control_flow import sequential
 from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.seldom import call_seldom
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.study.continuation import Points
 from udkjax.study.crossing import FARTHEST_NODE, nodes, weights
@@ -104,38 +105,41 @@ def _matrices(
         counts: mask of the values of interest.
         active: mask of the leaves of joints and drivers that are the P numbers.
     """
+    chosen = jax.tree.leaves(eqx.filter(_constraints(curve.mechanism), active))
+    K, n, P = len(values), curve.units.size - 1, sum(x.size for x in chosen)
+    nothing = jnp.zeros((K, 3, n, P)), jnp.zeros((K, P, n))
+    given = curve, values, found, spacing, active
+    matrix, residue = jax.lax.cond(jnp.any(counts), lambda: call_seldom(_beside_meetings, *given), lambda: nothing)
+    return jnp.where(counts[:, None, None, None], matrix, 0.0), jnp.where(counts[:, None, None], residue, 0.0)
+
+
+def _beside_meetings(curve: Curve, values: Array, found: Three, spacing: Array, active: PyTree) -> tuple[Array, Array]:
+    """Return `_matrices` of values that all count; not a number where nothing beside them is known."""
     W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
     chosen, rest = eqx.partition(_constraints(curve.mechanism), active)
     numbers, unravel = ravel_pytree(chosen)
-    K, n, P = len(values), len(W), len(numbers)
+    offset = spacing[:, None] * steps  # scaled
+    s = values[:, None] + offset * unit
 
-    def find() -> tuple[Array, Array]:
-        offset = spacing[:, None] * steps  # scaled
-        s = values[:, None] + offset * unit
+    def closed(s: Array, ds: Array, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
+        return curve.correct(jnp.append(q + ds * dq + 0.5 * ds**2 * ddq, s) / curve.units, fixed=True)
 
-        def closed(s: Array, ds: Array, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
-            return curve.correct(jnp.append(q + ds * dq + 0.5 * ds**2 * ddq, s) / curve.units, fixed=True)
+    X, is_closed = jax.vmap(jax.vmap(closed, (0, 0, None, None, None)))(s, offset * unit, *found)
+    q = X[..., :-1] * W
 
-        X, is_closed = jax.vmap(jax.vmap(closed, (0, 0, None, None, None)))(s, offset * unit, *found)
-        q = X[..., :-1] * W
+    def moved(numbers: Array) -> list[Array]:
+        parts = eqx.combine(unravel(numbers), rest)
+        other = eqx.tree_at(lambda c: _constraints(c.mechanism), curve, parts)
+        three = jax.vmap(jax.vmap(lambda s, q: _newton(other, s, q)))(s, q)
+        return [x / W * unit**k for k, x in enumerate(three)]
 
-        def moved(numbers: Array) -> list[Array]:
-            parts = eqx.combine(unravel(numbers), rest)
-            other = eqx.tree_at(lambda c: _constraints(c.mechanism), curve, parts)
-            three = jax.vmap(jax.vmap(lambda s, q: _newton(other, s, q)))(s, q)
-            return [x / W * unit**k for k, x in enumerate(three)]
-
-        changes = jax.jacfwd(moved)(numbers)  # (K, 12, n, P) each
-        ends = offset[:, :, None, None] * changes[0]
-        size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(FARTHEST_NODE), ends)
-        residue = jnp.where(jnp.abs(residue) > RESIDUE * size[..., None], residue, 0.0)
-        smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(FARTHEST_NODE), x) / unit**k for k, x in enumerate(changes)], 1)
-        known = jnp.all(is_closed, 1) & (spacing > 0)
-        return jnp.where(known[:, None, None, None], smooth * W[:, None], jnp.nan), residue
-
-    nothing = jnp.zeros((K, 3, n, P)), jnp.zeros((K, P, n))
-    matrix, residue = jax.lax.cond(jnp.any(counts), find, lambda: nothing)
-    return jnp.where(counts[:, None, None, None], matrix, 0.0), jnp.where(counts[:, None, None], residue, 0.0)
+    changes = jax.jacfwd(moved)(numbers)  # (K, 12, n, P) each
+    ends = offset[:, :, None, None] * changes[0]
+    size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(FARTHEST_NODE), ends)
+    residue = jnp.where(jnp.abs(residue) > RESIDUE * size[..., None], residue, 0.0)
+    smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(FARTHEST_NODE), x) / unit**k for k, x in enumerate(changes)], 1)
+    known = jnp.all(is_closed, 1) & (spacing > 0)
+    return jnp.where(known[:, None, None, None], smooth * W[:, None], jnp.nan), residue
 
 
 class _Operator(eqx.Module):
