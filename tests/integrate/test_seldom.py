@@ -34,3 +34,15 @@ def test_what_is_seldom_reached_is_right_and_not_compiled():
     assert many["positive"].tolist() == [True, False, True]
     assert "while" not in jax.jit(_reach).lower(x[0]).as_text()
     assert_allclose(jax.grad(lambda x: jnp.sum(x * _reach(jax.lax.stop_gradient(x))["root"]))(x[0]), found["root"])
+    assert "erfc" in jax.jit(lambda x: call_seldom(jax.scipy.special.erfc, x)).lower(x).as_text()  # NumPy does not know it
+
+
+def test_what_is_not_finite_is_so_by_numpy_too():
+    """No call of JAX is made from within a program that runs, neither for a matrix that NumPy refuses to decompose."""
+    x = jnp.stack([jnp.eye(2), jnp.full((2, 2), jnp.nan)])
+    s = jax.jit(lambda x: call_seldom(_singular_values, x))(x)
+    assert_allclose(s, [[1.0, 1.0], [np.nan, np.nan]])
+
+
+def _singular_values(x):
+    return jnp.linalg.svd(x, full_matrices=False)[1]

@@ -103,6 +103,19 @@ def count_operations(jaxpr: Any) -> int:
     return len(jaxpr.eqns) + sum(map(count_operations, inner))
 
 
+def has_rules(jaxpr: Any) -> bool:
+    """Return True if NumPy knows all operations of a program: for others JAX is called."""
+
+    def is_known(equation: Any) -> bool:
+        primitive = equation.primitive
+        if primitive in _EVALUATIONS or primitive.name in _CONTROL or primitive.name in RULES:
+            return all(map(has_rules, jaxprs_in_params(equation.params)))
+        expanded = _Expanded(equation).trace()
+        return expanded is not None and has_rules(expanded)
+
+    return all(map(is_known, jaxpr.eqns))
+
+
 _PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()
 
 
@@ -167,12 +180,17 @@ class _Expanded:
 
     def __call__(self, meter: Meter, *xs: Any) -> Any:
         if self._program is None:
-            function = self._function()
-            self._program = False if function is None else numpy_program(jax.make_jaxpr(function)(*self._inputs))
+            traced = self.trace()
+            self._program = False if traced is None else numpy_program(traced)
         if self._program is False:
             return _by_jax(self._primitive, self._parameters, xs)
         found = self._program(meter, xs)
         return found if self._primitive.multiple_results else found[0]
+
+    def trace(self) -> Any:
+        """Return the program of the others that it is made of, or None."""
+        function = self._function()
+        return None if function is None else jax.make_jaxpr(function)(*self._inputs)
 
     def _function(self) -> Callable[..., Any] | None:
         primitive, parameters = self._primitive, self._parameters

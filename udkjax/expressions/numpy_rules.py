@@ -123,12 +123,14 @@ def _dot(x: Any, y: Any, dimension_numbers: Any, **_: Any) -> np.ndarray:
 
 
 def _svd(x: np.ndarray, full_matrices: bool, compute_uv: bool, **_: Any) -> Any:
-    if not np.isfinite(x).all() or 0 in x.shape:
+    if 0 in x.shape:
         return NotImplemented
+    finite = np.isfinite(x).all((-2, -1), keepdims=True)
+    of_finite = np.where(finite, x, 0.0)
     if not compute_uv:
-        return [np.linalg.svd(x, compute_uv=False)]
-    u, s, vt = np.linalg.svd(x, full_matrices)
-    return [s, u, vt]
+        return [np.where(finite[..., 0], np.linalg.svd(of_finite, compute_uv=False), np.nan)]
+    u, s, vt = np.linalg.svd(of_finite, full_matrices)
+    return [np.where(finite[..., 0], s, np.nan), np.where(finite, u, np.nan), np.where(finite, vt, np.nan)]
 
 
 def _lu(x: np.ndarray) -> Any:

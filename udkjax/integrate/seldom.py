@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions.deferred import deferred_p, trace_once
-from udkjax.expressions.numpy_program import Meter, numpy_program
+from udkjax.expressions.numpy_program import Meter, has_rules, numpy_program
 from udkjax.native.host_function import call_host
 
 
@@ -52,5 +52,7 @@ def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
     if deferred_p is None or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return function(*given)
     program, leaves, out = trace_once(function, given)
+    if not has_rules(program):  # within a program that runs, JAX must not be called
+        return function(*given)
     found = call_host(_TracedFunction(program), [jnp.asarray(x)[None] for x in leaves])
     return out.rebuild([x[0].astype(aval.dtype) for x, aval in zip(found, program.out_avals, strict=True)])
