@@ -304,7 +304,7 @@ def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
     bodies = {f"{k}{i}": udk.Body(1.0, 0.01, [float(k), float(i)]) for k in range(3) for i in (0, 1)}
     pairs = [(f"{k}{i}", f"{k + 1}{j}") for k in (0, 1) for i in (0, 1) for j in (0, 1)] + [(f"{k}0", f"{k}1") for k in range(3)]
     joints: dict[str, Any] = {f"{a} {b}": udk.Distance([a, b], [[0.0, 0.0]] * 2) for a, b in pairs}
-    joints["pin"] = Revolute([GROUND, "00"], [[0.0, 0.0]] * 2)
+    joints["pin"] = udk.Revolute([GROUND, "00"], [[0.0, 0.0]] * 2)
     built, apply = [], fixes.apply_change
     monkeypatch.setattr(fixes, "apply_change", lambda *given: built.append(given) or apply(*given))
     found = udk.diagnose(udk.Mechanism(bodies, joints), walk=False)
