@@ -17,6 +17,7 @@ from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, num
 from udkjax.expressions.deferred import deferred
 from udkjax.printing import prints_table, units
 from udkjax.scene.fields import ROUNDING, library_for, number
+from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 # Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
@@ -34,6 +35,15 @@ class GuessTerms(NamedTuple):
     free: NumericArray  # a_F
     psi_t: NumericArray
     gamma: NumericArray
+
+
+class RowReach(NamedTuple):
+    """Pairs of a row of Psi and a body that it meets: the row's change as the body moves by a metre, and turns by a radian."""
+
+    row: np.ndarray
+    body: np.ndarray
+    moved: NumericArray
+    turned: NumericArray
 
 
 @prints_table
@@ -80,11 +90,35 @@ class Scales(NamedTuple):
 
 def known_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism whose numbers are known, by NumPy."""
-    mechanism = jax.tree.map(np.asarray, mechanism.at(0.0))
-    q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
+    mechanism, q, v = _known_guess(mechanism)
     with np.errstate(all="ignore"):  # numbers that are not finite are no scales
         found = _scales(mechanism, _guess_terms(mechanism, q, v, np), np)
     return jax.tree.map(number, found)
+
+
+def scales_by_masses(scales: Scales, known: Mechanism, mechanism: Mechanism) -> Scales:
+    """Return the scales of a known mechanism, with the rank threshold of the masses of one that was made from it.
+
+    A threshold decides what is a rank, and masses may be far apart in some member of a batch alone. Units decide how accurate a
+    run is, and those of the known mechanism serve: to trace a whole scene for them takes half a second of XLA's.
+    """
+    mass, inertia = jax.lax.stop_gradient(_masses(mechanism))
+    return scales._replace(rank_tol=_deferred_rank_tol(_known_reach(known), scales.weights, mass, inertia))
+
+
+@cached_by_identity
+def _known_reach(mechanism: Mechanism) -> RowReach:
+    """Return how rows meet bodies in a mechanism of known numbers, by NumPy."""
+    mechanism, q, v = _known_guess(mechanism)
+    with np.errstate(all="ignore"):
+        return _reach(mechanism, _guess_terms(mechanism, q, v, np), np)
+
+
+def _known_guess(mechanism: Mechanism) -> tuple[Mechanism, np.ndarray, np.ndarray]:
+    """Return a mechanism of known numbers as arrays of NumPy, at the time 0, and its guess."""
+    mechanism = jax.tree.map(np.asarray, mechanism.at(0.0))
+    q, v = (np.asarray(x, float).ravel() for x in (mechanism.q0, mechanism.v0))
+    return mechanism, q, v
 
 
 def traced_scales(mechanism: Mechanism) -> Scales:
@@ -124,45 +158,62 @@ def _grouped(values: Any, group: np.ndarray, count: int, xp: ArrayLibrary) -> An
 
 def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
     """Return the diagonal of the mass matrix, by NumPy or JAX."""
-    bodies = mechanism.bodies.values()
-    mass, inertia = (numbers_as_vector([getattr(body, name) for body in bodies]) for name in ("mass", "inertia"))
+    mass, inertia = _masses(mechanism)
     return xp.ravel(xp.stack([mass, mass, inertia], 1))
 
 
-def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales:
-    rows, columns, psi_q, free, psi_t, gamma = guess
+def _masses(mechanism: Mechanism) -> tuple[Any, Any]:
+    """Return the masses and the moments of inertia of all bodies."""
     bodies = mechanism.bodies.values()
-    inertia, mass = (xp.asarray(numbers_as_vector([getattr(body, name) for body in bodies])) for name in ("inertia", "mass"))
-    length = arm = xp.max(xp.sqrt(inertia / mass))
-    pair, of_entry = np.unique(rows * len(mass) + columns // 3, return_inverse=True)  # of a row and a body
-    turns = columns % 3 == 2
+    return numbers_as_vector([body.mass for body in bodies]), numbers_as_vector([body.inertia for body in bodies])
 
-    of_pair = _grouped(psi_q, of_entry, len(pair), xp), _grouped(turns, of_entry, len(pair), np) > 0
-    moved = xp.sqrt(xp.sum(xp.where(of_pair[1], 0.0, of_pair[0] ** 2), 1))
-    turned = xp.sum(xp.where(of_pair[1], xp.abs(of_pair[0]), 0.0), 1)
-    if len(pair):
+
+def _scales(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> Scales:
+    mass, inertia = (xp.asarray(x) for x in _masses(mechanism))
+    free, psi_t, gamma = guess[3:]
+    length = arm = xp.max(xp.sqrt(inertia / mass))
+    reach = _reach(mechanism, guess, xp)
+    of_row, moved, turned = reach.row, reach.moved, reach.turned
+    if len(of_row):
         by_place = moved > ROUNDING * xp.max(moved)
         arm = xp.where(by_place, turned / xp.where(by_place, moved, 1.0), 0.0)
         arm = xp.max(xp.where(xp.isfinite(arm), arm, 0.0))
         arm = xp.where(arm > ROUNDING * length, arm, length)
         length = xp.maximum(length, arm)
     change = xp.maximum(moved * length, turned)
-    row = pair // len(mass)
-    scale = xp.max(_grouped(change, row, len(psi_t), xp), 1, initial=0.0)
+    scale = xp.max(_grouped(change, of_row, len(psi_t), xp), 1, initial=0.0)
     scale = xp.where(xp.isfinite(scale), scale, 0.0)
     moves = scale > ROUNDING * xp.max(scale, initial=0.0)
     scale = xp.where(moves, scale, length)  # a row that nothing moves here: as if in metres
 
-    def largest(x: NumericArray) -> NumericArray:
-        return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)
-
-    body = pair % len(mass)
-    yields = (moved**2 / mass[body] + turned**2 / inertia[body]) * (length / scale[row]) ** 2  # 1/kg, of a row at a body
-    rank_tol = RANK_TOL / xp.sqrt(xp.maximum(1.0, largest(yields) * xp.max(mass) / ORDINARY_MASS_RATIO))
-
     unit = xp.tile(xp.stack([length, length, xp.ones_like(length)]), len(mass))
     v = xp.asarray(mechanism.v0).ravel()
     # An acceleration a lets a pendulum of length L swing to and fro in pi sqrt(L / a) each.
-    swings = (xp.sqrt(largest(x)) / np.pi for x in (free / unit, gamma / scale))
-    rates = [largest(v / unit), largest(psi_t / scale), *swings]
+    swings = (xp.sqrt(_largest(x, xp)) / np.pi for x in (free / unit, gamma / scale))
+    rates = [_largest(v / unit, xp), _largest(psi_t / scale, xp), *swings]
+    rank_tol = _rank_tol(reach, length / scale, mass, inertia, xp)
     return Scales(length, arm, reduce(xp.maximum, rates), xp.max(mass), scale, rank_tol)
+
+
+def _reach(mechanism: Mechanism, guess: GuessTerms, xp: ArrayLibrary) -> RowReach:
+    """Return how the rows of Psi meet bodies at the initial guess."""
+    count, turns = len(mechanism.bodies), guess.columns % 3 == 2
+    pair, of_entry = np.unique(guess.rows * count + guess.columns // 3, return_inverse=True)
+    psi_q, turns = _grouped(guess.psi_q, of_entry, len(pair), xp), _grouped(turns, of_entry, len(pair), np) > 0
+    moved = xp.sqrt(xp.sum(xp.where(turns, 0.0, psi_q**2), 1))
+    return RowReach(pair // count, pair % count, moved, xp.sum(xp.where(turns, xp.abs(psi_q), 0.0), 1))
+
+
+def _rank_tol(reach: RowReach, weights: Any, mass: Any, inertia: Any, xp: ArrayLibrary = jnp) -> Any:
+    """Return the rank threshold of D, its rows weighted."""
+    yields = reach.moved**2 / mass[reach.body] + reach.turned**2 / inertia[reach.body]  # 1/kg, of a row at a body
+    most = _largest(yields * weights[reach.row] ** 2, xp) * xp.max(mass)
+    return RANK_TOL / xp.sqrt(xp.maximum(1.0, most / ORDINARY_MASS_RATIO))
+
+
+_deferred_rank_tol = deferred(_rank_tol)
+
+
+def _largest(x: NumericArray, xp: ArrayLibrary) -> NumericArray:
+    """Return the largest size of those that are finite."""
+    return xp.max(xp.where(xp.isfinite(x), xp.abs(x), 0.0), initial=0.0)
