@@ -9,15 +9,13 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import ModuleType
-from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
-
-Value: TypeAlias = Any  # a number of Python, NumPy or JAX, or an array: each has its own operators
+from udkjax.expressions.written_steps import Value, WrittenSteps
 
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # the standard library's math and NumPy have them under the same names
@@ -56,51 +54,6 @@ _OPERATORS: dict[str, tuple[Callable, Callable]] = {
     "mul": (operator.mul, jax.lax.mul),
     "div": (operator.truediv, jax.lax.div),
 }
-
-
-_SYMBOLS: dict[Callable, str] = {operator.add: "+", operator.sub: "-", operator.mul: "*", operator.truediv: "/"}
-_WORTH_WRITING = (
-    20  # runs of steps one by one that take as long as writing them as a function of Python, which is 3 times as fast
-)
-
-
-class _Steps:
-    """Functions that are called one after another, each with numbers among the given ones and the results so far."""
-
-    def __init__(self, given: int, steps: list[tuple[Callable, list[int]]], outputs: list[int]):
-        self._given, self._steps, self._outputs = given, steps, outputs
-        self._runs, self._function = 0, None
-
-    def __call__(self, values: Sequence[Value]) -> list[Value]:
-        if self._function is None:
-            self._runs += 1
-            if self._runs <= _WORTH_WRITING:
-                known: list[Value] = [*values]
-                for function, places in self._steps:
-                    known.append(function(*[known[k] for k in places]))
-                return [known[k] for k in self._outputs]
-            self._function = self._write()
-        return self._function(values)
-
-    def _write(self) -> Callable[[Sequence[Value]], list[Value]]:
-        """Return the steps as one function of Python."""
-        lines = ["def run(values):"]
-        if self._given:
-            lines.append(f" {''.join(f'x{k}, ' for k in range(self._given))} = values")
-        functions: dict[str, Any] = {}
-        for k, (function, places) in enumerate(self._steps, self._given):
-            arguments = [f"x{p}" for p in places]
-            if function in _SYMBOLS:
-                found = f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}"
-            elif function is operator.neg:
-                found = f"-{arguments[0]}"
-            else:
-                functions[f"f{k}"] = function
-                found = f"f{k}({', '.join(arguments)})"
-            lines.append(f" x{k} = {found}")
-        lines.append(f" return [{', '.join(f'x{k}' for k in self._outputs)}]")
-        exec("\n".join(lines), functions)
-        return functions["run"]
 
 
 class ScalarProgram:
@@ -170,10 +123,10 @@ class ScalarProgram:
         return all(n.kind == "constant" or _plain_function(n, math, _NUMBER_FUNCTIONS) for n in nodes)
 
     @cached_property
-    def _steps_on_arrays(self) -> _Steps:
+    def _steps_on_arrays(self) -> WrittenSteps:
         return self._steps(_function_of_arrays)
 
-    def _steps(self, function_of: Callable[[Node], Callable]) -> _Steps:
+    def _steps(self, function_of: Callable[[Node], Callable]) -> WrittenSteps:
         places, steps = {(s.index, 1): k for k, s in enumerate(self.inputs)}, []
 
         def append(key: tuple[int, int], function: Callable, arguments: list[int]) -> None:
@@ -189,7 +142,7 @@ class ScalarProgram:
             node = self.graph.nodes[index]
             append((index, 1), function_of(node), [find(a) for a in node.arguments])
         outputs = [find(s) for s in self.outputs]
-        return _Steps(len(self.inputs), steps, outputs)
+        return WrittenSteps(len(self.inputs), steps, outputs)
 
     def count(self) -> dict[str, int]:
         """Count the operations of each kind; the sine and cosine of one angle are one."""
