@@ -182,7 +182,7 @@ def test_twenty_seconds(formulation, angle, rate):
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
     sol = udk.simulate(mech, LONG, rtol=1e-9, atol=1e-9, formulation=formulation, max_steps=5000)
     assert np.abs(exact(mech, sol) - sol.q).max() < 2e-6
-    assert jnp.abs(udk.violation(mech, sol)).max() < 1e-9
+    assert jnp.abs(udk.violation(mech, sol)).max() < 1e-12
 
 
 @pytest.mark.slow
