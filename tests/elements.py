@@ -29,6 +29,7 @@ DRIVERS = {
     "turn": udk.Driver(["ground", "b"], "angle", udk.Polynomial([0.1, 2.0, -0.7, 0.2])),
     "push": udk.Driver(["ground", "b"], "x", udk.Sine(1.0, 2.0, 0.3, -0.2)),
     "lift": udk.Driver(["a", "b"], "y", udk.Spline([0.0, 1.0, 3.0], [0.0, 0.5, 0.1]), P),
+    "slide": udk.Driver(["a", "b"], "x", udk.Sine(0.8, 1.0, 0.3, -0.2), P, axis=0.7),
     "stretch": udk.Driver(["a", "b"], "distance", udk.Polynomial([1.0]), P),
 }
 FORCES = {

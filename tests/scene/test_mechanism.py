@@ -20,7 +20,7 @@ def test_the_order_is_the_users(everything):
     again = jax.tree.unflatten(jax.tree.structure(everything), jax.tree.leaves(everything))
     assert list(again.bodies) == ["b", "a", "c"]
     assert list(again.constraints) == [*everything.joints, *everything.drivers]
-    assert list(again.constraints)[-4:] == ["turn", "push", "lift", "stretch"]
+    assert list(again.constraints)[-5:] == ["turn", "push", "lift", "slide", "stretch"]
     assert hash(jax.tree.structure(again)) == hash(jax.tree.structure(everything))
 
 

@@ -7,6 +7,8 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from tests.elements import DRIVERS
+from udkjax.study.drive import Coordinate, coordinate_value
 
 SCENES = {"driven pendulum": udk.library.driven_pendulum, "slider crank": lambda: udk.library.slider_crank(0.3, 4.0)}
 
@@ -23,6 +25,41 @@ def test_what_is_fed_forward_reproduces_the_motion(name):
     sol = udk.simulate(free, ts, state=udk.State(exact.q[0], exact.v[0]), rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(sol.q, exact.q, atol=1e-8)
     np.testing.assert_allclose(sol.v, exact.v, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_the_coordinate_of_a_driver_is_what_its_row_holds(name):
+    driver, frames = DRIVERS[name].complete(), (udk.Frame.at([0.3, -0.2], 0.4), udk.Frame.at([1.1, 0.7], -0.9))
+    row = driver.residual(0.6, *frames)[0] + driver.motion(0.6)
+    np.testing.assert_allclose(coordinate_value(Coordinate.of(driver), *frames), row, rtol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, np.pi / 2, -2.0])
+def test_a_slide_is_pushed_along_its_own_line(angle):
+    """A slide of mass m on an incline: m (a + g sin(angle)) along it, and m g cos(angle) across; the motion from zero on."""
+    along, ts, half = np.array([np.cos(angle), np.sin(angle)]), np.array([0.0, 0.5]), 1.5
+    ramp = udk.Drawing(
+        pins={"P": (0.3, 0.1)},
+        links={"block": udk.Link(["P"], mass=2.0, width=0.1)},
+        slides={"guide": {"link": "block", "direction": along}},
+        motors={"push": {"slide": "guide", "motion": udk.Polynomial([0.0, 0.2, half])}},
+    ).mechanism()
+    motion = udk.kinematics(ramp, None, ts)
+    found = udk.inverse_dynamics(ramp, ts, motion)
+    force = 2.0 * (2 * half + 9.81 * np.sin(angle))
+    np.testing.assert_allclose(found.efforts["push"], force, rtol=1e-12)
+    np.testing.assert_allclose(found.powers["push"], force * (0.2 + 2 * half * ts), rtol=1e-12)
+    driven = udk.kinematics(ramp, "push", [0.0, 0.4])
+    np.testing.assert_allclose(driven.q[:, 0, :2], np.array([0.3, 0.1]) + np.outer([0.0, 0.4], along), atol=1e-14)
+    loads = udk.reactions(ramp, motion, frame="joint")
+    np.testing.assert_allclose(loads["push"]["block"][:, :2], [[force, 0.0]] * 2, atol=1e-12)
+    np.testing.assert_allclose(loads["guide"]["block"][:, :2], [[0.0, 2.0 * 9.81 * np.cos(angle)]] * 2, atol=1e-12)
+    sol = udk.simulate(
+        udk.feed_forward(ramp, udk.inverse_dynamics(ramp, np.linspace(0.0, 0.5, 3))),
+        ts,
+        udk.State(motion.q[0], motion.v[0]),
+    )
+    np.testing.assert_allclose(sol.q, motion.q, atol=1e-8)
 
 
 def test_redundant_joints_and_redundant_drivers():

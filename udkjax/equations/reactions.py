@@ -64,7 +64,8 @@ def reactions(
         method: decides the rank; by default `SVD`.
         stabilization: the run's `Baumgarte`, to include what it adds.
         frame: the axes of the force. "ground"; "body": those of the body that is loaded; "joint": along x the `axis` of a
-            prismatic joint, slot or rack, or the line of a distance; of all others the axes of the last body that they hold.
+            prismatic joint, slot, rack or driver of x or y, or the line of a distance; of all others the axes of the last body
+            that they hold.
         about: the point of the torque: the "centre" of mass, or the "joint": the pin that two bodies share (in a slot or a
             prismatic joint body 2's point), each body's own of a distance; without points the centre of mass.
         compliances: of joints by their names, one number a row (m/N for rows in metres, rad/(N m) for rows in radians), or one
@@ -168,7 +169,7 @@ def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
     if isinstance(element, Prismatic | Slot | Rack):
         return frames[0].angle + element.axis
     if isinstance(element, Driver) and element.coordinate in ("x", "y"):
-        return frames[0].angle
+        return frames[0].angle if element.axis is None else frames[0].angle + element.axis
     if isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance"):
         line = between(element.points, *frames)
         return jnp.arctan2(line.y, line.x)

@@ -142,8 +142,15 @@ def number_called(name: str, optional: bool = False) -> Callable[[Any], Any]:
 
 def vector_as_angle(value: Any) -> Any:
     """Return the angle (rad) of a vector of two numbers in a table; anything else as it is, for others to refuse."""
-    is_vector = isinstance(value, list | tuple) and len(value) == 2 and all(type(x) in (int, float) for x in value) and any(value)
-    return math.atan2(value[1], value[0]) if is_vector else value
+    parts = list(value) if isinstance(value, np.ndarray | jax.Array) and value.shape == (2,) else value
+    numbers = int | float | np.number | jax.Array
+    if not isinstance(parts, list | tuple) or len(parts) != 2 or not all(isinstance(x, numbers) for x in parts):
+        return value
+    if any(isinstance(x, bool) or np.ndim(x) for x in parts):
+        return value
+    if is_traced(parts):
+        return direction(parts)
+    return math.atan2(parts[1], parts[0]) if any(parts) else value
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:

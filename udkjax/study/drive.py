@@ -45,11 +45,22 @@ class Coordinate(PrintsLine):
         bodies: the names of two bodies, or "ground".
         coordinate: "angle", "x", "y" or "distance".
         points: each in its own body's frame (m); by default the origins.
+        axis: for x and y: the direction of x in body 1's frame (rad); by default its own.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
     coordinate: CoordinateName = eqx.field(static=True, default="angle")
     points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
+    axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
+
+    @classmethod
+    def of(cls, driver: Driver) -> "Coordinate":
+        """Return the coordinate that a driver prescribes."""
+        return cls(driver.bodies, driver.coordinate, driver.points, driver.axis)
+
+    def driver(self, motion: Motion) -> Driver:
+        """Return the driver that prescribes this coordinate."""
+        return Driver(self.bodies, self.coordinate, motion, self.points, self.axis)
 
 
 Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
@@ -157,7 +168,7 @@ def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | N
 
 def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
     """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
-    driver = Driver(element.bodies, element.coordinate, _constant(0.0), element.points).complete()
+    driver = element.driver(_constant(0.0)).complete()
     if is_traced((driver, frames)):
         return jnp.asarray(driver.residual(0.0, *frames)[0])
     return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
@@ -193,8 +204,7 @@ def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
 
 def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coordinate]:
     if isinstance(driver, str) and driver in mechanism.drivers:
-        found = mechanism.drivers[driver]
-        return driver, Coordinate(found.bodies, found.coordinate, found.points)
+        return driver, Coordinate.of(mechanism.drivers[driver])
     element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
     return choose_name("value", mechanism.constraints), element
 
@@ -212,13 +222,13 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar)
     with jax.ensure_compile_time_eval():
         origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
     held = {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
-    held[name] = Driver(element.bodies, element.coordinate, ValueMotion(), element.points)
+    held[name] = element.driver(ValueMotion())
     return with_drivers(mechanism, held, origin=origin)
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
     """Return the mechanism with one more driver, or with another motion of one that is there."""
-    drivers = {**mechanism.drivers, name: Driver(element.bodies, element.coordinate, motion, element.points)}
+    drivers = {**mechanism.drivers, name: element.driver(motion)}
     known = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     found = with_drivers(mechanism, drivers)
     if known is None or found.is_concrete:
@@ -226,7 +236,7 @@ def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: P
     with jax.ensure_compile_time_eval():
         element = _known_element(known, name, element)
         motion = _constant(value_of(known, element)(known.q0))  # rows are counted as if the guess's value were held
-        of_origin = {**known.drivers, name: Driver(element.bodies, element.coordinate, motion, element.points)}
+        of_origin = {**known.drivers, name: element.driver(motion)}
         return with_drivers(mechanism, drivers, origin=Origin(with_drivers(known, of_origin)))
 
 
@@ -243,12 +253,10 @@ def with_drivers(
 
 
 def _known_element(known: Mechanism, name: str, element: Coordinate) -> Coordinate:
-    """Return the same coordinate, with points that are not traced."""
+    """Return the same coordinate, with points and an axis that are not traced."""
     if name in known.drivers:
-        return _element(known, name)[1]
-    if element.points is not None and isinstance(element.points, Tracer):
-        return Coordinate(element.bodies, element.coordinate, [(0.0, 0.0), (0.0, 0.0)])
-    return element
+        return Coordinate.of(known.drivers[name])
+    return jax.tree.map(lambda x: jnp.zeros(x.shape) if isinstance(x, Tracer) else x, element)
 
 
 def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:

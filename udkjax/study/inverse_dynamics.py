@@ -105,14 +105,16 @@ class Effort(ForceElement):
         coordinate: of the driver: "angle", "x", "y" or "distance".
         law: the torque (N m) or force (N) as a function of time.
         points: each in its own body's frame (m); None: the origins.
+        axis: for x and y: the direction of x in body 1's frame (rad); None: its own.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
     law: Motion = eqx.field(metadata=CALLED)
     points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
+    axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
 
     def potential(self, t, *frames):
-        return -self.law(t) * coordinate_value(Coordinate(self.bodies, self.coordinate, self.points), *frames)
+        return -self.law(t) * coordinate_value(Coordinate(self.bodies, self.coordinate, self.points, self.axis), *frames)
 
     @property
     def breakpoints(self):
@@ -184,7 +186,7 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     forces = dict(mechanism.forces)
     for name, effort in found.efforts.items():
         e = elements[name]
-        forces[choose_name(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points)
+        forces[choose_name(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points, e.axis)
     return without_drivers(mechanism, forces)
 
 

@@ -1,6 +1,7 @@
 """Drawings against the same mechanisms written by hand, and their pins as parameters."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +125,37 @@ def test_elements_act_where_they_are_drawn():
     assert_allclose(end["wheel"][2], 0.3 * np.sin(2.0), atol=1e-9)
     assert_allclose(end["pinion"][2], -2 * end["wheel"][2], atol=1e-9)
     assert_allclose(end["block"][2] - end["arm"][2], -angle, atol=1e-9)  # it slides on the arm without turning
+
+
+def ramp(direction, motion: Any = udk.Polynomial([0.0, 2.0]), **units):
+    links, slides = {"block": udk.Link(["P"], mass=2.0, width=0.1)}, {"guide": {"link": "block", "direction": direction}}
+    push = {"slide": "guide", "motion": motion}
+    return udk.Drawing({"P": (0, 0)}, links, slides=slides, motors={"push": push}, units=units).mechanism()
+
+
+def test_a_direction_is_an_angle_or_any_two_numbers():
+    along = np.array([-1.0, 2.0])
+    for given in (along, jnp.asarray(along), tuple(along), [-1, 2], list(jnp.asarray(along)), np.arctan2(2.0, -1.0)):
+        assert_allclose(ramp(given).joints["guide"].axis, np.arctan2(2.0, -1.0), rtol=1e-15)
+    slope = jax.grad(lambda x: ramp([jnp.cos(x), jnp.sin(x)]).joints["guide"].axis)(0.3)
+    assert_allclose(slope, 1.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize("given", [np.zeros(2), [0, 0], np.ones(3), [True, 1], [[1, 2], [3, 4]]], ids=str)
+def test_what_is_no_direction_is_the_only_mistake(given):
+    with pytest.raises(udk.SceneError) as refused:
+        ramp(given)
+    (problem,) = refused.value.problems
+    assert problem.startswith('slide "guide" (slide[0]).direction: must be a number, is [')
+
+
+@pytest.mark.parametrize("kind", [list, np.array, jnp.array])
+def test_coefficients_are_over_powers_of_the_time_whatever_holds_them(kind):
+    motion = {"type": "polynomial", "coefficients": kind([1.0, 2.0])}
+    with pytest.raises(udk.SceneError, match=r"coefficients\[1\]: 2.0 of what\? length is in mm and time is in ms"):
+        ramp(0.0, motion, length="mm", time="ms")
+    found = ramp(0.0, motion, length="mm", velocity="m/s").drivers["push"].motion
+    assert_allclose(np.asarray(found(1.0)), 2.001, rtol=1e-15)
 
 
 def test_a_cam_turns_its_drawn_profile():

@@ -73,7 +73,8 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed):
         return DrawingElements(groups, gravity, problems)
     layout = PinLayout(groups["link"], fixed, groups["slide"])
-    problems += layout_mistakes(layout, groups, fixed)
+    all_read = all(len(groups[section]) == len(named[section]) for section in groups)
+    problems += layout_mistakes(layout, groups, fixed, all_read)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = known_elements(groups)
         problems += shape_mistakes({name: pin.position for name, pin in drawn["pin"].items()}, drawn["link"])

@@ -148,6 +148,8 @@ class Units:
                 )
                 continue
             unit = _unit(cls, name, variant, law)
+            if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and name in (*VECTORS, "coefficients"):
+                value = list(value)
             if name in VECTORS and isinstance(value, list | tuple):
                 found[name] = vector_as_angle(value)
                 continue

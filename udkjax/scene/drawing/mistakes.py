@@ -38,8 +38,11 @@ def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, 
     return found
 
 
-def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str]) -> Iterator[str]:
-    """Iterate over the mistakes in how pins, links and other elements meet; all names are known."""
+def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str], all_read: bool) -> Iterator[str]:
+    """Iterate over the mistakes in how pins, links and other elements meet; all names are known.
+
+    Where not all elements could be read (`all_read`), what seems to hang on nothing may hang on one of the others.
+    """
     elements = {s: g for s, g in groups.items() if g and isinstance(next(iter(g.values())), DrawnElement)}
     yield from _taken_names(layout, groups)
     anchors = {pin for group in elements.values() for element in group.values() for pin in element.anchors}
@@ -54,7 +57,7 @@ def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str]) ->
     for k, (name, link) in enumerate(layout.links.items()):
         place = where("link", k, name)
         yield from (f"{place}{problem}" for problem in _link_mistakes(link))
-        if name not in attached:
+        if all_read and name not in attached:
             yield f"{place}.pins: no other link and no ground shares one of them: the link hangs on nothing"
     for section, group in elements.items():
         for k, (name, element) in enumerate(group.items()):
