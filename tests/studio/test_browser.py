@@ -75,6 +75,10 @@ def test_the_paper_five_bar_is_drawn_diagnosed_moved_and_saved(studio):
     assert_moves_as_simulated(studio, file.read_text())
     found = udk.diagnose(udk.load(file))
     assert (found.degrees_of_freedom, found.redundant) == (1, 1)
+    studio.tool("m")
+    studio.click(30, 150)
+    studio.settle()
+    assert "motor1 turns all the way round" in studio.findings
 
 
 @pytest.mark.slow

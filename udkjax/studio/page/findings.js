@@ -73,7 +73,7 @@ export class FindingsPanel {
     const rows = [make("p", {class: "lead"}, make("b", {}, plural(s.joint_freedoms, "freedom")), driven, " · ",
       make("b", {class: s.redundant ? "bad" : ""}, s.redundant ? plural(s.redundant, "redundant constraint") : "nothing redundant")),
     make("p", {}, s.motion, "."), ...(s.singular ? [make("p", {class: "warn"}, "It stands in a singular position: branches of its motion meet here, or it gives way to first order only.")] : [])];
-    for (const {motor, unit, ends} of this.travel ?? []) rows.push(make("p", {class: ends.length ? "warn" : ""}, travelWords(motor, unit, ends)));
+    for (const one of this.travel ?? []) rows.push(make("p", {class: one.ends.length || one.lost.length ? "warn" : ""}, travelWords(one)));
     for (const set of s.sets) rows.push(this.set(set, pins));
     const loose = Object.entries(s.loose);
     rows.push(make("p", {}, make("b", {}, "Reactions: "), loose.length
@@ -89,7 +89,7 @@ export class FindingsPanel {
   /** How far motors turn, in words; nothing while it is not known of this drawing. */
   travelWords() {
     if (!this.travel || this.element.classList.contains("stale")) return "";
-    return this.travel.map(({motor, unit, ends}) => travelWords(motor, unit, ends)).join(" ");
+    return this.travel.map(travelWords).join(" ");
   }
 
   /** A button that makes a fix, where the drawing has something for it. */
