@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from tests.choices import fast
+from tests.scaling import scaled
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.compiled_mechanism import compile_known
 from udkjax.integrate.native_engine import mark_rows
@@ -95,6 +96,22 @@ def test_a_jitted_function_of_a_mechanism_is_machine_code():
     assert len(traces) == 1
     filtered = eqx.filter_jit(udk.simulate)(udk.library.parallelogram(), TIMES)
     assert_allclose(filtered.q, udk.simulate(udk.library.parallelogram(), TIMES).q, rtol=0, atol=1e-10)
+
+
+def test_traced_numbers_mean_scales_of_their_own():
+    """A mechanism a thousand times as long and heavy takes the steps of a known one, under jit and beside others in a batch."""
+    linkage = udk.library.parallelogram(angle=-0.3)
+    sizes = [linkage, scaled(linkage, length=1e3, mass=1e3)]
+    known = [udk.simulate(mechanism, TIMES) for mechanism in sizes]
+    run = lambda values: udk.simulate(linkage.with_parameters(values), TIMES)  # noqa: E731
+    numbers = [mechanism.parameters() for mechanism in sizes]
+    batch = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: np.stack(x), *numbers))
+    for k, found in enumerate(
+        [jax.tree.map(lambda x: x[0], batch), jax.jit(run)(numbers[1]), jax.tree.map(lambda x: x[1], batch)]
+    ):
+        other = known[min(k, 1)]
+        assert {name: int(x) for name, x in found.stats.items()} == {name: int(x) for name, x in other.stats.items()}
+        assert_allclose(found.q, other.q, rtol=0, atol=1e-11 * np.abs(other.q).max())
 
 
 def test_batches_of_mechanisms_stacked_or_made_of_traced_numbers():

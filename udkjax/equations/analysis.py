@@ -23,7 +23,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.equations.redundancy import redundant_rows
-from udkjax.equations.scales import Scales, known_scales, scales_by_masses, traced_scales
+from udkjax.equations.scales import Scales, known_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
@@ -109,10 +109,9 @@ def analyse(mechanism: Mechanism) -> Analysis:
     """Find the rank, the redundant rows and the scales of a mechanism; results are cached by structure and numbers.
 
     Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
-    the known one that it was made from by `with_parameters`: a run watches the rows that are left out, and says so where numbers
-    made one of them independent. It has the scales of that one, too, with the rank threshold of its own masses. A mechanism whose
-    geometry is traced as an argument of a function under `jit` has no origin: its scales are its own, its redundant rows are not
-    known here, and a run finds them when it begins.
+    the known one that it was made from by `with_parameters`, and the scales of its own numbers: a run watches the rows that are
+    left out, and says so where numbers made one of them independent. A mechanism whose geometry is traced as an argument of a
+    function under `jit` has no origin: its redundant rows are not known here, and a run finds them when it begins.
 
     Args:
         mechanism: The scene; its numbers may be traced.
@@ -122,9 +121,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:
-            known = mechanism.origin.mechanism
-            found = analyse(known)
-            return replace(found, scales=scales_by_masses(found.scales, known, mechanism))
+            return replace(analyse(mechanism.origin.mechanism), scales=traced_scales(mechanism))
         mechanism = mechanism.without_origin
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
         return Analysis(traced_scales(mechanism), count, names, _rows_of_known_geometry(mechanism))

@@ -21,7 +21,7 @@ from udkjax.equations.constraints import State
 from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
-# Relative to the largest singular value: the rank that decides what statics leaves open. `scales.RANK_TOL`, of motion, has to let
+# Relative to the largest singular value: the rank that decides what statics leaves open. That of motion, `RANK_TOL`, has to let
 # runs cross singular configurations, and is larger. At one, a residual of rounding, 1e-16, is a displacement of its root, 1e-8,
 # and so is the singular value that should vanish there: a hundred times that.
 STATIC_RANK_TOL = 1e-6

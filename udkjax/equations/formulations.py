@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import exceeds

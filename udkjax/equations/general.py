@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.printing import PrintsLine

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
+from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
 from udkjax.equations.scene_solver import SceneSolver, program
@@ -72,6 +73,11 @@ class ScenePrograms:
     def term_count(self) -> int:
         """The number of values that `equation_terms` returns."""
         return self.coordinate_count + self.row_count
+
+    @property
+    def scale_count(self) -> int:
+        """The number of values that `scales` returns."""
+        return ROWS + self.row_count
 
     @property
     def piece_count(self) -> int:
@@ -287,6 +293,11 @@ class ScenePrograms:
     def prologue(self) -> LoopProgram:
         """`constants`, from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
         return write_prologue(self._layout, self._places, self._number_count)
+
+    @cached_property
+    def scales(self) -> ScaleProgram:
+        """scales, from `numbers`, those of the scene and the two thresholds: the characteristic scales of the guess."""
+        return write_scales(self._terms, self._places, self.prologue)
 
     @cached_property
     def differentiable(self) -> DifferentiablePrograms:

@@ -20,7 +20,8 @@ from scipy.sparse.linalg import splu
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE, RowTerms
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import RANK_TOL, known_scales, mass_of
+from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.scales import known_scales, mass_of
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.fields import ROUNDING

@@ -80,8 +80,7 @@ def simulate(
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
             their rates by 1/T of that, with L the characteristic length (`analyse`) and T the shortest of the characteristic
             time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. So the same tolerances
-            mean the same accuracy at any scale. Numbers that are traced by `with_parameters` leave L and the characteristic time
-            as they were. L = T = 1 for a `ConstrainedSystem`.
+            mean the same accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
         method: the pseudoinverse; by default `Auto()`.
         stabilization: `Projection()`, a `Baumgarte`, or None.
         solver: any diffrax solver for ordinary differential equations; by default Dopri8, of those measured in benchmarks/ the

@@ -12,7 +12,7 @@ from typing import Any
 
 from udkjax.native.ir import INT, POINTER, Function, Value
 from udkjax.native.layout import INPUTS, SHARE
-from udkjax.native.module import Module
+from udkjax.native.memory import Memory
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
 # size, extensions, count, types, buffers.
@@ -30,7 +30,7 @@ USERS, BEGUN, ENDED, NEXT, CALL = range(5)
 CLOSED = 2**32
 
 
-def handler(trajectory: Module, name: str) -> list[Function]:
+def handler(trajectory: Memory, name: str) -> list[Function]:
     """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions.
 
     The last of some functions.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.scale_program import RANK_TOL
 from udkjax.native.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.layout import FORMULATION_SETTINGS
 from udkjax.native.module import Module

@@ -41,6 +41,10 @@ class Memory:
         lengths = (f"{x} length" for x in self.lengths)
         return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, *lengths, "next"
 
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        raise NotImplementedError
+
     def layout(self, pointer: str) -> Layout:
         """Return the layout of the memory at a pointer."""
         return self.places if pointer == "work" else self.tangents

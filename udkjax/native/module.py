@@ -274,10 +274,6 @@ class Module(Memory):
         """Return whether there is something to do in the lanes."""
         return f.any_of(s.active > 0.5)
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
-        raise NotImplementedError
-
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Take one step in all lanes, and finish those that are done."""
         raise NotImplementedError

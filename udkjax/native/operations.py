@@ -25,9 +25,11 @@ from udkjax.native.event_states import EventStates
 from udkjax.native.formulations import FormulationCode
 from udkjax.native.layout import FORMULATION_SETTINGS, OUTPUTS, SETTINGS, SHARE
 from udkjax.native.marching import Marching
+from udkjax.native.memory import Memory
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.row_marks import RowMarks
+from udkjax.native.scale_code import ScaleCode
 from udkjax.native.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
 
 Shape = tuple[int, ...]
@@ -56,7 +58,7 @@ class Operation(ABC):
         return 0
 
     @abstractmethod
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, beside: int, vector: int) -> Memory:
         """Return the module in so many lanes.
 
         Args:
@@ -236,6 +238,22 @@ class MarkRows(Operation):
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
         return [(self.code.row_count,)]
+
+
+@dataclass(frozen=True)
+class FindScales(Operation):
+    """Find the characteristic scales, of numbers alone."""
+
+    settings: ClassVar[tuple[str, ...]] = ()
+    in_lanes: ClassVar[bool] = False
+    results: ClassVar[int] = len(ScaleCode.results)
+    share: ClassVar[int] = 32 * SHARE  # a member takes a microsecond
+
+    def module(self, width: int, beside: int, vector: int) -> Memory:
+        return ScaleCode(self.code)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [(self.code.scale_count,)]
 
 
 @dataclass(frozen=True)

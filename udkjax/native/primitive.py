@@ -19,14 +19,15 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
+from udkjax.equations.scales import evaluate_scales, scales_by_jax, scales_p
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.expressions.numpy_program import evaluate_as
 from udkjax.native import machine
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.loops import LoopWriter
-from udkjax.native.module import Module
-from udkjax.native.operations import Operation
+from udkjax.native.memory import Memory
+from udkjax.native.operations import FindScales, Operation
 from udkjax.native.program import UnsupportedError
 from udkjax.native.steps import STEP_LIMIT
 
@@ -39,7 +40,7 @@ FEW = 2  # members up to which one follows another: eight lanes take as long as 
 
 
 @lru_cache(maxsize=256)
-def generate(operation: Operation, width: int, beside: int) -> Module:
+def generate(operation: Operation, width: int, beside: int) -> Memory:
     """Write the module of an operation in so many lanes; raise `UnsupportedError` where there is no instruction for it.
 
     `beside`: how many directions of a single member are side by side.
@@ -285,3 +286,31 @@ native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
 mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
 evaluate_as(native_p, call_members)
+
+
+# --- the scales of traced mechanisms, whose operation of JAX is the equations'
+
+
+def _scale_inputs(numbers: Any) -> list[Any]:
+    none = np.zeros((1, 0))
+    return [numbers.reshape(-1, numbers.shape[-1]), np.zeros((1, 1)), *[none] * (len(INPUTS) - 2)]
+
+
+def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
+    if numbers.dtype != np.float64 or unsupported(programs):
+        return scales_by_jax(numbers, programs)
+    (found,) = native_p.bind(*_scale_inputs(numbers), operation=FindScales(programs), times=1)
+    return found.reshape(*numbers.shape[:-1], -1)
+
+
+def _scales_of_batch(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
+    """Return scales as an operation by itself: of a few vectors by NumPy, which compiles nothing."""
+    if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or jax.default_backend() != "cpu" or unsupported(programs):
+        return evaluate_scales(numbers, programs)
+    (found,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)
+    return found.reshape(*numbers.shape[:-1], -1)
+
+
+mlir.register_lowering(scales_p, mlir.lower_fun(_find_scales, multiple_results=False), platform="cpu")
+scales_p.def_impl(lambda numbers, programs: jax.device_put(_scales_of_batch(np.asarray(numbers), programs)))
+evaluate_as(scales_p, _scales_of_batch)

@@ -12,7 +12,7 @@ from udkjax.equations.constraints import gamma, psi
 from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import ROUNDING_UNITS
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism

@@ -26,7 +26,7 @@ from udkjax.annotations import Scalar
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.load_scale import load_sizes
-from udkjax.equations.scales import RANK_TOL
+from udkjax.equations.scale_program import RANK_TOL
 from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from udkjax.native import code_cache, machine
-from udkjax.native.module import Module
+from udkjax.native.memory import Memory
 from udkjax.native.operations import Operation
 from udkjax.native.wasm.object_code import LinkedModule, link
 
@@ -23,7 +23,7 @@ class WasmModule(NamedTuple):
     """A module of the engine: its code, and the module of which it knows how it is called."""
 
     linked: LinkedModule
-    module: Module
+    module: Memory
 
 
 def wasm_module(operation: Operation) -> WasmModule:
