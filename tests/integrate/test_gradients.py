@@ -200,3 +200,18 @@ def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
     chosen = [METHODS[name] for name in ("Auto", "Varga", "Greville")]
     by_each = jax.jit(lambda q, v: [udk.accelerations(mech, 0.0, q, v, method) for method in chosen])
     np.testing.assert_allclose(by_each(mech.q0, mech.v0), 0.0, atol=1e-12)
+
+
+def test_a_spring_between_pins_that_a_joint_holds_together_changes_no_gradient():
+    """Rounding alone is between its ends: derivatives of the direction of its force would be rounding over rounding."""
+    pendulum, ts = udk.library.double_pendulum(), np.linspace(0.0, 1.0, 5)
+    elbow = pendulum.joints["elbow"]
+    assert isinstance(elbow, udk.Revolute)
+    spring = {"spring": udk.Spring(elbow.bodies, elbow.points, stiffness=100.0, length=0.1, damping=1.0)}
+
+    def gradients(forces):
+        mechanism = udk.Mechanism(pendulum.bodies, pendulum.joints, forces=forces, gravity=pendulum.gravity)
+        end = lambda mass: udk.simulate(mechanism.with_parameters({"body.upper.mass": mass}), ts).q[-1, -1, 2]  # noqa: E731
+        return jax.grad(end)(1.0), jax.jacfwd(end)(1.0)
+
+    np.testing.assert_allclose(gradients(spring), gradients({}), rtol=1e-6)

@@ -60,10 +60,14 @@ class Point(NamedTuple):
         """Return the scalar product with another vector."""
         return self.x * other.x + self.y * other.y
 
-    def norm(self) -> Array:
-        """Return the vector's length; at the zero vector, where it has a kink, the derivative is taken as zero."""
+    def norm(self, least: Number = 0.0) -> Array:
+        """Return the vector's length; at the zero vector, where it has a kink, the derivative is taken as zero.
+
+        Args:
+            least: A length up to which a vector is taken as zero.
+        """
         square = self.dot(self)
-        xp, nonzero = array_namespace(square), square > 0
+        xp, nonzero = array_namespace(square), square > least * least
         return xp.where(nonzero, xp.sqrt(xp.where(nonzero, square, 1.0)), 0.0)
 
 

@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.printing import PrintsLine
@@ -22,6 +23,10 @@ from udkjax.scene.fields import (
 from udkjax.scene.held import Held, given_sampled, value_at
 
 Load = tuple[Number, Number, Number]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
+
+# Of a spring's length: nearer, its ends are taken to be in one place. Derivatives of the direction of its force lose as many
+# digits as the ends are near: between pins that joints hold together, where rounding alone is between them, all of them.
+NEAREST = float(np.sqrt(np.finfo(float).eps))
 
 
 class ForceElement(PrintsLine):
@@ -62,6 +67,10 @@ class Spring(ForceElement):
 
     The damper's force on point 2 is -damping d|d|/dt along the line. Units: N/m, N s/m, m.
 
+    Where its ends meet, a spring with a length pulls nowhere, since d has no direction; between pins that a joint holds together
+    it changes nothing. Where its ends pass through one another its force jumps: the motion is right, its derivatives lack what
+    they change by at that moment.
+
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
         points: the ends, each in its own body's frame (m).
@@ -77,7 +86,7 @@ class Spring(ForceElement):
 
     def potential(self, t, *frames):
         d = between(self.points, *frames)
-        distance = d.norm()
+        distance = d.norm(NEAREST * self.length)
         # Where the ends meet, |d| has a kink, but the energy of a spring without a length has none: its |d|^2 is d.d.
         square = jnp.where(self.length > 0, (distance - self.length) ** 2, d.dot(d) - (2 * distance - self.length) * self.length)
         return 0.5 * self.stiffness * square
