@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, numbers_as_vector
+from udkjax.expressions.deferred import deferred
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.expressions.numpy_program import evaluate_as
 from udkjax.printing import prints_table, units
@@ -76,7 +77,12 @@ def known_scales(mechanism: Mechanism) -> Scales:
 
 def traced_scales(mechanism: Mechanism) -> Scales:
     """Return the same in a trace; without derivatives."""
-    numbers = jax.lax.stop_gradient(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))
+    return _traced_scales(jax.lax.stop_gradient(mechanism.without_origin))
+
+
+@deferred
+def _traced_scales(mechanism: Mechanism) -> Scales:
+    numbers = numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS])
     return _unpack(scales_p.bind(numbers, programs=scene_programs(mechanism)))
 
 
