@@ -51,7 +51,9 @@ def test_designs_are_found_shown_and_written(folder, capsys):
     ("old", "new", "says"),
     [
         ('kind = "path"', 'kind = "pat"', "goal.kind must be one of"),
-        ('point = "P"', 'pont = "P"', "unknown key"),
+        ('point = "P"', 'pont = "P"', 'goal.pont: unknown key; did you mean "point"?'),
+        ('point = "P"', "", "goal.point: missing"),
+        ('point = "P"', 'point = "P"\nbody = 1', "goal.body: unknown key; known are point, targets, values"),
         ("transmission = 10", "transmision = 10", "did you mean"),
         ('pins = ["O", "A"]', 'pins = ["O"]', "must name two pins"),
         ('"pin.O" =', '"pin.Q" =', "is not free"),

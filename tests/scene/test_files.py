@@ -168,7 +168,7 @@ def test_all_mistakes_of_a_file_at_once():
         + SPRING.replace("stiffness = 1", "stiffness = nan")
     )
     assert found == [
-        "colour: unknown key",
+        "colour: unknown key; known are format, name, gravity, body, joint, driver, force",
         'body "link1" (body[0]).mass: must be > 0, is -2.0',
         'joint "A" (joint[0]).point: unknown key; did you mean "points"?',
         'joint "A" (joint[0]).bodies[1]: no body named "link2"; did you mean "link1"?',

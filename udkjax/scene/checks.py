@@ -123,7 +123,7 @@ def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Itera
     expected, sizes = keys(cls), {}
     for name in table:
         if name not in expected:
-            yield f"{where}.{_short(name)}: unknown key{suggestion(name, expected)}"
+            yield f"{where}.{_short(name)}: {unknown_key(name, expected)}"
     for name, key in expected.items():
         if name in table:
             yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
@@ -285,6 +285,12 @@ def suggestion(name: object, choices: Iterable[str]) -> str:
     lowered = {choice.lower(): choice for choice in choices}
     close = difflib.get_close_matches(name.lower(), lowered, n=1)
     return f"; did you mean {quote(lowered[close[0]])}?" if close else ""
+
+
+def unknown_key(key: object, expected: Iterable[str]) -> str:
+    """Return the words for a key that is not among the expected ones: the one that may be meant, or else all of them."""
+    known = tuple(expected)
+    return "unknown key" + (suggestion(key, known) or f"; known are {', '.join(known)}")
 
 
 def quote(name: str) -> str:

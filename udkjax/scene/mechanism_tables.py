@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, abbreviate, find_class, problems_of, suggestion
+from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, abbreviate, find_class, problems_of, unknown_key
 from udkjax.scene.fields import Table, is_traced, vector_as_angle
 from udkjax.scene.given_elements import name_elements
 from udkjax.scene.mechanism import Mechanism
@@ -65,8 +65,8 @@ def head_mistakes(scene: Table, expected: Collection[str]) -> Iterator[str]:
         yield f"name: must be a string, is {abbreviate(scene['name'])}"
     for key in scene:
         if key not in expected:
-            near = f"; write [[{key[:-1]}]]" if key[:-1] in expected and key.endswith("s") else suggestion(key, expected)
-            yield f"{key}: unknown key{near}"
+            is_plural = key.endswith("s") and key[:-1] in expected
+            yield f"{key}: " + (f"unknown key; write [[{key[:-1]}]]" if is_plural else unknown_key(key, expected))
 
 
 def read_section(

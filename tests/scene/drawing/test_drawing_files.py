@@ -197,6 +197,15 @@ MISTAKES = [
     # names
     (drawn("[pins]", "[pin]"), 'pin: unknown key; did you mean "pins"?'),
     (drawn("[[link]]", "[[links]]"), "links: unknown key; write [[link]]"),
+    (drawn(end='[[weld]]\nlinks = ["rod", "crank"]'), "weld: unknown key; known are "),
+    (
+        drawn(end='[[motor]]\nlink = "crank"\nspeed = 1'),
+        'motor "motor1" (motor[0]).link: unknown key; known are ',
+    ),
+    (
+        drawn(end='[[motor]]\npin = "O"\nspeed = "60 RPM"'),
+        'motor "motor1" (motor[0]).speed: "RPM" is no unit known here; did you mean "rpm"?',
+    ),
     (drawn('"C", "B"', '"C", "b"'), 'link "rocker" (link[2]).pins[1]: no pin named "b"; did you mean "B"?'),
     (drawn('ground = ["O", "C"]', 'ground = ["Q", "C"]'), 'ground[0]: no pin named "Q"'),
     (drawn('"rocker"', '"rod"'), 'link "rod" (link[2]).name: taken by another link'),

@@ -1,11 +1,12 @@
 """A design in a file: the mechanism, what is wanted of it, and what must hold, in units of the file."""
 
+import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.checks import SceneError, quote, unknown_key
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import load
 from udkjax.scene.mechanism import Mechanism
@@ -68,7 +69,7 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     """
     name = os.fspath(path)
     table = parse_toml(Path(path).read_text(encoding="utf-8"), name, SceneError)
-    problems = [f"unknown key {quote(key)}{suggestion(key, TOP)}" for key in table if key not in TOP]
+    problems = [f"{key}: {unknown_key(key, TOP)}" for key in table if key not in TOP]
     problems += [f"{key} is missing" for key in ("mechanism", "goal") if key not in table]
     units = Units(table.get("units"))
     problems += units.problems
@@ -114,9 +115,10 @@ def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[st
         problems.append(f"goal.kind must be one of {', '.join(map(quote, GOALS))}, not {quote(str(kind))}")
         return None
     make, keys = GOALS[kind]
-    problems += [f"goal.{key}: unknown key{suggestion(key, keys)}" for key in table if key not in (*keys, "kind")]
-    given = {key: value for key, value in table.items() if key in keys}
     before = len(problems)
+    problems += [f"goal.{key}: {unknown_key(key, keys)}" for key in table if key not in (*keys, "kind")]
+    given = {key: value for key, value in table.items() if key in keys}
+    problems += _missing("goal", make, given)
     for key, unit in keys.items():
         if key in given and unit == "pose":
             given[key] = [_pose(f"goal.{key}[{k}]", row, units, problems) for k, row in enumerate(given[key])]
@@ -139,8 +141,9 @@ def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problem
         return None
     make, unit = MOTION[kind]
     keys, before = (*MOTION_KEYS, *OWN_KEYS.get(kind, ())), len(problems)
-    problems += [f"{where}.{key}: unknown key{suggestion(key, keys)}" for key in table if key not in keys]
+    problems += [f"{where}.{key}: {unknown_key(key, keys)}" for key in table if key not in keys]
     given, driven = {key: value for key, value in table.items() if key != "kind"}, _driven_unit(mechanism)
+    problems += _missing(where, make, given)
     unit = {"rad": "N m", "m": "N"}[driven] if unit == "effort" else unit
     for key, si in (("most", unit), ("least", unit), ("speed", f"{driven}/s")):
         if key in given:
@@ -155,6 +158,12 @@ def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problem
     except (TypeError, ValueError) as problem:
         problems.append(f"{where}: {problem}")
         return None
+
+
+def _missing(where: str, make: Callable[..., Any], given: Table) -> list[str]:
+    """Return the mistakes of keys that a goal needs and that are not given."""
+    needed = [key for key, value in inspect.signature(make).parameters.items() if value.default is value.empty]
+    return [f"{where}.{key}: missing" for key in needed if key not in given]
 
 
 def _pose(path: str, row: Any, units: Units, problems: list[str]) -> list[Any]:
@@ -188,7 +197,7 @@ def _read_lengths(tables: Any, units: Units, problems: list[str]) -> dict[tuple[
     found = {}
     for k, table in enumerate(tables):
         where = f"length[{k}]"
-        problems += [f"{where}.{key}: unknown key{suggestion(key, LENGTH)}" for key in table if key not in LENGTH]
+        problems += [f"{where}.{key}: {unknown_key(key, LENGTH)}" for key in table if key not in LENGTH]
         pins = table.get("pins")
         if not isinstance(pins, list) or len(pins) != 2:
             problems.append(f'{where}.pins: must name two pins, such as ["A", "B"]')

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from udkjax.extras import OptionalImport
-from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion
+from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion, unknown_key
 from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.study.choices import CHOICES, Choice, choice
 from udkjax.study.quantities import InitialAngle, Length, Scaled, Setter
@@ -229,7 +229,7 @@ class _GridReader:
         expected = tuple(expected)
         for key in given:
             if key not in expected:
-                self.wrong(f"{place}.{key_of(key)}" if place else key_of(key), f"unknown key{suggestion(key, expected)}")
+                self.wrong(f"{place}.{key_of(key)}" if place else key_of(key), unknown_key(key, expected))
 
     def choice(self, place: str, setting: str, given: Toml) -> Choice:
         """Read one of the choices of a run."""
