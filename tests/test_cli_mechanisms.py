@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 
@@ -58,6 +59,9 @@ def test_inverse(tmp_path, capsys):
     np.testing.assert_allclose(power, rate * torque)
     peak = found["peaks"]["motor"]
     assert abs(peak["effort"]) == pytest.approx(np.max(np.abs(torque)))
+    work = np.array([0.0, *np.cumsum(0.05 * (power[1:] + power[:-1]))])
+    assert peak["work"] == pytest.approx(work[-1])
+    assert peak["swing"] == pytest.approx(np.ptp(work - np.linspace(0.0, work[-1], 4)))
     assert udkjax("inverse", EXAMPLES / "parallelogram.toml", "--t1", 0.3) == 2
 
 
@@ -87,6 +91,43 @@ def test_statics_and_modes_of_the_papers_linkage(tmp_path, capsys):
     (row,) = csv.DictReader((tmp_path / "m.csv").open())
     assert float(row["omega2 [1/s2]"]) == found["omega2"][0]
     assert float(row["body.link2.x [m]"]) == found["q"][found["bodies"].index("link2")][0]
+
+
+CLAMP = """
+format = 2
+units = {length = "mm", angle = "deg"}
+gravity = [0, 0]
+ground = ["O"]
+link = [
+  {name = "upper", pins = ["O", "A"], mass = 0.1},
+  {name = "lower", pins = ["A", "B"], mass = 0.1},
+  {name = "ram", pins = ["B"], mass = 0.1, width = 10},
+]
+slide = [{name = "guide", link = "ram", direction = [0, 1]}]
+motor = [{name = "work", slide = "guide", motion = {type = "polynomial", coefficients = [0, "0 m/s", "5 m/s2"]}}]
+load = [{pin = "A", force = ["-100 N", "0 N"]}]
+[pins]
+O = [0, 0]
+A = [5, -60]
+B = [0, -120]
+"""
+
+
+def test_statics_says_what_holds_a_toggle_clamp(tmp_path, capsys):
+    """A force P at the knee of two links that stand at a slope of 1 to 12 presses by P / 2 times 12, however the work starts."""
+    scene = tmp_path / "clamp.toml"
+    scene.write_text(CLAMP)
+    (found,) = results(capsys, "statics", scene, "--out", tmp_path / "s.csv")["equilibria"]
+    assert found["efforts"]["work"] == pytest.approx(600.0, rel=1e-12)
+    np.testing.assert_allclose(found["forces"]["O"]["upper"], [50.0, -600.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found["forces"]["guide"]["ram"][:2], [50.0, 0.0], atol=1e-9)
+    (row,) = csv.DictReader((tmp_path / "s.csv").open())
+    assert float(row["effort.work [N]"]) == found["efforts"]["work"]
+    assert float(row["pin.O.upper.fy [N]"]) == found["forces"]["O"]["upper"][1]
+    assert udkjax("statics", scene) == 0
+    assert re.search(r"work holds by +600 N\n +at O on upper +602.08 N: \(50, -600\) N\n", capsys.readouterr().out)
+    assert udkjax("statics", EXAMPLES / "parallelogram.toml") == 0
+    assert "not unique: of least norm" in capsys.readouterr().out
 
 
 def test_the_only_driver_is_meant_and_channels_are_written_and_drawn(tmp_path, capsys):

@@ -62,6 +62,20 @@ def test_a_slide_is_pushed_along_its_own_line(angle):
     np.testing.assert_allclose(sol.q, motion.q, atol=1e-8)
 
 
+def test_work_and_swing_of_a_weight_that_a_motor_turns():
+    """Torque m g r cos(w t): no work in a turn, and a swing of 2 m g r; with a brake the work 2 pi c w."""
+    rod = udk.Body(2.0, 0.1, position=[0.5, 0.0])
+    pin = udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
+    motor = udk.Driver(["ground", "rod"], "angle", udk.Polynomial([0.0, 3.0]))
+    brake = udk.TorsionSpring(["ground", "rod"], stiffness=0.0, damping=0.7)
+    turn, h = np.linspace(0.0, 2 * np.pi / 3.0, 401), 2 * np.pi / 400
+    for forces, work in (({}, 0.0), ({"brake": brake}, 0.7 * 3.0 * 2 * np.pi)):
+        found = udk.inverse_dynamics(udk.Mechanism({"rod": rod}, {"pin": pin}, {"motor": motor}, forces), turn)
+        np.testing.assert_allclose(found.works["motor"], work, atol=1e-12)
+        np.testing.assert_allclose(found.swings["motor"], 2 * 2.0 * 9.81 * 0.5, rtol=h**2 / 10)
+        assert "N m at" in str(found) and "swing of energy" in str(found)
+
+
 def test_redundant_joints_and_redundant_drivers():
     """Three links of a parallelogram driven alike: by symmetry of the weights, equal shares; by weights, shares as 1/w."""
     mech = udk.library.parallelogram(-0.8)

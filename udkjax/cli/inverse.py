@@ -37,7 +37,6 @@ def inverse(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.study.drive import element_of
 
     found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
     efforts = {name: np.asarray(x) for name, x in found.efforts.items()}
@@ -46,7 +45,8 @@ def inverse(
         good = np.isfinite(x)
         k = int(np.nanargmax(np.abs(x))) if good.any() else 0
         rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
-        results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms}
+        energies = {"work": found.works[name], "swing": found.swings[name]}
+        results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms, **energies}
     variables = {
         "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), "N m or N"),
         "power": (("time", "driver"), np.stack([np.asarray(x) for x in found.powers.values()], 1), "W"),
@@ -54,8 +54,7 @@ def inverse(
     if plot is not None:
         from udkjax.show.figures import channels_figure
 
-        torques = {name: element_of(mech, name).coordinate == "angle" for name in efforts}
-        shown = {name: (x, "N m" if torques[name] else "N") for name, x in efforts.items()}
+        shown = {name: (x, unit) for (name, x), (_, unit) in zip(efforts.items(), found.effort_units, strict=True)}
         shown |= {f"power of {name}": (np.asarray(x), "W") for name, x in found.powers.items()}
         channels_figure(ts, shown, title=mech.name).savefig(plot, dpi=150)
     write(out, text, variables, {"time": ts, "driver": list(efforts)}, {})

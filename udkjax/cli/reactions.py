@@ -34,13 +34,13 @@ def reactions(
     import udkjax as udk
     from udkjax.printing import PrintedTable, format_number, text_table
     from udkjax.study.channels import LOADS
+    from udkjax.study.reaction_peaks import unique_pin_forces
 
     sol = udk.simulate(mech, ts, throw=False)
     found = {pin: {body: np.asarray(x) for body, x in at.items()} for pin, at in udk.pin_reactions(mech, sol).items()}
     if not found:
         refuse("the scene has no joint that is at a point")
-    unique = udk.unique_reactions(mech, sol, about="joint")
-    parts = {pin: [x for name, x in unique.items() if name == pin or name.startswith(f"{pin}-")] for pin in found}
+    unique = unique_pin_forces(mech, sol)
     variables: dict[str, Any] = {}
     rows: list[tuple[str, ...]] = []
     results: dict[str, dict[str, Any]] = {}
@@ -50,9 +50,7 @@ def reactions(
                 variables[f"pin.{pin}.{body}.{name}"] = (("time",), x[:, k], unit)
             force = np.hypot(x[:, 0], x[:, 1])
             top, size = int(np.nanargmax(force)) if np.isfinite(force).any() else 0, float(np.nanmax(force, initial=0.0))
-            known = all(
-                bool(np.asarray(by_body[body])[np.isfinite(force), :2].all()) for by_body in parts[pin] if body in by_body
-            )
+            known = unique[pin][body]
             cells = [format_number(value, scale=size) for value in (force[top], x[top, 0], x[top, 1])]
             rows.append((pin, body, *cells, f"{ts[top]:g}", "" if known else "not unique: of least norm"))
             peak = {"force": force[top], "fx": x[top, 0], "fy": x[top, 1], "time": ts[top], "unique": known}

@@ -122,6 +122,11 @@ class Driver(Constraint):
     def breakpoints(self):
         return self.motion.breakpoints
 
+    @property
+    def effort_unit(self) -> str:
+        """The unit of what it exerts along its coordinate."""
+        return "N m" if self.coordinate == "angle" else "N"
+
     @fills("points")
     def complete(self, *frames):
         return self if self.coordinate == "angle" else fill(self, "points", ((0.0, 0.0), (0.0, 0.0)))

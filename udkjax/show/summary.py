@@ -32,7 +32,7 @@ def run_summary(
         **numbered("assembly", [text.removeprefix("assembly ") for text in moved]),
         "work": format_work(sol.stats),
         **trust(accuracy),
-        **{name: format_peak(sol.ts, x, mech.drivers[name].coordinate) for name, x in efforts(mech, sol).items()},
+        **{name: format_peak(sol.ts, x, mech.drivers[name].effort_unit) for name, x in efforts(mech, sol).items()},
         "time": f"{seconds:.2f} s, {compiling:.2f} s of it to compile",
     }
     return table(f"{mech.name or 'mechanism'}, {float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s, {len(sol.ts)} instants", lines)
@@ -54,9 +54,9 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
     return lines
 
 
-def format_peak(ts: ArrayLike, effort: ArrayLike, coordinate: str) -> str:
-    """Describe the effort of a driver over time: its peak and its root mean square, in the unit of its coordinate."""
-    x, unit = np.asarray(effort, float), "N m" if coordinate == "angle" else "N"
+def format_peak(ts: ArrayLike, effort: ArrayLike, unit: str) -> str:
+    """Describe the effort of a driver over time: its peak and its root mean square."""
+    x = np.asarray(effort, float)
     good = x[np.isfinite(x)]
     if not good.size:
         return "exerts nothing that is known"

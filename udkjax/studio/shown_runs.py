@@ -1,18 +1,18 @@
 """The run that the studio shows of a drawing: how long it lasts, and its curves of forces and energies."""
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.equations import analyse, efforts, unique_reactions
+from udkjax.equations import analyse, efforts
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.assembly import close
-from udkjax.scene import Driver, Mechanism, Polynomial, SceneError
+from udkjax.scene import Mechanism, Polynomial, SceneError
 from udkjax.show.player.measure_curves import measures_of
 from udkjax.study.channels import StateHistory
-from udkjax.study.reaction_peaks import pin_reactions
+from udkjax.study.drive import with_halted_drivers
+from udkjax.study.reaction_peaks import pin_reactions, unique_pin_forces
 
 Json = dict[str, Any]
 TURNS = 2  # of the slowest motor that a run shows
@@ -72,8 +72,7 @@ def holding_curves(mechanism: Mechanism) -> Json:
     if mobility_of(mechanism) > 0:
         raise SceneError(["motors do not hold all of it still: what they leave free, loads would move"])
     run = shown_run(mechanism)
-    halted = {name: replace(driver, motion=Polynomial((driver.motion(0.0),))) for name, driver in mechanism.drivers.items()}
-    held = Mechanism(mechanism.bodies, mechanism.joints, halted, mechanism.forces, gravity=mechanism.gravity)
+    held = with_halted_drivers(mechanism, 0.0)
     rest = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
     curves = [*_efforts(held, rest), *_pin_forces(held, rest)]
     return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
@@ -93,22 +92,18 @@ def mobility_of(mechanism: Mechanism) -> int:
 
 
 def _efforts(mechanism: Mechanism, run: StateHistory) -> list[Json]:
-    units = {name: "N m" if driver.coordinate == "angle" else "N" for name, driver in mechanism.drivers.items()}
-    return [_curve(f"{name}: effort", units[name], effort) for name, effort in efforts(mechanism, run).items()]
+    drivers = mechanism.drivers
+    return [_curve(f"{name}: effort", drivers[name].effort_unit, effort) for name, effort in efforts(mechanism, run).items()]
 
 
 def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[Json]:
     """Return curves of the forces at pins; of redundant constraints they are the share of least norm, and marked."""
-    curves, unique = [], unique_reactions(mechanism, run, about="joint")
-    for pin, bodies in pin_reactions(mechanism, run).items():
-        for body, load in bodies.items():
-            if body == "ground":
-                continue
-            load = np.asarray(load)
-            parts = [x[body] for name, x in unique.items() if body in x and (name == pin or name.startswith(f"{pin}-"))]
-            known = all(bool(np.asarray(x)[np.isfinite(load[:, 0]), :2].all()) for x in parts)
-            curves.append(_curve(f"{pin}: force on {body}", "N", np.hypot(load[:, 0], load[:, 1]), known))
-    return curves
+    known = unique_pin_forces(mechanism, run)
+    return [
+        _curve(f"{pin}: force on {body}", "N", np.hypot(*np.asarray(load)[:, :2].T), known[pin][body])
+        for pin, bodies in pin_reactions(mechanism, run).items()
+        for body, load in bodies.items()
+    ]
 
 
 def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:

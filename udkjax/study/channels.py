@@ -215,8 +215,7 @@ def _parse_driver(mechanism: Mechanism, text: str) -> Channel:
     name, rest = _split_owner("driver", mechanism.driver_names, text)
     quantity = _check_quantity(f"driver {quote(name)}", rest, {"load": ""})
     driver = mechanism.drivers[name]
-    units = "N m" if driver.coordinate == "angle" else "N"
-    return Channel(f"driver.{name}.{quantity}", units, "reactions", "driver", name, driver.bodies[1:], (), quantity)
+    return Channel(f"driver.{name}.{quantity}", driver.effort_unit, "reactions", "driver", name, driver.bodies[1:], (), quantity)
 
 
 def _parse_distance(mechanism: Mechanism, text: str) -> Channel:

@@ -62,6 +62,11 @@ class Coordinate(PrintsLine):
         """Return the driver that prescribes this coordinate."""
         return Driver(self.bodies, self.coordinate, motion, self.points, self.axis)
 
+    @property
+    def effort_unit(self) -> str:
+        """The unit of what acts along it."""
+        return self.driver(_constant(0.0)).effort_unit
+
 
 Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
 
@@ -221,9 +226,16 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar)
     known = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
         origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
-    held = {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
-    held[name] = element.driver(ValueMotion())
-    return with_drivers(mechanism, held, origin=origin)
+    return with_drivers(mechanism, {**_halted(mechanism, t), name: element.driver(ValueMotion())}, origin=origin)
+
+
+def with_halted_drivers(mechanism: Mechanism, t: Scalar) -> Mechanism:
+    """Return the mechanism whose drivers stand still where they are at time t (s)."""
+    return with_drivers(mechanism, _halted(mechanism, t))
+
+
+def _halted(mechanism: Mechanism, t: Scalar) -> dict[str, Driver]:
+    return {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:

@@ -53,6 +53,7 @@ class InverseDynamics(PrintsTable):
     efforts: dict[str, Float[Array, "T"]]  # by driver: torque (N m) along an angle, force (N) along a length
     powers: dict[str, Float[Array, "T"]]  # W: effort times the coordinate's rate
     residual: Float[Array, "T"]  # the largest part of M a - F that neither joints nor drivers exert, over M a and single loads
+    effort_units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # by driver
 
     _units = units(ts="s", efforts="N m or N", powers="W")
 
@@ -63,21 +64,41 @@ class InverseDynamics(PrintsTable):
         for name, effort in self.efforts.items():
             x = np.asarray(effort)
             if not np.isfinite(x).any():
-                rows.append((name, "the motion is not possible", "", ""))
+                rows.append((name, "the motion is not possible", "", "", "", ""))
                 continue
             k, mean_square = int(np.nanargmax(np.abs(x))), np.nanmean(x**2)
             power = np.asarray(self.powers[name])
             span = " to ".join(format_number(end(power)) for end in (np.nanmin, np.nanmax))
-            rows.append((name, f"{format_number(x[k])} at {ts[k]:.6g} s", f"{format_number(math.sqrt(mean_square))}", span))
+            unit, largest = dict(self.effort_units).get(name, "N m or N"), float(np.nanmax(np.abs(power))) * float(np.ptp(ts))
+            energies = (format_number(one[name], "J", largest) for one in (self.works, self.swings))
+            peak, mean = format_number(x[k], unit), format_number(math.sqrt(mean_square), unit)
+            rows.append((name, f"{peak} at {ts[k]:.6g} s", mean, f"{span} W", *energies))
         left = float(np.nanmax(np.asarray(self.residual), initial=0.0))
-        rows.append(("left over", f"{format_number(left, scale=1.0)} of the loads", "", ""))
-        heads = "driver", "peak (N m or N)", "root mean square", "power (W)"
+        rows.append(("left over", f"{format_number(left, scale=1.0)} of the loads", "", "", "", ""))
+        heads = "driver", "peak", "root mean square", "power", "work", "swing of energy"
         return PrintedTable(f"inverse dynamics at {len(ts)} times from {ts[0]:g} to {ts[-1]:g} s", rows, heads)
 
     @property
     def determined(self) -> Bool[Array, "T"]:
         """Times at which the efforts follow from the motion."""
         return jnp.all(jnp.isfinite(jnp.stack(list(self.efforts.values()))), 0)
+
+    @property
+    def works(self) -> dict[str, Float[Array, ""]]:
+        """Work (J) of each driver from the first time to the last, by the trapezoidal rule."""
+        return {name: jnp.trapezoid(power, self.ts) for name, power in self.powers.items()}
+
+    @property
+    def swings(self) -> dict[str, Float[Array, ""]]:
+        """The largest difference (J) of the work done from what the mean power does, by driver, by the trapezoidal rule.
+
+        Over whole cycles it is what a flywheel is to store: one of the inertia swing / (k w^2) keeps the speed w within k w.
+        """
+        steps, swings = jnp.diff(self.ts), {}
+        for name, power in self.powers.items():
+            energy = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * steps * (power[1:] + power[:-1]))])
+            swings[name] = jnp.ptp(energy - energy[-1] * (self.ts - self.ts[0]) / (self.ts[-1] - self.ts[0]))
+        return swings
 
     @property
     def power(self) -> Float[Array, "T"]:
@@ -167,7 +188,9 @@ def inverse_dynamics(
         raise ValueError(f"motion has {len(q)} states, and ts {len(ts)} times: give the times of the motion")
     efforts, rates, residual = _efforts(joints.without_origin, analysis, values, w, ts, q, v, a)
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
-    return InverseDynamics(ts, found, columns, {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}, residual)
+    powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
+    effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
+    return InverseDynamics(ts, found, columns, powers, residual, effort_units)
 
 
 @checked

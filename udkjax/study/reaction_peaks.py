@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udkjax.equations.reactions import reactions
+from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute
@@ -98,6 +98,18 @@ def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) 
             at = found.setdefault(_pin_of(mechanism, name), {})
             for body, load in loads[name].items():
                 at[body] = at[body] + load if body in at else load
+    return found
+
+
+def unique_pin_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, dict[str, bool]]:
+    """Decide, by pin and body, whether equilibrium alone determines the force at each time: see `unique_reactions`."""
+    found: dict[str, dict[str, bool]] = {}
+    unique, alive = unique_reactions(mechanism, solution), np.isfinite(np.asarray(solution.q)).all((1, 2))
+    for name, joint in mechanism.joints.items():
+        if has_point(joint):
+            at = found.setdefault(_pin_of(mechanism, name), {})
+            for body, known in unique[name].items():
+                at[body] = at.get(body, True) and bool(np.asarray(known)[alive, :2].all())
     return found
 
 

@@ -242,7 +242,7 @@ def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram
     code = scene_programs(mechanism, analysis.redundant_rows)
     evaluation = Evaluation(code, [numbers.function()])
     data["efforts"] = [
-        {"driver": name, "unit": "N m" if driver.coordinate == "angle" else "N", **places}
+        {"driver": name, "unit": driver.effort_unit, **places}
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
     data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
