@@ -37,6 +37,29 @@ def test_kinematics(tmp_path, capsys):
         assert data.attrs["scene"] == scene.read_text()
 
 
+def test_velocities_are_those_of_the_motor_s_own_speed(tmp_path, capsys):
+    """Example 6-7 of Norton, "Design of machinery": links of 100, 40, 120 and 80 mm, the crank at 40 deg and 25 rad/s."""
+    angle, place = math.radians(40.0), complex(0.1, 0.0)
+    crank = 0.04 * complex(math.cos(angle), math.sin(angle))
+    along = (crank - place) / abs(crank - place)
+    side = (0.08**2 + abs(crank - place) ** 2 - 0.12**2) / (2 * abs(crank - place))
+    pin = place + along * complex(side, -math.sqrt(0.08**2 - side**2))
+    scene = tmp_path / "norton.toml"
+    pins = {"O": 0j, "A": crank, "B": pin, "C": place}
+    links = {"crank": "OA", "coupler": "AB", "rocker": "CB"}
+    scene.write_text(
+        'format = 2\nground = ["O", "C"]\nmotor = [{pin = "O", speed = "25 rad/s"}]\n[pins]\n'
+        + "".join(f"{name} = [{z.real!r}, {z.imag!r}]\n" for name, z in pins.items())
+        + "".join(f'[[link]]\nname = "{name}"\npins = {list(ends)}\nmass = 1\n' for name, ends in links.items())
+    )
+    v = np.array(results(capsys, "kinematics", scene, "--count", 1)["v"])[0, :, 2]
+    np.testing.assert_allclose(v, [25.0, -4.121, 6.998], atol=1e-3)
+    slow = np.array(results(capsys, "kinematics", scene, "--count", 1, "--rate", 1.0)["v"])[0, :, 2]
+    np.testing.assert_allclose(slow, v / 25.0, rtol=1e-12)
+    assert udkjax("kinematics", scene, "--out", tmp_path / "k.csv") == 0
+    assert "velocities at 25 rad/s of motor1" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize(
     ("driver", "problem"), [("motr", 'did you mean "motor"'), ("body.slider.x", 'body.slider.x is held by driver "motor"')]
 )

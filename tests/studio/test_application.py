@@ -8,6 +8,7 @@ import pytest
 import udkjax as udk
 from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
+from udkjax.studio.shown_runs import duration_of
 from udkjax.studio.templates import TEMPLATES
 from udkjax.studio.worker import Worker
 
@@ -242,6 +243,14 @@ def test_what_is_at_rest_has_a_finite_duration(client):
     assert 0 < scene["duration"] < 100
     nothing_moves_it = ARMS.replace('motor = [{pin = "O", speed = 1}]', "gravity = [0, 0]")
     assert client.ask("compile", text=nothing_moves_it).json()["scene"]["duration"] == 1.0
+
+
+def test_a_slide_is_shown_as_long_as_it_takes_to_cross_the_mechanism():
+    """A block at 2 mm/s goes in a run about as far as the link that it pulls is long, not the way of a few swings."""
+    links = {"block": udk.Link(["P"], mass=1.0, width=0.01), "arm": udk.Link(["P", "Q"], mass=1.0)}
+    slides, motors = {"guide": {"link": "block", "direction": [0, 1]}}, {"push": {"slide": "guide", "speed": -0.002}}
+    mech = udk.Drawing({"P": (0, 0), "Q": (0.2, 0)}, links, slides=slides, motors=motors).mechanism()
+    assert 0.05 < 0.002 * duration_of(mech) < 0.4
 
 
 def test_all_pins_of_a_line_are_named_once():

@@ -25,7 +25,7 @@ def kinematics(
     first: Annotated[float | None, tyro.conf.arg(name="from")] = None,
     last: Annotated[float | None, tyro.conf.arg(name="to")] = None,
     count: int = 361,
-    rate: float = 1.0,
+    rate: float | None = None,
     branches: bool = False,
     channels: tuple[str, ...] = (),
     out: Path | None = None,
@@ -40,7 +40,7 @@ def kinematics(
         first: first value (rad, m); by default the lower limit of travel, or where it starts if there is none.
         last: last value; by default the upper limit, or one turn after the first.
         count: number of values.
-        rate: of the driver (rad/s, m/s), for velocities and accelerations.
+        rate: of the driver (rad/s, m/s), for velocities and accelerations; by default that of a motor at constant speed, else 1.
         branches: find all ways to put it together for the first value, too.
         channels: further channels to write, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
@@ -53,10 +53,12 @@ def kinematics(
     import numpy as np
 
     import udkjax as udk
+    from udkjax.printing import format_number
     from udkjax.show.summary import table
-    from udkjax.study.drive import value_of
+    from udkjax.study.drive import constant_speed, value_of
 
     travel = udk.travel(mech, driver)
+    rate = (constant_speed(mech, driver) or 1.0) if rate is None else rate
     first = _default(first, float(travel.lower), float(value_of(mech, driver)(udk.assemble(mech).q)))
     last = _default(last, float(travel.upper), first + (2 * math.pi if travel.unit == "rad" else float(udk.analyse(mech).length)))
     found = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
@@ -70,6 +72,8 @@ def kinematics(
         "travel": "no limits" if free else f"{_end(travel, 0)} to {_end(travel, 1)}",
         "reached": f"{reached} of {count} values from {_value(first, travel.unit)} to {_value(last, travel.unit)}",
     }
+    if out is not None or plot is not None:
+        lines["velocities"] = f"at {format_number(rate)} {travel.unit}/s of {driver}"
     if math.isfinite(float(found.limit)):
         lines["toggle"] = f"{float(found.limit):.15g} {travel.unit}"
     for name, words in (("singular", "singular at"), ("not_determined", "rates unknown at")):

@@ -1,7 +1,6 @@
 """`udkjax statics`."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
 from udkjax.cli.common import Json, Scene, fail, refuse, show
@@ -78,7 +77,7 @@ def statics(
 
 
 class RestingForces(NamedTuple):
-    """What holds a mechanism at rest: efforts of drivers (N, N m); forces x and y (N) and a torque (N m) at pins on bodies."""
+    """Efforts of drivers (N, N m), and forces x and y (N) and a torque (N m) at pins on bodies, that hold a mechanism at rest."""
 
     efforts: dict[str, float]
     forces: dict[str, dict[str, list[float]]]
@@ -91,10 +90,10 @@ def forces_at(mech: "Mechanism", q: "ArrayLike", t: float) -> RestingForces:
 
     import udkjax as udk
     from udkjax.study.drive import with_halted_drivers
-    from udkjax.study.reaction_peaks import unique_pin_forces
+    from udkjax.study.reaction_peaks import RestingPositions, unique_pin_forces
 
     still, q = with_halted_drivers(mech, t), np.asarray(q)
-    rest = SimpleNamespace(ts=np.array([t]), q=q[None], v=np.zeros((1, *q.shape)))
+    rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))
     at_pins = udk.pin_reactions(still, rest)
     forces = {pin: {body: np.asarray(load)[0].tolist() for body, load in on.items()} for pin, on in at_pins.items()}
     efforts = {name: float(effort[0]) for name, effort in udk.efforts(still, rest).items()}

@@ -201,7 +201,7 @@ def _read(text: str) -> _Unit:
     for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
         name = _WORDS.get(name, name)
         if name not in _UNITS:
-            meant = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == name.lower()]
+            meant = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == f"{name}".lower()]
             cure = meant[0] if meant else f": they are made of {', '.join(_UNITS)}"
             raise ValueError(f"{quote(text)} is no unit known here{cure}")
         found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))

@@ -1,18 +1,18 @@
 """The run that the studio shows of a drawing: how long it lasts, and its curves of forces and energies."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from udkjax.equations import analyse, efforts
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.assembly import close
-from udkjax.scene import Mechanism, Polynomial, SceneError
+from udkjax.scene import Driver, Mechanism, SceneError
 from udkjax.show.player.measure_curves import measures_of
 from udkjax.study.channels import StateHistory
-from udkjax.study.drive import with_halted_drivers
-from udkjax.study.reaction_peaks import pin_reactions, unique_pin_forces
+from udkjax.study.drive import constant_speed, with_halted_drivers
+from udkjax.study.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 
 Json = dict[str, Any]
 TURNS = 2  # of the slowest motor that a run shows
@@ -24,15 +24,13 @@ TOLERANCE = 1e-8  # of a run, relative
 
 
 def duration_of(mechanism: Mechanism) -> float:
-    """Return the time of a run to show (s): turns of the slowest motor, or else swings."""
-    rates = [
-        abs(float(np.asarray(driver.motion.coefficients)[1]))
-        for driver in mechanism.drivers.values()
-        if driver.coordinate == "angle" and isinstance(driver.motion, Polynomial) and len(driver.motion.coefficients) == 2
-    ]
-    rates = [rate for rate in rates if rate > 0]
-    swing = float(analyse(mechanism).time)
-    exact = TURNS * 2 * math.pi / min(rates) if rates else SWINGS * swing if math.isfinite(swing) else STILL
+    """Return the time of a run to show (s): turns of the slowest motor, or a slide's way across the mechanism, or else swings."""
+    scales, ways = analyse(mechanism), []
+    for name, driver in mechanism.drivers.items():
+        if (speed := constant_speed(mechanism, name)) != 0:
+            ways.append((TURNS * 2 * math.pi if driver.coordinate == "angle" else float(scales.length)) / abs(speed))
+    swing = float(scales.time)
+    exact = max(ways) if ways else SWINGS * swing if math.isfinite(swing) else STILL
     return float(f"{exact:.{DIGITS}g}")
 
 
@@ -76,14 +74,6 @@ def holding_curves(mechanism: Mechanism) -> Json:
     rest = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
     curves = [*_efforts(held, rest), *_pin_forces(held, rest)]
     return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
-
-
-class RestingPositions(NamedTuple):
-    """Positions over time, at rest: q and v (T, bodies, 3)."""
-
-    ts: Any
-    q: Any
-    v: Any
 
 
 def mobility_of(mechanism: Mechanism) -> int:

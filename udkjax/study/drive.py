@@ -164,6 +164,12 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
     return value
 
 
+def constant_speed(mechanism: Mechanism, driver: str) -> float:
+    """Return the speed (rad/s, m/s) of a driver that moves at a constant one; 0 of all other coordinates."""
+    motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
+    return float(np.asarray(motion.coefficients)[1]) if isinstance(motion, Polynomial) and len(motion.coefficients) == 2 else 0.0
+
+
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
     """Return the mechanism that its drivers no longer hold, with these forces instead of its own if any are given."""
     with jax.ensure_compile_time_eval():

@@ -57,6 +57,14 @@ class Envelope(NamedTuple):
 Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
 
 
+class RestingPositions(NamedTuple):
+    """Positions over time, at rest: q and v (T, bodies, 3)."""
+
+    ts: Any
+    q: Any
+    v: Any
+
+
 @checked
 def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> Peaks:
     """Return the peaks and root mean squares of all reactions over a run.
