@@ -58,6 +58,18 @@ def message(function, *arguments: Any, **given: Any) -> str:
     return str(error.value)
 
 
+@pytest.mark.parametrize("function", [udk.simulate, udk.step, udk.energy, udk.library.four_bar])
+def test_arguments_that_do_not_exist_or_are_missing_are_refused_by_the_function_s_name(function):
+    given = [] if function is udk.library.four_bar else [MECH] * (1 + (function is udk.simulate))
+    with pytest.raises(TypeError, match=rf"^{function.__name__}\(\): .*'?(x0|state|solution|ts)'"):
+        function(*given, x0=1.0)
+
+
+def test_an_argument_that_is_mistyped_is_suggested():
+    with pytest.raises(TypeError, match=r"^simulate\(\): .*'rtoll'; did you mean \"rtol\"\?"):
+        udk.simulate(MECH, TS, rtoll=1e-6)
+
+
 @pytest.mark.parametrize("name", functions_of("mechanism"))
 def test_what_is_no_mechanism_is_refused(name):
     if name == "animate":  # takes several, too

@@ -5,9 +5,9 @@ one annotated `Literal` its choices; arrays are recognized by their names (named
 numbers are real, finite and of the right sign. Of traced values the shapes and dtypes are checked; their values are data.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
-from inspect import Parameter, isclass, signature
+from inspect import BoundArguments, Parameter, Signature, isclass, signature
 from types import UnionType
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
@@ -74,11 +74,20 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
         bound = defaults | given
         is_right = len(given) == len(args) + len(kwargs) and required <= given.keys() and len(bound) == len(parameters.parameters)
         if not (plain and is_right):  # `bind` says what is wrong
-            given = parameters.bind(*args, **kwargs).arguments
+            given = bind_arguments(function.__name__, parameters, args, kwargs).arguments
             bound = defaults | given
         return given, bound
 
     return bind
+
+
+def bind_arguments(name: str, parameters: Signature, args: Sequence[Any], kwargs: Mapping[str, Any]) -> BoundArguments:
+    """Return the arguments of a function by their names. Raises `TypeError`, which names the function."""
+    try:
+        return parameters.bind(*args, **kwargs)
+    except TypeError as error:
+        unknown = next((key for key in kwargs if key not in parameters.parameters), None)
+        raise TypeError(f"{name}(): {error}{suggestion(unknown, parameters.parameters)}") from None
 
 
 def argument_problems(function: Callable[..., object], given: Given) -> list[str]:

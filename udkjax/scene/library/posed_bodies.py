@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.expressions.deferred import deferred_if_traced
+from udkjax.scene.arguments import bind_arguments
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import array_namespace, number
 from udkjax.scene.mechanism import Mechanism
@@ -33,7 +34,7 @@ def with_known_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
 
     @wraps(build)
     def build_with_known_numbers(*arguments: P.args, **named: P.kwargs) -> Mechanism:
-        bound = parameters.bind(*arguments, **named)
+        bound = bind_arguments(build.__name__, parameters, arguments, named)
         bound.apply_defaults()
         for name, value in bound.arguments.items():
             if not isinstance(parameters.parameters[name].default, int):  # counts and switches stay what they are
