@@ -66,8 +66,9 @@ def test_arguments_that_do_not_exist_or_are_missing_are_refused_by_the_function_
 
 
 def test_an_argument_that_is_mistyped_is_suggested():
+    simulate: Any = udk.simulate
     with pytest.raises(TypeError, match=r"^simulate\(\): .*'rtoll'; did you mean \"rtol\"\?"):
-        udk.simulate(MECH, TS, rtoll=1e-6)
+        simulate(MECH, TS, rtoll=1e-6)
 
 
 @pytest.mark.parametrize("name", functions_of("mechanism"))

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations.elements import differentiate_constraint, has_pieces, trace_force, trace_piece
-from udkjax.equations.structure import ElementStructure
+from udkjax.equations.structure import ElementStructure, element_kinds
 from udkjax.expressions import Graph, Scalar, frontier
+from udkjax.scene.mechanism import Mechanism
 
 POSITION_INPUTS, VELOCITY_INPUTS = ("x", "y", "angle"), ("vx", "vy", "omega")
 FREE_INPUTS = ("fx", "fy", "fangle")  # of a_F
@@ -89,3 +90,10 @@ class ForcePrograms(ElementPrograms):
 
 constraint_programs = lru_cache(maxsize=256)(ConstraintPrograms)
 force_programs = lru_cache(maxsize=256)(ForcePrograms)
+
+
+def has_rheonomic_joints(mechanism: Mechanism) -> bool:
+    """Return whether a joint, not only drivers, depends on time."""
+    kinds, loaded = element_kinds(mechanism, list(mechanism.joints.values())), bool(mechanism.forces)
+    residuals = (constraint_programs(kind.structure, False, loaded).outputs["psi"] for kind in kinds)
+    return any("time" in s.node.depends for rows in residuals for s in rows)

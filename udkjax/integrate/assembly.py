@@ -24,6 +24,7 @@ from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
+from udkjax.equations.element_programs import has_rheonomic_joints
 from udkjax.equations.position_closure import is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales
@@ -31,7 +32,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.expressions.deferred import deferred
 from udkjax.integrate import native_closing
 from udkjax.integrate.causes.open_rows import explain_open
-from udkjax.integrate.closure import close_by_jax, close_by_machine_code
+from udkjax.integrate.closure import close_by_jax, close_by_machine_code, from_moment
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import poses_table
@@ -119,7 +120,10 @@ def close(
     if not mechanism.is_concrete or is_traced((t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
         close = _close if is_within_jit() else _close_compiled  # in which known numbers are traced, too
-        return close(mechanism.without_origin.at(t), analysis, t, state)
+        moment = mechanism.without_origin.at(t)
+        if isinstance(t, Tracer) and not has_rheonomic_joints(moment):
+            moment, t = from_moment(moment, t), 0.0
+        return close(moment, analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
         analysis = None  # the analysis of the known mechanism lasts
     return _closure_of_known(mechanism, np.asarray(t).item(), state, analysis)

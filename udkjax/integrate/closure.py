@@ -15,10 +15,30 @@ from udkjax.integrate import native_closing
 from udkjax.integrate.linear_map import DifferentiableFunction, Linear
 from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
 from udkjax.pinv import SVD
+from udkjax.scene.drivers import Motion
+from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 
 Closed = Assembly[Array]
 NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales, t, q, v
+
+
+class MotionFrom(Motion):
+    """A motion law whose time zero is a time of another one (s): of its numbers one, it has derivatives by machine code."""
+
+    motion: Motion
+    start: Number
+
+    def __call__(self, t):
+        return self.motion(self.start + t)
+
+
+def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
+    """Return a mechanism whose drivers are at time zero where they are at time t."""
+    if not mechanism.drivers:
+        return mechanism
+    motions = lambda x: [driver.motion for driver in x.drivers.values()]  # noqa: E731
+    return eqx.tree_at(motions, mechanism, [MotionFrom(motion, t) for motion in motions(mechanism)])
 
 
 def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:

@@ -6,12 +6,14 @@ so that no derivative is ever transposed operation by operation.
 """
 
 import operator
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.integrate import native_engine
@@ -19,16 +21,25 @@ from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.linear_map import DifferentiableFunction, Linear, change_along
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.split_jvp import split_jvp
+from udkjax.integrate.time_derivatives import run_of_times
 from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
 
+CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the step controller
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
 def differentiable(problem: Problem) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
-    None are taken along numbers that do not depend on what is differentiated.
+    None are taken along numbers that do not depend on what is differentiated, nor along those of the step controller: steps are
+    taken as they are.
     """
+    control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
+    problem = replace(problem, **control)
+    return run_of_times(_integrate, problem) if isinstance(problem.ts, Tracer) else _integrate(problem)
+
+
+def _integrate(problem: Problem) -> IntegratorOutput:
     problem_of, xs = split_numbers(problem)
     return _run(DifferentiableRun(problem_of, problem.compiled.plan.is_native), xs)
 

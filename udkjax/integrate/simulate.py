@@ -76,7 +76,8 @@ def simulate(
         mechanism: the mechanism, or a `ConstrainedSystem`.
         ts: output times (T,) in s, increasing; the motion starts at ts[0].
         state: the initial `State`, taken as it is, or the `Closure` of an assembly. By default the scene's guess is assembled.
-        rtol: relative tolerance of every coordinate and velocity.
+        rtol: relative tolerance of every coordinate and velocity. Steps are taken as they are: nothing has derivatives by
+            tolerances, nor by `dt0`.
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
             their rates by 1/T of that, with L the characteristic length (`analyse`) and T the shortest of the characteristic
             time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. So the same tolerances

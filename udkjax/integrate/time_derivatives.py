@@ -1,0 +1,138 @@
+"""Derivatives of a run along its times, whatever integrates it.
+
+With the flow Phi of y' = f(t, y), the state at t_k of a run that begins at t_0 with y_0 is Phi(t_k; t_0, y_0), and
+
+    d/dt_k = f(t_k, y_k),        d/dt_0 = -(dy_k/dy_0) f(t_0, y_0).
+
+So a run of fixed times serves: its first state and its outputs are moved along f for a time s that is zero, but has derivatives.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from udkjax.integrate.gradients import stop_gradients
+from udkjax.integrate.linear_map import DifferentiableFunction, Linear
+from udkjax.integrate.native_equations import equations_for_diffrax
+from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
+
+
+def run_of_times(run: Callable[[Problem], IntegratorOutput], problem: Problem) -> IntegratorOutput:
+    """Return `run(problem)`, of a function that has no derivatives along `problem.ts`, with these derivatives of q and v."""
+    ts = stop_gradients(problem.ts)
+    move = partial(_move, replace(problem, ts=ts))
+    q, v = move(problem.ts[0], problem.q, problem.v, ts[0] - problem.ts[0])
+    raw = run(replace(problem, ts=ts, q=q, v=v))
+    qs, vs = jax.vmap(move)(ts, raw.q, raw.v, problem.ts - ts)
+    return raw._replace(q=qs, v=vs)
+
+
+def _move(
+    problem: Problem, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"], s: Float[Array, ""]
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    problem_of, numbers = split_numbers(problem)
+    q, v = _state_after(StateAfter(RatesOfState(problem_of)), [s, t, q, v, *numbers])
+    return q, v
+
+
+class Rates(eqx.Module):
+    """The rates x' of some numbers x."""
+
+    @abstractmethod
+    def __call__(self, x: list[Array]) -> list[Array]:
+        """Return x' at x."""
+
+
+class RatesOfState(Rates):
+    """The rates of time, q and v, and those of the numbers of a problem, which stay as they are."""
+
+    problem: TreeOfNumbers
+
+    def __call__(self, x: list[Array]) -> list[Array]:
+        t, q, v, *numbers = x
+        equations = equations_for_diffrax(self.problem(numbers))
+        return [jnp.ones_like(t), *equations.rates(t, q, v), *map(jnp.zeros_like, numbers)]
+
+
+class RatesOfChange(Rates):
+    """The rates of x, and those of its changes behind it."""
+
+    rates: Rates
+
+    def __call__(self, x: list[Array]) -> list[Array]:
+        half = len(x) // 2
+        found, changes = jax.jvp(self.rates, (x[:half],), (x[half:],))
+        return found + changes
+
+
+class StateAfter(DifferentiableFunction):
+    """q and v after a time s = 0, of s, t, q, v and the numbers of a problem."""
+
+    rates: RatesOfState
+
+    @property
+    def orders(self) -> int:
+        return 1
+
+    def __call__(self, xs: list[Array]) -> list[Array]:
+        s, *x = xs
+        return _after(self.rates, x, s)[1:3]
+
+    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
+        return [x.shape for x in xs[2:4]]
+
+    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: PyTree) -> list[Array]:
+        del run
+        given = iter(vs)
+        ds, _, *changes = [next(given) if m else None for m in active[:4]]
+        changes = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(xs[2:4], changes, strict=True)]
+        if ds is None:
+            return changes
+        return [dx + rate * ds for dx, rate in zip(changes, self.rates(xs[1:])[1:3], strict=True)]
+
+    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: PyTree) -> list[Array]:
+        del run
+        bars = [jnp.zeros_like(x) for x in xs]
+        bars[2:4] = ws
+        if active[0]:
+            bars[0] = sum((jnp.vdot(w, rate) for w, rate in zip(ws, self.rates(xs[1:])[1:3], strict=True)), bars[0])
+        return select(bars, active)
+
+
+@eqx.filter_custom_jvp
+def _state_after(function: StateAfter, xs: list[Array]) -> list[Array]:
+    del function
+    return xs[2:4]
+
+
+@_state_after.def_jvp
+def _(primals, tangents):
+    function, xs = primals
+    active = tuple(dx is not None for dx in tangents[1])
+    linear = Linear(function=function, xs=xs, run=(), active=active)
+    return _state_after(*primals), linear.applied(select(tangents[1], active))
+
+
+@eqx.filter_custom_jvp
+def _after(rates: Rates, x: list[Array], s: Float[Array, ""]) -> list[Array]:
+    """Return x(s) of x' = rates(x), for s = 0: it is x, and has the derivatives of x(s), of any order, by forward mode."""
+    del rates, s
+    return x
+
+
+@_after.def_jvp
+def _(primals, tangents):
+    rates, x, s = primals
+    _, dx, ds = tangents
+    dx = [jnp.zeros_like(one) if d is None else d for one, d in zip(x, dx, strict=True)]
+    found, change = _after(rates, x, s), _after(RatesOfChange(rates), x + dx, s)[len(x) :]
+    if ds is not None:
+        change = [d + rate * ds for d, rate in zip(change, rates(found), strict=True)]
+    return found, change
