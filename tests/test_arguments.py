@@ -205,6 +205,25 @@ def test_settings_of_studies_are_those_of_simulate():
     assert "method must be" in message(udk.identify, MECH, record, "body.link1.mass", method=udk.SVD)
 
 
+def test_a_member_with_a_number_that_is_not_finite_is_an_invalid_argument():
+    """Whichever number of a scene it is, and no other member is: masses, points, gravity, motions of drivers, stiffnesses."""
+    crank = udk.library.slider_crank()
+    springs = {"spring": udk.Spring(["ground", "slider"], [[3.0, 0.0], [0.0, 0.0]], stiffness=1.0, length=0.5, damping=0.1)}
+    driver = {"motor": udk.Driver(["ground", "crank"], "angle", udk.Polynomial([crank.q0[0, 2], 1.0]))}
+    scene = udk.Mechanism(crank.bodies, crank.joints, driver, springs, crank.gravity)
+    right = {name: np.asarray(x) for name, x in scene.parameters().items()}
+    rows = [right]
+    for name, x in right.items():
+        for bad in (np.nan, np.inf):
+            rows.append(right | {name: np.where(np.arange(x.size).reshape(x.shape) == x.size - 1, bad, x)})
+    rows.append(right)
+    run = lambda values: udk.simulate(scene.with_parameters(values), TS, throw=False)  # noqa: E731
+    found = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: np.stack(x), *rows))
+    good, invalid = udk.Result.successful, udk.Result.invalid_argument
+    assert found.code.tolist() == [good, *[invalid] * (len(rows) - 2), good]
+    np.testing.assert_allclose(np.asarray(found.q)[[0, -1]], np.stack([udk.simulate(scene, TS).q] * 2), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("events", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_what_turns_out_to_be_of_no_use_is_the_result_of_a_member(events):
     """Traced numbers are known by their shapes alone: the run that they spoil says so, and no other."""

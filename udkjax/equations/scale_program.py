@@ -38,12 +38,13 @@ class ScaleProgram(NamedTuple):
     sizes: dict[str, int]
 
 
-def write_scales(terms: SceneTerms, places: Mechanism, prologue: LoopProgram) -> ScaleProgram:
+def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prologue: LoopProgram) -> ScaleProgram:
     """Write the program.
 
     Args:
         terms: The terms of the scene.
         places: The scene, with the place of each number in `numbers` instead of the number.
+        number_count: Number of numbers of the scene.
         prologue: The program of the constants.
     """
     layout, bodies = terms.layout, list(places.bodies.values())
@@ -61,6 +62,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, prologue: LoopProgram) ->
             pair_table = np.concatenate([pair_table, np.stack(columns, 1)])
     parts = [
         *(Reset("scales", 0, ROWS), Reset("largest", 0, LARGEST), Reset("change", 0, layout.row_count), Reset("t", 0, 1)),
+        KernelLoop(_kernel(_write_finite), np.arange(number_count)[:, None]),
         KernelLoop(_kernel(_write_guess), body_table),
         *(*prologue.parts, terms.sincos(), *terms.free_accelerations("v"), *elements),
         KernelLoop(_kernel(_write_arm), pair_table),
@@ -86,7 +88,7 @@ def _meets(group: ConstraintGroup) -> list[tuple[int, int]]:
 
 def _entries(group: ConstraintGroup) -> np.ndarray:
     """Return the entries of Psi_q of an element, (rows, bodies, 3)."""
-    return np.array(group.programs.outputs["psi_q"], object).reshape(-1, len(group.bodies), 3)
+    return np.array(group.programs.outputs["psi_q"], object).reshape(group.programs.row_count, len(group.bodies), 3)
 
 
 def _over_elements(terms: SceneTerms, group: ConstraintGroup, meets: list[tuple[int, int]], first: np.ndarray) -> KernelLoop:
@@ -147,6 +149,12 @@ def _finite(x: Any) -> Any:
 def _swing(acceleration: Any) -> Any:
     """Return the rate that belongs to an acceleration, over a length: a pendulum swings to and fro in pi sqrt(L / a) each."""
     return jnp.sqrt(jnp.abs(_finite(acceleration))) / math.pi
+
+
+def _write_finite(w: KernelWriter) -> None:
+    """Leave NaN as the mass where a number is not finite."""
+    found = _apply(w, lambda x: jnp.where(jnp.abs(x) < jnp.inf, 0.0, jnp.nan), w.read("numbers", 0))
+    w.write(found[0], "scales", None, MASS, MAXIMUM)
 
 
 def _write_guess(w: KernelWriter) -> None:

@@ -40,7 +40,7 @@ class Scales(NamedTuple):
     length: Float[Array, ""]  # m
     arm: Float[Array, ""]  # m; the longest of a constraint, masses aside; `length` where there is none
     rate: Float[Array, ""]  # 1/s; 0 where nothing moves and nothing pulls
-    mass: Float[Array, ""]  # kg
+    mass: Float[Array, ""]  # kg; not a number where any number of the mechanism is none
     rows: Float[Array, "m"]  # m, rad or whatever the row is in
     rank_tol: Float[Array, ""]  # of D, its rows weighted, relative to its largest singular value
 

@@ -297,7 +297,7 @@ class ScenePrograms:
     @cached_property
     def scales(self) -> ScaleProgram:
         """scales, from `numbers`, those of the scene and the two thresholds: the characteristic scales of the guess."""
-        return write_scales(self._terms, self._places, self.prologue)
+        return write_scales(self._terms, self._places, self._number_count, self.prologue)
 
     @cached_property
     def differentiable(self) -> DifferentiablePrograms:

@@ -146,6 +146,7 @@ def prepare_run(
         good = usable(*stop_gradients(numbers)) | ~start.is_closed
         if analysis is not None:
             good = good & stop_gradients(traced_numbers_hold(compiled.textbook.mechanism.elements))
+            good = good & jnp.isfinite(compiled.textbook.scales.mass)
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))
         good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))

@@ -72,8 +72,8 @@ CAUSES = {
     Result.event_impossible: "an event asks for what the constraints do not allow: an impact in a direction in which they leave "
     "no motion, or a joint attached where it is open",
     Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
-    "finite, a tolerance or first step that is not positive, or a number of the scene or of an event that cannot be: a mass that "
-    "is not positive, knots that do not increase, a lower limit above the upper one",
+    "finite, a tolerance or first step that is not positive, or a number of the scene or of an event that cannot be: one that is "
+    "not finite, a mass that is not positive, knots that do not increase, a lower limit above the upper one",
     Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 
