@@ -80,6 +80,15 @@ def assert_scales(found, mechanism):
         assert_allclose(x, y, rtol=1e-14)
 
 
+@pytest.mark.parametrize("count", [1, 30])
+def test_bodies_that_nothing_holds_have_scales(count):
+    """Those of their inertia and of gravity; by NumPy, whatever their number, and by machine code."""
+    falling = udk.Mechanism({f"b{k}": udk.Body(2.0, 0.5, [float(k), 0.0]) for k in range(count)}, {})
+    found = udk.analyse(falling)
+    assert_allclose([found.length, found.mass, found.time], [0.5, 2.0, np.pi * np.sqrt(0.5 / 9.81)], rtol=1e-14)
+    assert_scales(jax.jit(lambda whole: udk.analyse(whole).scales)(falling), falling)
+
+
 @pytest.mark.parametrize("make", [udk.library.planetary_gear, udk.library.driven_pendulum, udk.library.elliptic_trammel])
 def test_scales_by_arrays_of_jax_and_by_machine_code_are_those_of_numpy(make):
     """Of drivers, gears and force elements; JAX's own operations are for other devices."""

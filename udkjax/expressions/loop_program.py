@@ -183,6 +183,8 @@ def _with_lists(part: LaidOutPart) -> LaidOutPart:
 
 
 def _run_by_numpy(part: LaidOutPart, found: dict[str, np.ndarray]) -> None:
+    if not part.outputs:
+        return
     results: Any = [part.run]
     if isinstance(part.run, ScalarProgram):
         results = part.run.by_numpy([found[name][places] if name else places for name, places in part.inputs])
