@@ -27,6 +27,17 @@ O4 = [180, 0]
 D = [250, 150]
 O6 = [250, 20]
 """
+BOOM = """format = 2
+units = {length = "mm"}
+ground = ["O", "C"]
+link = [{name = "boom", pins = ["O", "A", "T"], mass = 50, width = 80}]
+LIFT
+[pins]
+O = [0, 0]
+C = [300, -200]
+A = [500, 150]
+T = [1500, 450]
+"""
 for _name, _pins, _width in (
     ("crank", "O2 A", 15),
     ("coupler", "A B C", 0),
@@ -236,6 +247,16 @@ def test_the_engine_takes_places_of_pins_and_a_hand_that_nothing_drives(client):
     assert set(answer["engine"]["modules"]) == {"run", "close", "evaluate"}
     assert set(answer["hand"]["modules"]) == {"close", "evaluate"}  # it is moved, and does not move
     assert len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
+
+
+def test_a_cylinder_moves_the_page_s_engine_and_lets_go_of_the_hand(client):
+    text = BOOM.replace("LIFT", 'motor = [{between = ["C", "A"], speed = "20 mm/s"}]')
+    answer = client.ask("compile", text=text, engine="wasm").json()
+    assert answer["why"] == "" and len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
+    (travel,) = client.ask("diagnose", text=text, about="travel").json()["travel"]
+    reach = [math.hypot(500, 150) + sign * math.hypot(300, 200) for sign in (-1, 1)]  # mm: C is in line with O and A
+    drawn = math.hypot(200, 350)
+    np.testing.assert_allclose([1e3 * end["value"] + drawn for end in travel["ends"]], reach, rtol=1e-6)
 
 
 def test_what_is_at_rest_has_a_finite_duration(client):

@@ -158,26 +158,34 @@ class _Draft:
         return next((pin for pin, members in self.members.items() if set(bodies) <= set(members)), "")
 
     def driver(self, name: str, driver: Driver) -> None:
-        """Draw a driver: a motor where it turns two links at their pin."""
+        """Draw a driver: a motor where it turns two links at their pin, or moves two places apart."""
         pin = self.pin_between(driver.bodies)
         if driver.coordinate == "angle" and pin:
-            motion = driver.motion
-            if isinstance(motion, Polynomial) and len(motion.coefficients) == 2:
-                law: dict[str, Any] = {"speed": float(motion.coefficients[1])}
-            else:
-                law = {"motion": shift_motion(motion, jnp.asarray(-self.angle(driver.bodies)))}
-            self.add("motor", name, {"pin": pin, "of": list(driver.bodies), **law})
+            where, drawn = {"pin": pin, "of": list(driver.bodies)}, self.angle(driver.bodies)
+        elif driver.coordinate == "distance":
+            ends = self.ends(name, driver.bodies, driver.points)
+            where, drawn = {"between": ends}, float(np.linalg.norm(self.places[ends[1]] - self.places[ends[0]]))
         else:
-            self.by_hand("driver", name, driver)
+            return self.by_hand("driver", name, driver)
+        motion = driver.motion
+        if isinstance(motion, Polynomial) and len(motion.coefficients) == 2:
+            law: dict[str, Any] = {"speed": float(motion.coefficients[1])}
+        else:
+            law = {"motion": shift_motion(motion, jnp.asarray(-drawn))}
+        return self.add("motor", name, where | law)
+
+    def ends(self, name: str, bodies: Sequence[str], points: Any) -> list[str]:
+        """Return a pin at a point of each of two bodies."""
+        return [
+            self.pin(f"{name}{k + 1}", [body], self.place(body, point))
+            for k, (body, point) in enumerate(zip(bodies, np.asarray(points), strict=True))
+        ]
 
     def force(self, name: str, force: ForceElement) -> None:
         """Draw a force element."""
         match force:
             case Spring():
-                ends = [
-                    self.pin(f"{name}{k + 1}", [body], self.place(body, point))
-                    for k, (body, point) in enumerate(zip(force.bodies, np.asarray(force.points), strict=True))
-                ]
+                ends = self.ends(name, force.bodies, force.points)
                 spring = {"between": ends, "stiffness": force.stiffness, "length": force.length, "damping": force.damping}
                 self.add("spring", name, {key: value for key, value in spring.items() if value is not None})
             case TorsionSpring(angle=angle) if self.pin_between(force.bodies) and eqx.is_array(angle):
@@ -190,9 +198,8 @@ class _Draft:
                 self.by_hand("force", name, force)
 
     def by_hand(self, section: str, name: str, element: Any) -> None:
-        """Keep a distance, or a driver of one, as it is: its points go into the frames that the links will have."""
-        distance = isinstance(element, Distance) or getattr(element, "coordinate", "") == "distance"
-        if not distance:
+        """Keep a distance as it is: its points go into the frames that the links will have."""
+        if not isinstance(element, Distance):
             cure = "draw it with the pins, slots, slides, gears and motors of format 2"
             raise SceneError([f"{section} {name!r}: the studio cannot draw one of class {type(element).__name__}; {cure}"])
         for k, (body, point) in enumerate(zip(element.bodies, np.asarray(element.points), strict=True)):

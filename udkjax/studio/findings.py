@@ -122,7 +122,7 @@ def motor_travel(mechanism: Mechanism) -> Json:
     """Return the travel of each motor from the drawn position, where the others hold, and the pins in line at its limits."""
     found = []
     for name, driver in mechanism.drivers.items():
-        if driver.coordinate != "angle" and driver.coordinate != "x":
+        if driver.coordinate == "y":
             continue
         try:
             ends_of = travel(mechanism, name)

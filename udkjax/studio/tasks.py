@@ -85,11 +85,18 @@ def engine_of(mechanism: Mechanism, document: Json) -> Json:
         engine = portable_engine(mechanism, names, pull=False).data
         hand = None
         if mechanism.drivers:
-            free = {**document, "motor": [m for m in document.get("motor", []) if "torque" in m], "driver": []}
-            hand = portable_engine(loads(merge_document("", free)), names, pull=False, runs=False).data
+            hand = portable_engine(loads(merge_document("", _undriven(document))), names, pull=False, runs=False).data
     except (UnsupportedError, SceneError) as error:
         return {"why": str(error)}
     return {"engine": engine, "hand": hand, "pins": pins, "why": engine["why"]}
+
+
+def _undriven(document: Json) -> Json:
+    """Return a drawing that nothing drives: the pins of cylinders stay in use, by dampers that do nothing."""
+    motors = document.get("motor", [])
+    idle = [{"between": motor["between"], "damping": 0} for motor in motors if "between" in motor]
+    torques = [motor for motor in motors if "torque" in motor]
+    return {**document, "motor": torques, "driver": [], "damper": [*document.get("damper", []), *idle]}
 
 
 def _read(text: str) -> Json | None:

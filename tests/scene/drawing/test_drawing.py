@@ -127,6 +127,29 @@ def test_elements_act_where_they_are_drawn():
     assert_allclose(end["block"][2] - end["arm"][2], -angle, atol=1e-9)  # it slides on the arm without turning
 
 
+def test_a_cylinder_lifts_a_boom_as_levers_say():
+    """The force of a cylinder from C to A has the arm of O to the line C A, the weight that of the centre of the boom."""
+    pins = {"O": (0.0, 0.0), "C": (0.3, -0.2), "A": (0.5, 0.15), "T": (1.5, 0.45)}
+    boom = udk.Drawing(
+        pins,
+        {"boom": udk.Link(["O", "A", "T"], mass=50.0, width=0.08)},
+        ground=["O", "C"],
+        motors={"lift": {"between": ["C", "A"], "speed": "20 mm/s"}},
+    ).mechanism()
+    way, arm = np.subtract(pins["A"], pins["C"]), 0.5 * 0.2 + 0.3 * 0.15
+    drawn = np.hypot(*way)
+    held = 50.0 * 9.81 * 0.75 / (arm / drawn)
+    for mechanism in (boom, udk.loads(udk.dumps(boom))):
+        slowly = mechanism.with_parameters({"motor.lift.speed": 1e-6})
+        assert_allclose(udk.inverse_dynamics(slowly, [0.0]).efforts["lift"], held, rtol=1e-9)
+        q = udk.simulate(mechanism, [0.0, 2.0]).q
+        tips = [udk.path(mechanism, udk.kinematics(mechanism, None, [0.0, 2.0]), "A"), np.array([pins["C"]] * 2)]
+        assert_allclose(np.hypot(*np.subtract(*tips).T), [drawn, drawn + 0.04], rtol=1e-12)
+        assert_allclose(q, udk.kinematics(mechanism, None, [0.0, 2.0]).q, atol=1e-9)
+    moved = jax.grad(lambda x: udk.inverse_dynamics(slowly.with_parameters({"pin.C": x}), [0.0]).efforts["lift"][0])
+    assert np.isfinite(moved(jnp.array(pins["C"]))).all()
+
+
 def ramp(direction, motion: Any = udk.Polynomial([0.0, 2.0]), **units):
     links, slides = {"block": udk.Link(["P"], mass=2.0, width=0.1)}, {"guide": {"link": "block", "direction": direction}}
     push = {"slide": "guide", "motion": motion}

@@ -233,6 +233,16 @@ MISTAKES = [
     ),
     (drawn(end='[[motor]]\npin = "O"'), 'motor "motor1" (motor[0]).speed: give one of speed, motion and torque'),
     (
+        drawn(end='[[motor]]\npin = "O"\nbetween = ["O", "B"]\nspeed = 1'),
+        'motor "motor1" (motor[0]).pin: give a pin, a slide, or two',
+    ),
+    (drawn(end='[[motor]]\nbetween = ["A", "O"]\nspeed = 1'), 'motor "motor1" (motor[0]).between: both pins are on "crank"'),
+    (drawn(end='[[motor]]\nbetween = ["O", "B"]\ntorque = 1'), 'motor "motor1" (motor[0]).torque: a cylinder does not turn'),
+    (
+        drawn(end='[[motor]]\nbetween = ["O", "B"]\nspeed = "1 rpm"'),
+        'motor "motor1" (motor[0]).speed: "rpm" does not fit; it is measured in m/s',
+    ),
+    (
         drawn(end='[[motor]]\npin = "O"\nof = ["crank", "rod"]\nspeed = 1'),
         'motor "motor1" (motor[0]).of: "rod" is not at pin "O", where there are ground, crank',
     ),

@@ -112,7 +112,7 @@ def units_of_element(cls: type, table: Table) -> tuple[str, str]:
     if cls in (PinSpring, PinDamper):
         return ("TorsionSpring" if "pin" in table else "Spring"), ""
     if cls is Motor:
-        return ("SlideMotor", "m") if "slide" in table else ("Motor", "rad")
+        return ("SlideMotor", "m") if "slide" in table or table.get("between") else ("Motor", "rad")
     return cls.__name__, "rad" if table.get("coordinate") == "angle" else "m"
 
 

@@ -16,31 +16,33 @@ from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring
 
 
 class Motor(DrawnElement):
-    """A motor turns the second of two links at a `pin`, or moves a `slide`: at a `speed`, by a `motion`, or by a `torque`.
+    """A motor turns the second of two links at a `pin`, moves a `slide`, or is a cylinder `between` two pins.
 
-    A speed and a motion count from the drawn position.
+    It does so at a `speed`, by a `motion`, or by a `torque` at a pin. Speed and motion count from the drawn position; those of a
+    cylinder are of the distance of its pins.
     """
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     slide: str | None = eqx.field(static=True, default=None, metadata=SLIDE)
+    between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
-    speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; of a slide: m/s
+    speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; of a slide or a cylinder: m/s
     motion: Motion | None = None  # rad or m, from the drawn position
     torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m
 
     @property
     def measured_as(self):
-        return "SlideMotor" if self.slide is not None else "Motor"
+        return "Motor" if self.pin is not None else "SlideMotor"
 
     def mistakes(self, layout):
-        if (self.pin is None) == (self.slide is None):
-            yield "pin: give a pin, or a slide"
-        elif self.pin is not None:
-            yield from pair_mistakes(layout, self.pin, self.of)
+        if (self.pin is not None) + (self.slide is not None) + bool(self.between) != 1:
+            yield "pin: give a pin, a slide, or two pins that it is between"
+        elif self.slide is None:
+            yield from _mistakes_of_ends(layout, self.between, self.pin, self.of)
         if sum(x is not None for x in (self.speed, self.motion, self.torque)) != 1:
             yield "speed: give one of speed, motion and torque"
-        elif self.slide is not None and self.torque is not None:
-            yield "torque: a slide does not turn: write a [[load]] with a force"
+        elif self.pin is None and self.torque is not None:
+            yield f"torque: a {'slide' if self.slide else 'cylinder'} does not turn: write a [[load]] with a force"
 
     def parts(self, placement):
         if self.slide is not None:
@@ -48,11 +50,17 @@ class Motor(DrawnElement):
             pair, place = (slide.on, slide.link), placement.places[placement.links[slide.link].pins[0]]
             axis = placement.direction(slide.on, slide.along, slide.direction)
             return Parts(driver=Driver(pair, "x", self._law(0.0), placement.points(pair, (place, place)), axis))
-        assert self.pin is not None
+        if self.pin is None:
+            law, ends = self._law(placement.distance(*self.between)), placement.ends(self.between)
+            return Parts(driver=Driver(ends, "distance", law, _points_of(placement, self.between)))
         pair = placement.pair(self.pin, self.of)
         if self.torque is not None:
             return Parts(force=Torque(pair, self.torque))
         return Parts(driver=Driver(pair, "angle", self._law(placement.angle_between(*pair))))
+
+    @property
+    def anchors(self):
+        return self.between
 
     def _law(self, start: Number) -> Motion:
         if self.motion is not None:
@@ -199,8 +207,12 @@ def _turn_back(vector: Array, angle: Number) -> Array:
 def _spring_between(
     placement: Placement, between: tuple[str, ...], stiffness: Number, length: Number, damping: Number | None
 ) -> Spring:
-    ends = placement.ends(between)
-    return Spring(ends, placement.points(ends, [placement.places[pin] for pin in between]), stiffness, length, damping)
+    return Spring(placement.ends(between), _points_of(placement, between), stiffness, length, damping)
+
+
+def _points_of(placement: Placement, between: tuple[str, ...]) -> Array:
+    """Return the places of two pins, each in the frame of the first link there."""
+    return placement.points(placement.ends(between), [placement.places[pin] for pin in between])
 
 
 def _mistakes_of_ends(layout: PinLayout, between: tuple[str, ...], pin: str | None, of: tuple[str, ...]) -> Iterator[str]:

@@ -92,7 +92,7 @@ def _taken_names(layout: PinLayout, groups: Groups) -> Iterator[str]:
 def _attached(layout: PinLayout, groups: Groups) -> set[str]:
     """Return the links that something holds or pulls at."""
     found = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
-    for section in ("slide", "slot", "cam", "gear", "spring", "damper", "load", "joint", "driver", "force"):
+    for section in ("slide", "slot", "cam", "gear", "motor", "spring", "damper", "load", "joint", "driver", "force"):
         for element in groups[section].values():
             pins = (getattr(element, "pin", None), *getattr(element, "pins", ()), *getattr(element, "between", ()))
             named = (getattr(element, name, None) for name in ("link", "on", "body"))

@@ -178,6 +178,7 @@ class Draft {
       this.put("elements", [line(frame, offsets([[-14, 15], [10, 15]]), "accent", 1.8), this.head(frame, [16, 15], [1, 0])]);
       return;
     }
+    if (entry.between !== undefined) return void this.damper(entry);
     const place = this.place(entry.pin);
     if (!place) return;
     const value = String(entry.speed ?? entry.torque ?? "").trim();

@@ -15,7 +15,7 @@ const KEYS = {
   slot: [["pin", "name"], ["along", "names"], ["direction", "angle"], ["on", "name"], ["link", "name"]],
   gear: [["links", "names"], ["teeth", "count"], ["radii", "length"], ["internal", "yes"], ["carrier", "name"]],
   cam: [["pins", "names"], ["links", "names"], ["profile.angle", "angle"], ["profile.radius", "length"]],
-  motor: [["pin", "name"], ["slide", "name"], ["of", "names"], ["speed", "speed"], ["torque", "torque"], ["motion", "motion"]],
+  motor: [["pin", "name"], ["slide", "name"], ["between", "names"], ["of", "names"], ["speed", "speed"], ["torque", "torque"], ["motion", "motion"]],
   spring: [["between", "names"], ["pin", "name"], ["of", "names"], ["stiffness", "stiffness"], ["length", "length"], ["angle", "angle"], ["damping", "damping"]],
   damper: [["between", "names"], ["pin", "name"], ["of", "names"], ["damping", "damping"]],
   load: [["pin", "name"], ["link", "name"], ["force", "force"], ["torque", "torque"], ["frame", "name"]],
