@@ -150,3 +150,23 @@ def test_a_pin_is_driven_along_a_coordinate(linkage):
     values = float(udk.path(mech, sol, "C")[0, 0]) - np.array([0.01, 0.05])
     motion = udk.kinematics(mech, "pin.C.x", values)
     assert_allclose(udk.path(mech, motion, "C")[:, 0], values, rtol=0, atol=1e-12)
+
+
+def test_at_a_toggle_places_are_known_and_velocities_are_not():
+    """A slide pulls two links of 1 m straight: there its pin is 2 m away and their angle is 0, however fast it goes."""
+    pins = {"O": (0.0, 0.0), "A": (0.6, 0.8), "B": (1.2, 0.0)}
+    links = {
+        "crank": udk.Link(["O", "A"], mass=1.0),
+        "rod": udk.Link(["A", "B"], mass=1.0),
+        "block": udk.Link(["B"], mass=1, width=1),
+    }
+    slides, motors = {"guide": {"link": "block", "direction": 0.0}}, {"pull": {"slide": "guide", "speed": 1.0}}
+    mech = udk.Drawing(pins, links, ground=["O"], slides=slides, motors=motors).mechanism()
+    motion = udk.kinematics(mech, "pull", [0.0, float(udk.travel(mech, "pull").upper)])
+    assert motion.status[1] == udk.Reached.not_determined
+    assert_allclose(udk.path(mech, motion, "B"), [[1.2, 0.0], [2.0, 0.0]], atol=1e-6)
+    assert np.isnan(udk.path(mech, motion, "B", derivative=1)[1]).all() and np.isfinite(udk.path(mech, motion, "A")).all()
+    names = ["pin.B.x", "joint.A.angle", "distance.crank(-0.5, 0).rod(0.5, 0)", "pin.B.vx", "joint.A.omega"]
+    values = measure(mech, motion, [channel_of(mech, name) for name in names])
+    assert_allclose(values[1, :3], [2.0, 0.0, 2.0], atol=1e-6)
+    assert np.isnan(values[1, 3:]).all() and np.isfinite(values[0]).all()

@@ -41,12 +41,16 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
 
     Returns:
         Values (T, C) in SI units, one channel a column. Where a state is not a number, after a run has failed, nor are its
-        values; derivatives are zero there, and unharmed elsewhere.
+        values; where its velocities alone are none, at a toggle, positions, angles and distances are known. Derivatives are
+        zero where values are not numbers, and unharmed elsewhere.
     """
-    motion, reached = _fill(mechanism, solution)
+    motion, placed, reached = _fill(mechanism, solution)
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
-    return jnp.where(reached[:, None], jnp.stack(columns, -1), jnp.nan) if columns else jnp.zeros((len(motion.q), 0))
+    if not columns:
+        return jnp.zeros((len(motion.q), 0))
+    known = [placed if isinstance(c, Channel) and c.quantity in POSITIONS else reached for c in channels]
+    return jnp.where(jnp.stack(known, -1), jnp.stack(columns, -1), jnp.nan)
 
 
 @checked
@@ -66,7 +70,7 @@ def path(
             `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
 
     Returns:
-        x and y (T, 2) in ground axes; not a number where the motion is not.
+        x and y (T, 2) in ground axes; not a number where the motion is not. At a toggle positions are known, and no velocities.
 
     Raises:
         ValueError: no such body or pin.
@@ -80,21 +84,27 @@ def path(
 
 @deferred
 def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
-    motion, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), analysis)
-    return jnp.where(reached[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)
+    motion, placed, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), analysis)
+    return jnp.where((reached if derivative else placed)[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)
 
 
 def _fill(
     mechanism: Mechanism, solution: StateHistory | SimpleNamespace, analysis: Analysis | None = None
-) -> tuple["_Motion", Bool[Array, "T"]]:
-    """Return a motion with the scene's guess where it is not a number, so that all derivatives are, and where it is one."""
-    reached = jnp.all(jnp.isfinite(solution.q) & jnp.isfinite(solution.v), axis=(1, 2))
-    finite = reached[:, None, None]
-    q, v = (jnp.where(finite, x, jax.lax.stop_gradient(x0)) for x, x0 in ((solution.q, mechanism.q0), (solution.v, mechanism.v0)))
+) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
+    """Return a motion with the scene's guess where it is not a number, so that all derivatives are.
+
+    Where its positions are numbers, and where its velocities are so as well, comes with it.
+    """
+    placed = jnp.all(jnp.isfinite(solution.q), axis=(1, 2))
+    reached = placed & jnp.all(jnp.isfinite(solution.v), axis=(1, 2))
+    filled = ((placed, solution.q, mechanism.q0), (reached, solution.v, mechanism.v0))
+    q, v = (jnp.where(known[:, None, None], x, jax.lax.stop_gradient(x0)) for known, x, x0 in filled)
     a = getattr(solution, "a", None)
-    return _Motion(mechanism, solution.ts, q, v, None if a is None else jnp.where(finite, a, 0.0), analysis), reached
+    a = None if a is None else jnp.where(reached[:, None, None], a, 0.0)
+    return _Motion(mechanism, solution.ts, q, v, a, analysis), placed, reached
 
 
+POSITIONS = ("x", "y", "angle", "distance")  # quantities that velocities do not matter to
 DERIVATIVE = {"": 0, "v": 1, "a": 2}  # of a position, by the letter before x or y
 
 
