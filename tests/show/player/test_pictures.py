@@ -52,6 +52,32 @@ def test_an_svg_has_its_pins_at_their_places(animation, closed_form, tmp_path):
     assert text.startswith("<svg ") and "<title>slider-crank</title>" in text
 
 
+def test_arrows_of_a_picture_are_the_reactions(tmp_path):
+    """A chain of 3 kg and 1 kg hangs: its upper pin holds 4 kg, its lower one 1 kg, upwards on the body below."""
+    bodies = {"upper": udk.Body(3.0, 0.1, position=[0.0, -0.5]), "lower": udk.Body(1.0, 0.1, position=[0.0, -1.5])}
+    ends = [[0.0, -0.5], [0.0, 0.5]]
+    joints = {"A": udk.Revolute(["ground", "upper"], [[0.0, 0.0], ends[1]]), "B": udk.Revolute(["upper", "lower"], ends)}
+    chain = udk.Mechanism(bodies, joints)
+    shown = udk.animate(chain, udk.simulate(chain, np.linspace(0.0, 1.0, 11)), measures=(), reactions=True)
+    view = view_of(shown.data["bounds"], 640, has_arrows=True)
+    for t in (0.0, 0.55):
+        text = shown.save(tmp_path / "pose.svg", t=t).read_text()
+        heads = [
+            np.array(re.findall(r"([\d.]+),([\d.]+)", head), float)
+            for head in re.findall('<polygon class="reaction".*?"([^"]*)"', text)
+        ]
+        assert len(heads) == 2
+        for head, pin, force in zip(heads, (0.0, -1.0), (4.0, 1.0), strict=True):
+            tip = [view.x, view.y - view.scale * pin - 70.0 * view.pt * force / 4.0]
+            np.testing.assert_allclose(head[0], tip, atol=0.05)
+            assert 0 < tip[1] < view.height
+    dark = np.asarray(films.image(shown, 0.0, 640, "dark"), float)
+    force = [int(THEMES["dark"]["force"][k : k + 2], 16) for k in (1, 3, 5)]
+    assert (np.abs(dark - force).max(axis=2) < 20).sum() > 50
+    plain = udk.animate(chain, udk.simulate(chain, [0.0, 1.0]), measures=()).save(tmp_path / "plain.svg").read_text()
+    assert "reaction" not in plain
+
+
 def test_texts_of_an_svg_are_texts(hostile, tmp_path):
     text = udk.animate(hostile.mechanism, measures=()).save(tmp_path / "pose.svg").read_text()
     assert "<script" not in text and "&lt;/script&gt;" in text

@@ -22,8 +22,17 @@ from udkjax.show.player.marks import Shapes
 from udkjax.show.player.measure_curves import Measures, ShownMotion
 from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
-from udkjax.show.player.player_data import Traces, failure_of, mode_record, motion_of, paths_of, player_data, run_record
-from udkjax.show.player.sketch import TracedPath
+from udkjax.show.player.player_data import (
+    Traces,
+    arrows_of,
+    failure_of,
+    mode_record,
+    motion_of,
+    paths_of,
+    player_data,
+    run_record,
+)
+from udkjax.show.player.sketch import ForceArrow, TracedPath
 
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
@@ -50,6 +59,7 @@ class Animation:
     def __init__(self, data: Json, failures: Mapping[str, str] | None = None):
         self.data, self.failures = data, dict(failures or {})  # causes of failed runs, by their labels
         self._motions = [motion_of(record) for record in data["runs"]]
+        self._arrows = [arrows_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
 
     def html(self, theme: str | None = None, autoplay: bool = False) -> str:
@@ -110,6 +120,11 @@ class Animation:
             self._paths = [paths_of(record) for record in self.data["runs"]]
         return self._paths
 
+    def arrows(self, t: float | None = None) -> list[list[ForceArrow]]:
+        """Return the arrows of the reactions of each run at time t (s); none where they are not shown."""
+        t = float(self.data["start"] if t is None else t)
+        return [arrows(t) for arrows in self._arrows]
+
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)
 
@@ -140,7 +155,8 @@ def animate(
         measures: curves of a strip over time: any of "violation" (m; radians as an arc of the characteristic length), "energy",
             "rank" and "effort" (of drivers, N or N m), or {"torque (N m)": array} for values of your own, of several runs
             {"torque (N m)": {label: array}}.
-        reactions: draw the forces of the joints as arrows; of redundant joints, the shares of least norm.
+        reactions: draw the forces of the joints as arrows, in pictures and films as well; of redundant joints, the shares of
+            least norm, which the page draws dashed and pictures paler.
         traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
             the pins that move, up to eight.
         shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.

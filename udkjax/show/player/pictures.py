@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from udkjax.extras import OptionalImport
 from udkjax.show.player.packing import Json
-from udkjax.show.player.sketch import THEMES, Circle, Line, Sketch, TracedPath, View, view_of
+from udkjax.show.player.sketch import THEMES, Circle, ForceArrow, Line, Sketch, TracedPath, View, view_of
 
 DXF_LAYERS = {
     "pin": "joints",
@@ -35,15 +35,19 @@ class Posed(Protocol):
         """Return the paths of the traced points of each run."""
         ...
 
+    def arrows(self, t: float | None = None) -> list[list[ForceArrow]]:
+        """Return the arrows of the reactions of each run at time t."""
+        ...
+
 
 def sketches(animation: Posed, t: float | None, width: int, theme: str, times: int = 1) -> tuple[View, list[Sketch]]:
     """Return the view of each panel, `width` over all and so many times as large, and the sketch of each run at time t."""
     if theme not in THEMES:
         raise ValueError(f"theme {theme!r} is neither of {', '.join(THEMES)}")
     runs = animation.data["runs"]
-    view = view_of(animation.data["bounds"], width // len(runs), times)
-    shown = zip(runs, animation.pose(t), animation.paths(), strict=True)
-    return view, [Sketch(run["marks"], pose, view, theme, paths) for run, pose, paths in shown]
+    view = view_of(animation.data["bounds"], width // len(runs), times, any(run["reactions"] for run in runs))
+    shown = zip(runs, animation.pose(t), animation.paths(), animation.arrows(t), strict=True)
+    return view, [Sketch(run["marks"], pose, view, theme, paths, arrows) for run, pose, paths, arrows in shown]
 
 
 def svg(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> str:

@@ -34,7 +34,7 @@ from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
-from udkjax.show.player.sketch import POINT, TracedPath, view_of
+from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
 from udkjax.show.player.symbols import symbols_of
 from udkjax.study.channels import locate
 
@@ -150,13 +150,34 @@ def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]
     ts, q, v = (unpack(record[name]) for name in ("time", "q", "v"))
 
     def at(t: float) -> Float[np.ndarray, "bodies 3"]:
-        j = int(np.clip(np.searchsorted(ts[:, 0], t, side="right"), 1, max(len(ts) - 1, 1)))
-        i, j = j - 1, min(j, len(ts) - 1)
-        h = ts[j, 0] - ts[i, 0]
-        s = float(np.clip((t - ts[i, 0]) / h, 0, 1)) if h > 0 else 0.0
-        r = 1 - s
+        i, j, s = _place_in(ts[:, 0], t)
+        h, r = ts[j, 0] - ts[i, 0], 1 - s
         ends = q[i] * r * r * (1 + 2 * s) + q[j] * s * s * (3 - 2 * s)
         return (ends + h / record["frame"] * s * r * (v[i] * r - v[j] * s)).reshape(shape)
+
+    return at
+
+
+def _place_in(ts: Float[np.ndarray, "T"], t: float) -> tuple[int, int, float]:
+    """Return the instants that a time lies between, and the part of the way from one to the other."""
+    j = int(np.clip(np.searchsorted(ts, t, side="right"), 1, max(len(ts) - 1, 1)))
+    i, j = j - 1, min(j, len(ts) - 1)
+    h = ts[j] - ts[i]
+    return i, j, float(np.clip((t - ts[i]) / h, 0, 1)) if h > 0 else 0.0
+
+
+def arrows_of(record: Record) -> Callable[[float], list[ForceArrow]]:
+    """Return the arrows of a run's reactions as a function of time, as the player shows them: linear between instants."""
+    if not record["reactions"]:
+        return lambda t: []
+    shown, ts = record["reactions"], unpack(record["time"])[:, 0]
+    forces = unpack(shown["force"]).reshape(len(ts), -1, 2) / shown["usual"]
+
+    def at(t: float) -> list[ForceArrow]:
+        i, j, s = _place_in(ts, t)
+        now = (forces[i] * (1 - s) + forces[j] * s).tolist()
+        anchors = zip(shown["anchors"], now, shown["unique"], strict=True)
+        return [ForceArrow(int(body), (x, y), (fx, fy), unique) for (body, x, y), (fx, fy), unique in anchors]
 
     return at
 

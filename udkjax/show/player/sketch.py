@@ -15,15 +15,20 @@ from udkjax.show.player.symbols import Symbol, symbols_of
 THEMES: dict[str, dict[str, Any]] = {
     "light": {
         "back": "#ffffff", "ink": "#1b2430", "soft": "#5a6676", "grid": "#edf0f4", "accent": "#0067b0", "tint": 0.74,
+        "force": "#b3261e",
         "bodies": ["#0072b2", "#d55e00", "#009e73", "#c2559a", "#3a9bdc", "#b87a00", "#6b5bb5"],
     },
     "dark": {
         "back": "#11161d", "ink": "#e7ecf3", "soft": "#9aa7b8", "grid": "#1c232d", "accent": "#5cb3f2", "tint": 0.68,
+        "force": "#ff8a80",
         "bodies": ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
     },
 }  # fmt: skip
 POINT = 420.0  # px: of pictures whose shorter side is this long a symbol's unit is one pixel
 MARGIN = 44.0  # px
+ARROW, LONGEST_ARROW = 70.0, 3.0  # units of a symbol, of the usual force; and the longest arrow, in usual ones
+HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # units of a symbol, rad
+NOT_UNIQUE_TINT = 0.5  # of the way from the colour of a force to the background
 PATH_WIDTH, PATH_TINT = 1.2, 0.4  # units of a symbol; of the way from the colour of a body to the background
 
 
@@ -32,6 +37,15 @@ class TracedPath(NamedTuple):
 
     body: int
     points: Float[np.ndarray, "n 2"]
+
+
+class ForceArrow(NamedTuple):
+    """A force on a point (m) of a body: x and y in parts of the usual force, and whether equilibrium alone determines it."""
+
+    body: int
+    at: tuple[float, float]
+    force: tuple[float, float]
+    unique: bool
 
 
 class View(NamedTuple):
@@ -67,10 +81,13 @@ class Circle(NamedTuple):
     fill: str = ""
 
 
-def view_of(bounds: Sequence[float], width: int, times: int = 1) -> View:
-    """Return the view of a picture of this width that holds `bounds` (left, bottom, right, top, in m), so many times as large."""
+def view_of(bounds: Sequence[float], width: int, times: int = 1, has_arrows: bool = False) -> View:
+    """Return the view of a picture of this width that holds `bounds` (left, bottom, right, top, in m), so many times as large.
+
+    Around them there is room for the usual arrow of a force, if it has some.
+    """
     left, bottom, right, top = bounds
-    margin = min(MARGIN, 0.12 * width)
+    margin = min(MARGIN + ARROW, 0.24 * width) if has_arrows else min(MARGIN, 0.12 * width)
     height = int(np.clip((width - 2 * margin) / (right - left) * (top - bottom) + 2 * margin, 0.25 * width, 1.25 * width))
     scale = times * min((width - 2 * margin) / (right - left), (height - 2 * margin) / (top - bottom))
     pt = times * float(np.clip(min(width, height) / POINT, 0.75, 1.5))
@@ -94,15 +111,33 @@ class Sketch:
         view: View,
         theme: str = "light",
         paths: Sequence[TracedPath] = (),
+        arrows: Sequence[ForceArrow] = (),
     ):
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
         symbols = symbols_of(marks, view.pt / view.scale)
         self.shapes = [*map(self._path, paths), *map(self._shape, symbols)]
+        for arrow in arrows:
+            self.shapes += self._arrow(arrow)
 
     def _path(self, path: TracedPath) -> Line:
         points = np.array([self.view.x, self.view.y]) + self.view.scale * path.points * [1, -1]
         colour = mix(self._colour(f"edge:{path.body}"), self.theme["back"], PATH_TINT)
         return Line("path", points, PATH_WIDTH * self.view.pt, colour)
+
+    def _arrow(self, arrow: ForceArrow) -> list[Line]:
+        """Return the shaft and the head of an arrow; nothing where it is too short to be seen."""
+        force, pt = np.array(arrow.force), self.view.pt
+        size = float(np.hypot(*force))
+        length = ARROW * pt * min(size, LONGEST_ARROW)
+        if length <= HEAD * pt:
+            return []
+        way, start = force / size * [1, -1], self._anchor(arrow.body, *arrow.at)
+        tip, side = start + length * way, np.array([-way[1], way[0]])
+        back = tip - HEAD * pt * np.cos(HEAD_ANGLE) * way
+        colour = mix(self.theme["force"], self.theme["back"], 0.0 if arrow.unique else NOT_UNIQUE_TINT)
+        wing = HEAD * pt * np.sin(HEAD_ANGLE) * side
+        shaft = Line("reaction", np.array([start, back]), ARROW_WIDTH * pt, colour)
+        return [shaft, Line("reaction", np.array([tip, back + wing, back - wing]), fill=colour, closed=True)]
 
     def _shape(self, symbol: Symbol) -> Line | Circle:
         look = symbol["width"] * self.view.pt, self._colour(symbol["stroke"]), self._colour(symbol["fill"])
