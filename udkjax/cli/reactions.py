@@ -34,7 +34,7 @@ def reactions(
     import udkjax as udk
     from udkjax.printing import PrintedTable, format_number, text_table
     from udkjax.study.channels import LOADS
-    from udkjax.study.reaction_peaks import unique_pin_forces
+    from udkjax.study.reaction_peaks import cam_forces, unique_pin_forces
 
     sol = udk.simulate(mech, ts, throw=False)
     found = {pin: {body: np.asarray(x) for body, x in at.items()} for pin, at in udk.pin_reactions(mech, sol).items()}
@@ -60,10 +60,16 @@ def reactions(
         from udkjax.show.figures import reactions_figure
 
         reactions_figure(ts, found, mech.name).savefig(plot, dpi=150)
+    remarks, cams = [], {}
+    for cam, pressed in cam_forces(mech, sol).items():
+        least = int(np.nanargmin(pressed)) if np.isfinite(pressed).any() else 0
+        cams[cam] = {"least": pressed[least], "time": ts[least]}
+        pulls = "; it would have to pull: the follower leaves it" if pressed[least] < 0 else ""
+        remarks.append(f"  cam {cam} presses by {format_number(pressed[least], 'N')} at least, at {ts[least]:g} s{pulls}")
     heads = "pin", "on", "largest force (N)", "fx (N)", "fy (N)", "at (s)", ""
     show(
-        {"result": sol.result, "peaks": results},
-        text_table(PrintedTable(f"{mech.name or 'mechanism'}, forces at its pins", rows, heads), len(rows)),
+        {"result": sol.result, "peaks": results, "cams": cams},
+        text_table(PrintedTable(f"{mech.name or 'mechanism'}, forces at its pins", rows, heads, remarks), len(rows)),
         json,
     )
     if not sol.result.is_success:

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float, Int
 from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.joints import Revolute
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Cam, Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import StateHistory, has_point
 
@@ -118,6 +119,29 @@ def unique_pin_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str,
             at = found.setdefault(_pin_of(mechanism, name), {})
             for body, known in unique[name].items():
                 at[body] = at.get(body, True) and bool(np.asarray(known)[alive, :2].all())
+    return found
+
+
+def cam_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, Float[np.ndarray, "T"]]:
+    """Return the force (N) with which each cam presses on its follower, along the normal of the profile.
+
+    A `Cam` holds both ways. Where the force is below zero it pulls, and a real follower without a groove leaves the profile.
+    """
+    found, q = {}, np.asarray(solution.q)
+    cams = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Cam)}
+    loads = reactions(mechanism, solution) if cams else {}
+
+    def place(body: str, point: Array) -> np.ndarray:
+        x, y, angle = (0.0, 0.0, 0.0) if body == GROUND else q[:, mechanism.body_names.index(body)].T
+        along = np.exp(1j * angle) * complex(*point) + x + 1j * y
+        return np.broadcast_to(along, len(q))
+
+    for name, cam in cams.items():
+        centre, follower = (place(body, point) for body, point in zip(cam.bodies, np.asarray(cam.points), strict=True))
+        on, sign = (cam.bodies[1], 1.0) if cam.bodies[1] != GROUND else (cam.bodies[0], -1.0)
+        fx, fy = np.asarray(loads[name][on])[:, :2].T
+        outwards = ((fx + 1j * fy) * np.conj(follower - centre)).real
+        found[name] = sign * np.copysign(np.hypot(fx, fy), outwards)
     return found
 
 
