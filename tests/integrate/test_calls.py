@@ -61,6 +61,17 @@ def test_what_is_decided_of_a_mechanism_is_decided_once():
     assert not names & {"structure", "scene_programs", "compile_mechanism", "has_pieces", "_analyse"}
 
 
+def test_a_compiled_run_does_nothing_to_the_outputs_of_machine_code():
+    """Programs of a thousand operations and more are handed to another thread by JAX, which takes as long as a fifth of a run."""
+    mechanism = udk.library.parallelogram()
+
+    def operations(outputs: int) -> float:
+        run = jax.jit(lambda q, v: udk.simulate(mechanism, np.linspace(0.0, 1.0, outputs), udk.State(q, v), throw=False))
+        return run.lower(mechanism.q0, mechanism.v0).compile().cost_analysis()["flops"]
+
+    assert operations(2) == operations(401) < 1000
+
+
 @pytest.mark.parametrize("count, transform", [(2, jax.grad), (3, jax.jacfwd)])
 def test_an_eager_derivative_takes_few_programs(compilations, count, transform):
     """All of them are single operations of JAX's: NumPy evaluates what closes, runs and goes back."""

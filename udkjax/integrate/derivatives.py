@@ -58,9 +58,8 @@ def _(primals, tangents):
 
     def in_parts(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
         """Return the run, and a linear map of the direction."""
-        raw, record = at[0].recorded(stop_gradients(at[1]), active)
-        states = (raw.q, raw.v) if raw.q.shape[0] > 2 else ()  # of outputs between the first and the last alone
-        linear = Linear(function=at[0], xs=at[1], run=(states, record), active=active)
+        raw, recorded = at[0].recorded(stop_gradients(at[1]), active)
+        linear = Linear(function=at[0], xs=at[1], run=recorded, active=active)
         return list(_as_run(*at, raw)), linear.applied(direction)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
@@ -117,9 +116,7 @@ class DifferentiableRun(DifferentiableFunction):
     def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
         problem, which = self.problem(xs), self.problem.marks(active)
         if self._is_native(xs, active):
-            if run is None:
-                raw, record = self.recorded(xs, active)
-                run = (raw.q, raw.v), record
+            run = self.recorded(xs, active)[1] if run is None else run
             q, v, y = ws
             found = native_engine.vjp(problem, which, run, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
@@ -151,11 +148,14 @@ class DifferentiableRun(DifferentiableFunction):
         raw, change = change_along(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
         return raw, [change[k] for k in SMOOTH]
 
-    def recorded(self, xs: list[Array], active: Mask) -> tuple[IntegratorOutput, Array | None]:
-        """Return the run and its record, by the machine code of its reverse mode, if that serves: no other is compiled."""
+    def recorded(self, xs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
+        """Return the run and what it leaves to walk back from, by the machine code of reverse mode, if that serves.
+
+        No other is compiled. Diffrax leaves nothing.
+        """
         if self._is_native(xs, active):
             return native_engine.integrate_for_vjp(self.problem(xs), self.problem.marks(active))
-        return _integrate_by_diffrax(self.problem(xs)), None
+        return _integrate_by_diffrax(self.problem(xs)), ()
 
     def _is_native(self, xs: list[Array], active: Mask) -> bool:
         return self.native and native_engine.serves_derivatives(self.problem.marks(active))

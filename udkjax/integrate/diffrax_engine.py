@@ -25,7 +25,8 @@ def integrate_by_diffrax(
     problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
 ) -> IntegratorOutput:
     """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
-    ts, y0 = _leave_breakpoints(problem), jnp.concatenate([problem.q, problem.v])
+    ts = _leave_breakpoints(problem)
+    y0 = given = jnp.concatenate([problem.q, problem.v])
     equations = equations_for_diffrax(problem)
     if problem.compiled.plan.projected:  # machine code does so, and its derivatives are combined with those of this engine
         y0 = project(equations, ts[0], y0)
@@ -49,9 +50,10 @@ def integrate_by_diffrax(
     reached = ts <= t_end[0]
     later = reached & (jnp.arange(len(ts)) > 0)
     ys = jnp.where(later[:, None], ys, y0)  # a run without any accepted step has saved nothing
-    if problem.compiled.plan.projected:
-        ys = jnp.concatenate([ys[:1], project_all(equations, ts[1:], ys[1:])])
+    others = project_all(equations, ts[1:], ys[1:]) if problem.compiled.plan.projected else ys[1:]
+    ys = jnp.concatenate([given[None], others])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
+    lost = jnp.min(jnp.where(reached & ~(violated <= problem.drift_tol), np.arange(float(len(ts))), np.inf))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
@@ -59,7 +61,9 @@ def integrate_by_diffrax(
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
-    return IntegratorOutput(q, v, violated, reached, status, t_end[0], end[0], *steps, right_hand_sides)
+    found = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides)
+    q, v = (jnp.where(found.kept[:, None], y, jnp.nan) for y in (q, v))
+    return found._replace(q=q, v=v)
 
 
 def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:

@@ -47,12 +47,21 @@ def integrate(problem: Problem) -> IntegratorOutput:
     return _output(native_p.bind(*run_inputs(problem, operation), operation=operation, times=len(problem.ts)))
 
 
-def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, Array]:
+class RecordedRun(NamedTuple):
+    """What a run leaves to walk back from."""
+
+    record: Array
+    states: tuple[Array, ...]  # q and v (T, n), if there are outputs between the first and the last
+    kept: Array  # `IntegratorOutput.kept`
+
+
+def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, RecordedRun]:
     """Integrate a problem by the code that `vjp` takes: no other is compiled. Return the record that it walks back from, too."""
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
     none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     found = native_p.bind(*run_inputs(problem, operation), *none, operation=operation, times=times)
-    return _output(found[: len(OUTPUTS)]), found[-1][0]
+    raw = _output(found[: len(OUTPUTS)])
+    return raw, RecordedRun(found[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
 
 
 def serves_derivatives(active: Problem) -> bool:
@@ -98,17 +107,16 @@ def _integrate_along(
         operation=operation,
         times=len(problem.ts),
     )
-    return _output(found), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
+    raw = _output(found)
+    dys = jnp.where(raw.kept[:, None], dys[0, 0], 0.0)
+    return raw, (dys[:, :n], dys[:, n:], dend[0, 0])
 
 
-def vjp(problem: Problem, active: Any, run: tuple[Sequence[Array], Array], ys: Array, end: Array) -> Problem:
-    """Return the cotangents of what is `active`, from those of the states at the outputs (T, 2n) and of the end (2n,).
-
-    `run` is what `integrate_for_vjp` has left: q and v (T, n), if there are outputs between the first and the last; the record.
-    """
-    operation, (states, record) = _operation(problem, active, reverse=True), run
-    states = states or [np.zeros((len(problem.ts), len(problem.q)))] * 2
-    given = [x[None] for x in (record, *states, ys, end)]
+def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) -> Problem:
+    """Return the cotangents of what is `active`, from those of the states at the outputs (T, 2n) and of the end (2n,)."""
+    operation, kept = _operation(problem, active, reverse=True), run.kept[:, None]
+    states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
+    given = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]
     found = native_p.bind(*run_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
     numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
@@ -145,6 +153,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
         "length": problem.length,
         "omega": problem.rate,
         "max_steps": problem.max_steps,
+        "drift_tol": problem.drift_tol,
     }
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
     return operation.pack(numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
@@ -210,9 +219,9 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
 
 
 def _output(found: Sequence[Any]) -> IntegratorOutput:
-    q, v, violation, info = [x[0] for x in found]
-    code, t, tried, accepted, evaluations, written = [info[k] for k in range(len(INFO))]
+    q, v, _, info = [x[0] for x in found]
+    code, t, tried, accepted, evaluations, written, lost = [info[k] for k in range(len(INFO))]
     number = np.arange(len(q))
     reached = (number <= written) & (number < len(q) - 1) | (code == DONE)
     counts = [x.astype(int) for x in (tried, accepted, evaluations)]
-    return IntegratorOutput(q, v, violation, reached, code.astype(int), t, info[len(INFO) :], *counts)
+    return IntegratorOutput(q, v, reached, lost, code.astype(int), t, info[len(INFO) :], *counts)

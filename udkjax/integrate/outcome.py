@@ -21,7 +21,6 @@ class FinishedRun(NamedTuple):
     usable: Bool[Array, ""]  # `usable` of its arguments
     closed: Bool[Array, ""]
     missed: Bool[Array, ""]  # the closed state takes rows that the method leaves out
-    drift_tol: Float[Array, ""]
 
 
 def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
@@ -31,24 +30,24 @@ def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
 
 def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: Array | None) -> Bool[Array, ""]:
     """Tell whether numbers are what `simulate` lets in: of those that are traced when it is called it sees the shapes alone."""
-    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
+    finite = jnp.all(jnp.isfinite(jnp.concatenate([q, v])))
     tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol >= LEAST_ATOL) & (rtol + atol < jnp.inf) & (drift_tol > 0)
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 
-def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array, Bool[Array, "T"]]:
-    """Return the `Result`, the time (s) that belongs to it, and which of the output times count."""
-    code = xp.where(run.raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
-    code = xp.where(run.raw.status == NOT_FINITE, Result.not_finite, code)
-    code = xp.where(run.raw.status == LOST, Result.drift, code)
-    code = xp.where(run.raw.status == DONE, Result.successful, code)
-    code, time, reached = _drift(run, code, xp)
-    first = xp.arange(len(run.ts)) == 0
+def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
+    """Return the `Result` and the time (s) that belongs to it; the first lost output ends the motion."""
+    raw = run.raw
+    code = xp.where(raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    code = xp.where(raw.status == NOT_FINITE, Result.not_finite, code)
+    code = xp.where(raw.status == LOST, Result.drift, code)
+    code = xp.where(raw.status == DONE, Result.successful, code)
+    is_lost = xp.isfinite(raw.lost)
+    code = xp.where(is_lost, xp.where(raw.lost == 0, Result.initial_state_open, Result.drift), code)
     code = xp.where(run.missed, Result.drift, code)
     code = xp.where(run.closed, code, Result.could_not_assemble)
     code = xp.where(run.usable, code, Result.invalid_argument)
-    started = run.usable & run.closed & ~run.missed
-    return code, xp.where(started, time, run.ts[0]), reached & (started | first)
+    return code, xp.where(is_lost, run.ts[xp.where(is_lost, raw.lost, 0).astype(int)], raw.t)
 
 
 def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
@@ -64,18 +63,6 @@ def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Arra
 
     is_finite = jax.lax.cond(status != DONE, finite, lambda _: jnp.array(True), 0)
     return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
-
-
-def _drift(run: FinishedRun, code: Array, xp: ModuleType) -> tuple[Array, Array, Bool[Array, "T"]]:
-    """Return code, time and the reached times, where the first output time at which a row of Psi is violated ends the solution.
-
-    That holds for rows that the method leaves out, too.
-    """
-    lost = run.raw.reached & ~(run.raw.violation <= run.drift_tol)
-    drifted, first = xp.any(lost), xp.argmax(lost)
-    reached = run.raw.reached & (~drifted | (xp.arange(len(run.ts)) <= first))
-    code = xp.where(drifted, xp.where(first == 0, Result.initial_state_open, Result.drift), code)
-    return code, xp.where(drifted, run.ts[first], run.raw.t), reached
 
 
 def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:

@@ -34,7 +34,8 @@ AUTO = Auto()  # one for all runs that do not say otherwise
 # looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
 # 2e-3 open.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
-LOOSE_TOL = 1e3  # of runs that have failed before they begin
+LOOSE_TOL = 1e3  # of runs that have failed before they begin, and
+NO_DRIFT = -1.0  # the violation of Psi that they may have: no output of theirs counts but the first
 
 
 class Choices(NamedTuple):
@@ -167,6 +168,7 @@ def prepare_run(
         length=length,
         rate=rate,
         max_steps=choices.max_steps,
+        drift_tol=xp.where(runs & ~start.has_missed_rows, choices.drift_tol, NO_DRIFT),
         marks=mark_rows(compiled, ts[0], start.q, start.v, length, rate, xp) if compiled.plan.marks_rows else None,
     )
     return PreparedRun(problem, given_ts, start.shape, good, start.is_closed, start.has_missed_rows)

@@ -31,6 +31,7 @@ class Problem:
     length: Float[Array, ""] | None
     rate: Float[Array, ""]  # of the system and the run (1/s)
     max_steps: Int[ArrayLike, ""]
+    drift_tol: Float[Array, ""]  # violation of Psi, of the rows' scales, beyond which a run has failed
     marks: Float[Array, "m"] | None = None  # of rows of Psi: one for those that are independent; None: machine code knows them
     # Capacity of a record for reverse mode; None: by breakpoints.
     points: int | None = field(default=None, metadata={"static": True})
@@ -56,13 +57,18 @@ class Problem:
 class IntegratorOutput(NamedTuple):
     """A run as an integrator leaves it: `status` is one of `native.steps`, from `DONE` on."""
 
-    q: Float[Array, "T n"]  # of any value where it was not reached
+    q: Float[Array, "T n"]  # no number where it was not reached, or behind the first that is lost
     v: Float[Array, "T n"]
-    violation: Float[Array, "T"]  # the largest of any row of Psi there, over its scale
     reached: Bool[Array, "T"]
+    lost: Float[Array, ""]  # the number of the first output at which Psi is violated by more than `drift_tol`; infinite: none
     status: Int[Array, ""]
     t: Float[Array, ""]  # the end
     y: Float[Array, "2n"]  # at t
     tried: Int[Array, ""]  # steps
     accepted: Int[Array, ""]
     evaluations: Int[Array, ""]
+
+    @property
+    def kept(self) -> Bool[Array, "T"]:
+        """True for outputs that were reached and do not lie behind the first lost one."""
+        return self.reached & (np.arange(self.reached.shape[-1]) <= self.lost)

@@ -240,11 +240,9 @@ def _finish(
 ) -> tuple[Solution, Any, Any]:
     """Return the results of `_run`, of a run as the integrator leaves it."""
     problem, ts = run.problem, run.ts
-    later = (raw.reached & (np.arange(len(ts)) > 0))[:, None]
-    q, v = xp.where(later, raw.q, problem.q), xp.where(later, raw.v, problem.v)
-    ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows, choices.drift_tol)
-    code, time, reached = outcome(ending if xp is np else stop_gradients(ending), xp)
-    q, v = [xp.where(reached[:, None], y, xp.nan).reshape(-1, *run.state_shape) for y in (q, v)]
+    ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows)
+    code, time = outcome(ending if xp is np else stop_gradients(ending), xp)
+    q, v = (y.reshape(-1, *run.state_shape) for y in (raw.q, raw.v))
     stats = counts(raw, problem.compiled.plan.projected, len(ts), xp)
     rtol, atol = xp.asarray(choices.rtol, float), xp.asarray(choices.atol, float)
     if xp is np:

@@ -104,7 +104,7 @@ def _advance(
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)
     raw = differentiable(replace(run.problem, points=STORED_POINTS))
-    good = stop_gradients(run.is_usable & raw.reached[-1] & (jnp.max(raw.violation) <= DRIFT_PROJECTED))
+    good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.lost))
     failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
 

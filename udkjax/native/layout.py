@@ -28,11 +28,11 @@ FORMULATION_SETTINGS = (
     "formulation_tol",
     "mass",
 )  # besides, for formulations: the threshold of the rank, the scale of masses (kg)
-SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps", "method")
+SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps", "method", "drift_tol")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
 SHARE = 32  # members of a thread, at least: to wake it takes some 50 us, and the shortest runs take one or two each
-INFO = ("code", "t", "tried", "accepted", "evaluations", "written")  # then the last q and v
+INFO = ("code", "t", "tried", "accepted", "evaluations", "written", "lost")  # then the last q and v
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,7 @@ LANE_NUMBERS = {  # numbers of each lane, and what they are
     "accepted": "accepted steps so far",
     "evaluations": "accelerations so far",
     "written": "outputs so far",
+    "lost": "number of the first output at which Psi is violated by more than `drift_tol`; infinite: none",
     "crossing": "where a piece of the state is expected to end (s)",
     "aim": "where the attempt is to end: before that, beyond it, or across",
     "tries": "attempts to end there, in a row",

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.native.ir import DOUBLE, INT, POINTER, Function
+from udkjax.native.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.manifold import largest_violation, project_output
 from udkjax.native.module import Module
@@ -49,7 +49,15 @@ def write_begin(module: Module):
     ts = module.member_address(f, "ts", member)
     times = module.field(f, "times")
     start, end = f.load(ts), f.load(ts, times - 1)
-    first = {"start": start, "end": end, "next": f.load(ts, 1), "rate": np.inf, "crossing": np.inf, "passed": -np.inf}
+    first = {
+        "start": start,
+        "end": end,
+        "next": f.load(ts, 1),
+        "rate": np.inf,
+        "crossing": np.inf,
+        "passed": -np.inf,
+        "lost": np.inf,
+    }
     for name, value in first.items():
         put(name, value)
     for j in range(POINTS):
@@ -101,12 +109,6 @@ def write_finish(module: Module):
         member = module.to_int(f, f.lane(s.member, k))
         with f.if_(f.lane(s.code, k).is_(float(DONE))):
             module.write_state(f, s, k, times - 1, "state q", "result v")
-        info = module.result_address(f, "info", member, len(INFO) + 2 * module.n)
-        values = {"t": s.point3_t}
-        for j, name in enumerate(INFO):
-            f.store(f.lane(values.get(name, getattr(s, name) if name != "t" else s.point3_t), k), info, j)
-        module.copy_lane(f, info, len(INFO), "point3 q", k)
-        module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
         q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
         with f.each(module.n) as i:
             for name, x in (("state q", q), ("result v", v)):
@@ -120,7 +122,26 @@ def write_finish(module: Module):
     s.violated = largest_violation(module, f)
     with module.each_lane(f, s.due) as k:
         module.write_state(f, s, k, f.const(0, INT), "state q", "result v")
+        info = module.result_address(f, "info", module.to_int(f, f.lane(s.member, k)), len(INFO) + 2 * module.n)
+        for j, name in enumerate(INFO):
+            f.store(f.lane(s.point3_t if name == "t" else getattr(s, name), k), info, j)
+        module.copy_lane(f, info, len(INFO), "point3 q", k)
+        module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
+        _clear_outputs(module, f, s, k)
     module.end_members(f, s)
+
+
+def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
+    """Clear the outputs of lane k that its run did not reach, and those behind the first lost one: they are no numbers."""
+    times, nan = module.field(f, "times"), f.const(np.nan)
+    is_done = f.lane(s.code, k).is_(float(DONE))
+    reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)
+    kept = module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
+    row = module.to_int(f, f.lane(s.member, k)) * times + kept
+    to = [module.result_address(f, name, row, module.n) for name in ("qs", "vs")]
+    with f.each((times - kept) * module.n) as i:
+        for address in to:
+            f.store(nan, address, i)
 
 
 def write_run(module: Module):

@@ -171,10 +171,13 @@ class Memory:
 
     def write_state(self, f: Function, s: Lane, k: Value, number: Value, q: str, v: str):
         """Write state number `number` of lane k into the outputs."""
-        row = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number
+        row, violated = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number, f.lane(s.violated, k)
         for name, x in (("qs", q), ("vs", v)):
             self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, k)
-        f.store(f.lane(s.violated, k), self.field(f, "violation", POINTER), row)
+        f.store(violated, self.field(f, "violation", POINTER), row)
+        with f.if_(~(violated <= f.lane(s.drift_tol, k))):
+            first = f.min(f.lane(s.lost, k), f.op(f"sitofp i64 {number.name} to double", DOUBLE))
+            self.put_lane_entry(f, "lost", k, first)
 
     def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
         """Reserve so many numbers: return what to free, and where they begin, at a register's boundary."""

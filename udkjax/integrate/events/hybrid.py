@@ -1,6 +1,7 @@
 """A mechanism with events as a hybrid system, by JAX: a flow in each phase, and conditions along it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import equinox as eqx
@@ -106,6 +107,7 @@ class Hybrid(eqx.Module):
             length=self.length,
             rate=self.rate,
             max_steps=self.plan.max_steps,
+            drift_tol=self.drift_tol,
             marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate),
         )
 
@@ -114,7 +116,9 @@ class Hybrid(eqx.Module):
 
         def of_phase(phase: int, ts: Array, state: RunState) -> IntegratorOutput:
             problem = self.problem(phase, ts, state)
-            if derivatives or not self.plans[phase].is_native:
+            if derivatives:  # of a run that is known to go on
+                return differentiable(replace(problem, drift_tol=jnp.inf))
+            if not self.plans[phase].is_native:
                 return differentiable(problem)
             return native_engine.integrate(problem)
 

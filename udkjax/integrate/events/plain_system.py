@@ -139,7 +139,7 @@ class PlainSystem:
         q = jnp.where(own, state.q + (times - t)[:, None] * state.v, raw.q)
         v = jnp.where(own, state.v, raw.v)
         lands = window.lands & (np.arange(2 * E) == window.event)
-        good = jnp.cumsum(~(own[:, 0] | (raw.reached & (raw.violation <= hybrid.drift_tol)))) == 0
+        good = jnp.cumsum(~(own[:, 0] | (raw.reached & (np.arange(len(times)) < raw.lost)))) == 0
 
         at = jnp.searchsorted(times, nodes)
         g, g_dot = jax.vmap(hybrid.conditions_and_rates)(nodes, q[at], v[at])
