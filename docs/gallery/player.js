@@ -966,8 +966,7 @@ class Engine {
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
-    const drifted = found.violation.subarray(0, count).findIndex(x => !(x <= data.drift_tol));
-    if (drifted >= 0) { done = false; count = drifted; words = UNFINISHED[5]; }
+    if (ended.lost < count) { done = false; count = ended.lost; words = UNFINISHED[5]; }
     const limited = ended.code === 2, last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
     return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t, code: ended.code,
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
