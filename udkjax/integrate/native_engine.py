@@ -48,7 +48,7 @@ def integrate(problem: Problem) -> IntegratorOutput:
 
 
 class RecordedRun(NamedTuple):
-    """What a run leaves to walk back from."""
+    """The record of a run, from which reverse mode walks back."""
 
     record: Array
     states: tuple[Array, ...]  # q and v (T, n), if there are outputs between the first and the last
