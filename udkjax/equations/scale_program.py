@@ -8,16 +8,16 @@ A row changes by `moved` as a body moves by a metre, and by `turned` as it turns
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations.element_programs import VELOCITY_INPUTS
 from udkjax.equations.scene_layout import BODY_COORDINATES, ROW, ConstraintGroup
 from udkjax.equations.scene_terms import SceneTerms
-from udkjax.expressions import Scalar, ScalarProgram, trace
-from udkjax.expressions.loop_program import MAXIMUM, KernelLoop, KernelWriter, LoopProgram, Reset
+from udkjax.expressions import Scalar, ScalarProgram
+from udkjax.expressions.loop_program import MAXIMUM, Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
+from udkjax.expressions.selection import absolute, greater, maximum, where
 from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
@@ -101,7 +101,7 @@ def _over_elements(terms: SceneTerms, group: ConstraintGroup, meets: list[tuple[
             x, y, angle = entries[row, body]
             moved = w.graph.sqrt(x * x + y * y)
             w.write(moved, "moved", base, k)
-            w.write(_apply(w, jnp.abs, angle)[0], "turned", base, k)
+            w.write(absolute(angle), "turned", base, k)
             w.write(moved, "largest", None, MOVED, MAXIMUM)
         for row, (rate, gamma) in enumerate(zip(_psi_t(group), programs.outputs["gamma"], strict=True)):
             w.write(rate, "psi_t", ROW, row)
@@ -120,41 +120,36 @@ def _psi_t(group: ConstraintGroup) -> list[Scalar]:
     return graph.copy(rate, known)
 
 
-# --- kernels that all scenes share
+# --- kernels, of numbers that may be no finite ones
 
 
 @lru_cache(maxsize=64)
-def _kernel(write: Callable[[KernelWriter], None]) -> Any:
+def _kernel(write: Callable[[KernelWriter], None]) -> Kernel:
+    """Return a kernel that all scenes share."""
     w = KernelWriter()
     write(w)
     return w.kernel()
 
 
-@lru_cache(maxsize=64)
-def _traced(function: Callable[..., Any], count: int) -> Callable[..., list[np.ndarray]]:
-    return trace(function, *[0.0] * count)
+def _is_finite(x: Scalar) -> Scalar:
+    return greater(x.graph.constant(math.inf), absolute(x))
 
 
-def _apply(w: KernelWriter, function: Callable[..., Any], *arguments: Scalar) -> list[Scalar]:
-    """Return a function's results for scalars."""
-    found = _traced(function, len(arguments))(w.graph, *(np.asarray(s, object) for s in arguments))
-    return [x.item() for x in found]
+def _finite(x: Scalar) -> Scalar:
+    """Return a number that is finite, and zero for others."""
+    return where(_is_finite(x), x, x.graph.constant(0.0))
 
 
-def _finite(x: Any) -> Any:
-    """Return a number that is finite; zero for others."""
-    return jnp.where(jnp.abs(x) < jnp.inf, x, 0.0)
-
-
-def _swing(acceleration: Any) -> Any:
+def _swing(acceleration: Scalar) -> Scalar:
     """Return the rate that belongs to an acceleration, over a length: a pendulum swings to and fro in pi sqrt(L / a) each."""
-    return jnp.sqrt(jnp.abs(_finite(acceleration))) / math.pi
+    return acceleration.graph.sqrt(absolute(_finite(acceleration))) / math.pi
 
 
 def _write_finite(w: KernelWriter) -> None:
     """Leave NaN as the mass where a number is not finite."""
-    found = _apply(w, lambda x: jnp.where(jnp.abs(x) < jnp.inf, 0.0, jnp.nan), w.read("numbers", 0))
-    w.write(found[0], "scales", None, MASS, MAXIMUM)
+    w.write(
+        where(_is_finite(w.read("numbers", 0)), w.graph.constant(0.0), w.graph.constant(math.nan)), "scales", None, MASS, MAXIMUM
+    )
 
 
 def _write_guess(w: KernelWriter) -> None:
@@ -169,75 +164,55 @@ def _write_guess(w: KernelWriter) -> None:
 
 def _write_arm(w: KernelWriter) -> None:
     """Compute the longest arm of all pairs, 0 where none of them has one."""
-
-    def arm(moved: Any, turned: Any, largest: Any) -> Any:
-        by_place = moved > ROUNDING * largest
-        return _finite(jnp.where(by_place, turned / jnp.where(by_place, moved, 1.0), 0.0))
-
-    given = w.read("moved", PAIR), w.read("turned", PAIR), w.read("largest", None, MOVED)
-    w.write(_apply(w, arm, *given)[0], "scales", None, ARM, MAXIMUM)
+    moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
+    by_place = greater(moved, w.read("largest", None, MOVED) * ROUNDING)
+    arm = where(by_place, turned / where(by_place, moved, w.graph.constant(1.0)), w.graph.constant(0.0))
+    w.write(_finite(arm), "scales", None, ARM, MAXIMUM)
 
 
 def _write_length(w: KernelWriter) -> None:
-    def lengths(radius: Any, arm: Any) -> Any:
-        arm = jnp.where(arm > ROUNDING * radius, arm, radius)
-        return jnp.maximum(radius, arm), arm
-
-    found = _apply(w, lengths, w.read("largest", None, RADIUS), w.read("scales", None, ARM))
-    for place, s in zip((LENGTH, ARM), found, strict=True):
-        w.write(s, "scales", None, place)
+    radius, arm = w.read("largest", None, RADIUS), w.read("scales", None, ARM)
+    arm = where(greater(arm, radius * ROUNDING), arm, radius)
+    w.write(maximum(radius, arm), "scales", None, LENGTH)
+    w.write(arm, "scales", None, ARM)
 
 
 def _write_change(w: KernelWriter) -> None:
     """Compute what a displacement of L or a turn of one radian changes in each row."""
     moved = w.read("moved", PAIR) * w.read("scales", None, LENGTH)
-    w.write(_apply(w, jnp.maximum, moved, w.read("turned", PAIR))[0], "change", PAIR_ROW, 0, MAXIMUM)
+    w.write(maximum(moved, w.read("turned", PAIR)), "change", PAIR_ROW, 0, MAXIMUM)
 
 
 def _write_largest_change(w: KernelWriter) -> None:
-    w.write(_apply(w, _finite, w.read("change", 0))[0], "largest", None, CHANGE, MAXIMUM)
+    w.write(_finite(w.read("change", 0)), "largest", None, CHANGE, MAXIMUM)
 
 
 def _write_row(w: KernelWriter) -> None:
     """Compute the scale of each row, and the rates at which rows change."""
-
-    def scale_and_rate(change: Any, largest: Any, length: Any, psi_t: Any, gamma: Any) -> Any:
-        moves = _finite(change) > ROUNDING * largest
-        scale = jnp.where(moves, change, length)  # a row that nothing moves here: as if in metres
-        return scale, jnp.maximum(jnp.abs(_finite(psi_t / scale)), _swing(gamma / scale))
-
-    given = w.read("change", 0), w.read("largest", None, CHANGE), w.read("scales", None, LENGTH)
-    scale, rate = _apply(w, scale_and_rate, *given, w.read("psi_t", 0), w.read("gamma", 0))
+    change = _finite(w.read("change", 0))
+    moves = greater(change, w.read("largest", None, CHANGE) * ROUNDING)
+    scale = where(moves, change, w.read("scales", None, LENGTH))  # a row that nothing moves here: as if in metres
     w.write(scale, "scales", 0, ROWS)
-    w.write(rate, "scales", None, RATE, MAXIMUM)
+    for rate in (absolute(_finite(w.read("psi_t", 0) / scale)), _swing(w.read("gamma", 0) / scale)):
+        w.write(rate, "scales", None, RATE, MAXIMUM)
 
 
 def _write_yield(w: KernelWriter) -> None:
     """Compute the largest entry (1/kg) of a weighted row of D D^T of one body."""
-
-    def entry(moved: Any, turned: Any, mass: Any, inertia: Any, length: Any, scale: Any) -> Any:
-        return jnp.abs(_finite((moved**2 / mass + turned**2 / inertia) * (length / scale) ** 2))
-
-    given = *(w.read(x, PAIR) for x in ("moved", "turned")), *(w.read("numbers", k) for k in (PAIR_MASS, PAIR_INERTIA))
-    found = _apply(w, entry, *given, w.read("scales", None, LENGTH), w.read("scales", PAIR_ROW, ROWS))
-    w.write(found[0], "largest", None, YIELD, MAXIMUM)
+    moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
+    weight = w.read("scales", None, LENGTH) / w.read("scales", PAIR_ROW, ROWS)
+    entry = moved * moved / w.read("numbers", PAIR_MASS) + turned * turned / w.read("numbers", PAIR_INERTIA)
+    w.write(absolute(_finite(entry * (weight * weight))), "largest", None, YIELD, MAXIMUM)
 
 
 def _write_rate(w: KernelWriter, free: list[Scalar]) -> None:
     """Compute the rates at which velocities and free accelerations move and turn bodies."""
-    velocity = [w.read("v", BODY_COORDINATES, k) for k in range(3)]
-    for s in _apply(w, _rates, w.read("scales", None, LENGTH), *velocity, *free):
-        w.write(s, "scales", None, RATE, MAXIMUM)
-
-
-def _rates(length: Any, vx: Any, vy: Any, omega: Any, fx: Any, fy: Any, fangle: Any) -> list[Any]:
-    moves = [jnp.abs(_finite(x)) for x in (vx / length, vy / length, omega)]
-    return [*moves, *(_swing(x) for x in (fx / length, fy / length, fangle))]
+    length = w.read("scales", None, LENGTH)
+    for k, unit in enumerate((length, length, w.graph.constant(1.0))):
+        for rate in (absolute(_finite(w.read("v", BODY_COORDINATES, k) / unit)), _swing(free[k] / unit)):
+            w.write(rate, "scales", None, RATE, MAXIMUM)
 
 
 def _write_threshold(w: KernelWriter) -> None:
-    def threshold(most: Any, mass: Any) -> Any:
-        return RANK_TOL / jnp.sqrt(jnp.maximum(1.0, most * mass / ORDINARY_MASS_RATIO))
-
-    found = _apply(w, threshold, w.read("largest", None, YIELD), w.read("scales", None, MASS))
-    w.write(found[0], "scales", None, THRESHOLD)
+    ratio = w.read("largest", None, YIELD) * w.read("scales", None, MASS) / ORDINARY_MASS_RATIO
+    w.write(RANK_TOL / w.graph.sqrt(maximum(w.graph.constant(1.0), ratio)), "scales", None, THRESHOLD)
