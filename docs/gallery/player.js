@@ -1151,14 +1151,14 @@ class SliderPanel {
       make("div", {class: "actions"}, ...Object.values(this.buttons)), this.note, make("div", {class: "rows"}, ...parts));
   }
   row(slider, changed) {
-    const {label, unit, low, high} = slider, step = (high - low) / STEPS;
-    const range = make("input", {type: "range", min: low, max: high, step, "aria-label": label, "aria-valuetext": `${slider.value} ${unit}`});
+    const {label, low, high, shown: unit = slider.unit, per_unit: per = 1} = slider, step = (high - low) / STEPS;
+    const range = make("input", {type: "range", min: low, max: high, step, "aria-label": label, "aria-valuetext": `${slider.value * per} ${unit}`});
     const number = make("input", {type: "number", step: "any", "aria-label": `${label}, number`});
     const set = value => {
       if (value < +range.min) range.min = value;
       if (value > +range.max) range.max = value;
       range.value = value;
-      number.value = +value.toPrecision(DIGITS);
+      number.value = +(value * per).toPrecision(DIGITS);
       range.setAttribute("aria-valuetext", `${number.value} ${unit}`);
     };
     range.addEventListener("input", () => { set(+range.value); changed(+range.value); });
@@ -1166,7 +1166,7 @@ class SliderPanel {
     const take = () => {
       if (!Number.isFinite(number.valueAsNumber)) return set(+range.value);
       if (number.value === taken) return undefined;
-      const value = number.valueAsNumber;
+      const value = number.valueAsNumber / per;
       set(value);
       taken = number.value;
       return changed(value);
@@ -1175,9 +1175,9 @@ class SliderPanel {
     number.addEventListener("change", take);
     number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // which a notebook keeps to itself
     range.addEventListener("dblclick", () => { set(slider.value); changed(slider.value); });
-    const shown = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
+    const words = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
     const element = make("div", {class: "slider", title: slider.name},
-      make("span", {class: "name"}, label), number, make("span", {class: "unit"}, shown), range);
+      make("span", {class: "name"}, label), number, make("span", {class: "unit"}, words), range);
     set(slider.value);
     return {slider, element, set, range, number};
   }

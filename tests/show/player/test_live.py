@@ -166,6 +166,18 @@ def test_ten_seconds_with_events_are_simulated_where_no_run_is_given():
     assert animation.data["live"]["engines"][0]["events"]["names"] == ["bottom"]
 
 
+def test_numbers_are_shown_in_the_units_of_the_drawing(slider_crank):
+    """60 rpm and 30 mm of a drawing in mm and degrees, whose own numbers are in SI units, as those of a scene without units."""
+    pins, links = {"O": (0, 0), "A": (30, 40)}, {"crank": {"pins": ["O", "A"], "mass": 2}}
+    motors, wanted = {"motor": {"pin": "O", "speed": "60 rpm"}}, ["motor.motor.speed", "pin.A", "link.crank.mass"]
+    units = {"length": "mm", "angle": "deg"}
+    speed, *place, mass = sliders_of(udk.Drawing(pins, links, ground=["O"], motors=motors, units=units).mechanism(), wanted)
+    assert (speed.shown, *[x.shown for x in place], mass.shown) == ("rpm", "mm", "mm", "kg")
+    assert [x.value * x.per_unit for x in (speed, *place, mass)] == pytest.approx([60, 30, 40, 2], rel=1e-14)
+    assert speed.value == pytest.approx(2 * np.pi) and speed.unit == "rad/s" and place[0].value == pytest.approx(0.03)
+    assert all(x.shown == x.unit and x.per_unit == 1 for x in sliders_of(slider_crank, True))
+
+
 def test_pins_that_must_stay_in_line_have_no_sliders_unless_named():
     lift = udk.library.scissor_lift()
     assert {slider.name for slider in sliders_of(lift, True) if slider.unit == "m" and slider.section == "Pins"} == {

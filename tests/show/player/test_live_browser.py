@@ -400,6 +400,21 @@ def test_where_the_first_motion_failed_other_numbers_may_come_to_its_end(opened)
         assert page.evaluate(f"{PLAYER}.live.player.data.end") == TS[-1]
 
 
+def test_numbers_are_typed_in_the_units_of_the_drawing(opened):
+    pins, links = {"O": (0, 0), "A": (30, 40)}, {"crank": {"pins": ["O", "A"], "mass": 2}}
+    motors, units = {"motor": {"pin": "O", "speed": "60 rpm"}}, {"length": "mm", "angle": "deg"}
+    crank = udk.Drawing(pins, links, ground=["O"], motors=motors, units=units).mechanism()
+    with opened(udk.animate(crank, udk.simulate(crank, TS), live=["motor.motor.speed", "pin.A"])) as page:
+        fields = page.get_by_role("spinbutton")
+        assert [fields.nth(k).input_value() for k in range(3)] == ["60", "30", "40"]
+        assert page.locator(".live .unit").all_text_contents() == ["rpm", "mm", "mm"]
+        move(page, "motor speed", 90)
+        move(page, "A x", 45)
+        assert_allclose(page.evaluate(f"[...{LIVE}.values]"), [3 * np.pi, 0.045, 0.04], rtol=1e-12)
+        turned = shown_q(page)[-1, 2] - np.arctan2(40, 45)
+        assert_allclose(turned, 3 * np.pi * TS[-1], atol=1e-6)
+
+
 def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
     with opened(live) as page:
         first, values = shown_q(page), page.evaluate(f"[...{LIVE}.values]")

@@ -104,6 +104,11 @@ class Units:
             k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
         }
 
+    def shown(self, unit: str) -> str:
+        """Return the unit in which numbers of an SI unit are shown to who wrote the file: its own, or one made of its own."""
+        of_parts = {"m/s": f"{self.chosen.get('length', 'm')}/s", "rad/s": "rpm" if self.chosen.get("angle") == "deg" else unit}
+        return self.chosen.get(_KIND_OF.get(unit, ""), of_parts.get(unit, unit))
+
     def write(self, value: float, unit: str) -> float | str:
         """Return a number in SI units as it is written, so that it is read as the same number, bit by bit."""
         factor = self._factor(unit) if unit else 1.0

@@ -10,7 +10,8 @@ from udkjax.equations import analyse
 from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene import Mechanism
 from udkjax.scene.drawing import Drawing
-from udkjax.scene.units import units_of
+from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.units import conversion_factor, units_of
 from udkjax.show.player.packing import Json
 
 # Names of parameters, whole or one entry, by themselves or with the range of their sliders; True: all that a scene has.
@@ -39,7 +40,10 @@ LARGEST_GRAVITY = 20.0  # m/s2: twice that of the earth
 
 
 class Slider(NamedTuple):
-    """One number that a page changes: its parameter, what it is called and where, its range."""
+    """One number that a page changes: its parameter, what it is called and where, its range.
+
+    Value and range are in SI units; the page shows `per_unit` times as much in the unit of the drawing, `shown`.
+    """
 
     name: str
     label: str
@@ -48,6 +52,8 @@ class Slider(NamedTuple):
     value: float
     low: float
     high: float
+    shown: str
+    per_unit: float
 
     @property
     def data(self) -> Json:
@@ -67,6 +73,7 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
     scales = analyse(mechanism).scales
     length, rate = float(scales.length), float(scales.rate) or 1.0
     found, bound = [], pins_in_line(mechanism)
+    written = Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
     for name, value in scalar_parameters(mechanism, wanted).items():
         if wanted is None and (".profile." in name or _base(name) in bound):  # the outline of a cam is drawn as it was
             continue
@@ -75,7 +82,9 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
         low, high = given or usual_range(name, unit, value, length, rate)
         if not low <= value <= high or not low < high:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not hold its value {value:g}")
-        found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high)))
+        shown = written.shown(unit)
+        per_unit = 1.0 / conversion_factor(shown, unit) if shown != unit else 1.0
+        found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high), shown, per_unit))
     return in_sections(found)
 
 
