@@ -92,7 +92,7 @@ def dumps(mechanism: Mechanism | Drawing) -> str:
         SceneError: The format cannot hold the mechanism: classes of the user's own, traced numbers, batches of numbers.
     """
     drawing = mechanism if isinstance(mechanism, Drawing) else mechanism.drawing
-    if isinstance(mechanism, Mechanism) and (mechanism.changed or not isinstance(drawing, Drawing)):
+    if isinstance(mechanism, Mechanism) and (mechanism.departs_from_drawing or not isinstance(drawing, Drawing)):
         return tables.mechanism_text(mechanism)
     assert isinstance(drawing, Drawing)
     return drawing_text(drawing)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Scalar
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import Body
+from udkjax.scene.changes_by_hand import changed_by_hand, count_marks, mark_changes, marks_by_name
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.drivers import Driver
@@ -31,7 +32,6 @@ from udkjax.scene.number_fields import (
     replace_numbers,
     require_values,
     split_index,
-    value_of,
 )
 
 Element = TypeVar("Element", bound=eqx.Module)
@@ -107,7 +107,7 @@ class Mechanism(PrintsTable):
         name: of the mechanism, for titles and files.
         origin: for internal use: the known mechanism that traced numbers stand for.
         drawing: the `Drawing` that it is made from, if any.
-        changed: for internal use: names of numbers that do not follow from the drawing any more.
+        changed: for internal use: one for each entry of a number that does not follow from the drawing any more, zero for others.
     """
 
     name: str = eqx.field(static=True)
@@ -123,7 +123,9 @@ class Mechanism(PrintsTable):
     _drivers: tuple[Driver, ...]
     _forces: tuple[ForceElement, ...]
     drawing: AbstractDrawing | None = None  # the drawing that it was made from
-    changed: tuple[str, ...] = eqx.field(static=True, default=())  # numbers that do not follow from the drawing any more
+    # Of a drawn one: one for each entry of a number of the elements that was changed by hand, zero where it follows from the
+    # drawing. A number itself, so that what was changed and what was not are of one structure: one program serves both.
+    changed: Float[Array, "K"] | None = None
 
     def __init__(
         self,
@@ -135,7 +137,7 @@ class Mechanism(PrintsTable):
         name: str = "",
         origin: Origin | None = None,
         drawing: AbstractDrawing | None = None,
-        changed: tuple[str, ...] = (),
+        changed: Float[Array, "K"] | None = None,
     ):
         forces = forces or {}
         given = {
@@ -156,6 +158,8 @@ class Mechanism(PrintsTable):
         self.force_names, self._forces = _unzip(found["force"])
         self.origin = None if self.is_concrete else origin
         self.drawing, self.changed = drawing, changed
+        if drawing is not None and changed is None:
+            self.changed = number(np.zeros(count_marks(self)))
 
     @property
     def bodies(self) -> Mapping[str, Body]:
@@ -242,7 +246,7 @@ class Mechanism(PrintsTable):
         """The same mechanism without its `origin` and its `drawing`: a program compiled for it serves all of them."""
         if self.origin is None and self.drawing is None:
             return self
-        return _copy(self, {"origin": None, "drawing": None, "changed": ()})
+        return _copy(self, {"origin": None, "drawing": None, "changed": None})
 
     @property
     def is_concrete(self) -> bool:
@@ -283,28 +287,37 @@ class Mechanism(PrintsTable):
         require_values(values, self.name)
         traced = is_traced(dict(values))
         origin = Origin(self) if traced and self.is_concrete else self.origin
-        base, own, changed = self, values, ()
+        base, own, changed = self, values, None
         if self.drawing is not None:
-            base, own, changed = self._redraw(self.drawing, values)
+            base, own, by_hand = self._redraw(self.drawing, values)
         new, gravity = replace_numbers(groups_of(base), base.gravity, own, parameters_of(base), self.name)
+        if self.drawing is not None:
+            changed = mark_changes(self, new, by_hand)
         elements = new["body"], new["joint"], new["driver"], new["force"]
         return Mechanism(*elements, gravity, self.name, origin, base.drawing, changed)
 
-    def _redraw(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], Any]:
-        """Return the mechanism of the drawing with its share of the values, the other values, and the names of these."""
+    @property
+    def departs_from_drawing(self) -> bool:
+        """True if a number does not follow from the drawing any more, or may not, as numbers are traced."""
+        return self.changed is not None and (is_traced(self.changed) or bool(np.any(np.asarray(self.changed))))
+
+    @property
+    def changed_names(self) -> list[str]:
+        """Names of known numbers of which an entry does not follow from the drawing any more."""
+        return [name for name, mark in marks_by_name(self).items() if np.any(np.asarray(mark))]
+
+    def _redraw(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], list[str]]:
+        """Return the mechanism of the drawing with its share of the values, the other values, and the names of those by hand."""
         drawn, known = parameters_in(drawing.groups), parameters_of(self)
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
         own = {name: value for name, value in values.items() if name not in of_drawing}
-        whole = {split_index(name, known)[0] for name in own} & set(own)  # an array that is given takes its entries with it
-        before = [name for name in self.changed if name not in own and split_index(name, known)[0] not in whole]
-        changed = (*before, *own)
         if not of_drawing:
-            return self, own, changed
+            return self, own, list(own)
         replace_numbers(groups_of(self), self.gravity, own, known, self.name)  # all mistakes in names before anything else
         drawn["gravity"] = known["gravity"]
         groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
-        own = {name: value_of(known, name, groups_of(self)) for name in before} | own
-        return drawing.with_groups(groups, gravity).mechanism(), own, changed
+        redrawn = drawing.with_groups(groups, gravity).mechanism()
+        return redrawn, changed_by_hand(self, redrawn) | own, list(own)
 
 
 def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:

@@ -111,7 +111,7 @@ def replace_numbers(
         SceneError: A name is unknown, or a value does not fit.
     """
     groups, problems, scene = {section: dict(elements) for section, elements in groups.items()}, [], name
-    sampled = {held_name: _field_of_held(known[f"{held_name}.values"]) for held_name in _held_names(known)}
+    sampled = {held_name: _field_of_held(known[f"{held_name}.values"]) for held_name in held_names(known)}
     # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
         name, index = split_index(given, known)
@@ -138,7 +138,8 @@ def replace_numbers(
     return groups, gravity
 
 
-def _held_names(known: Collection[str]) -> list[str]:
+def held_names(known: Collection[str]) -> list[str]:
+    """Return the names of the numbers of forces that have samples."""
     return [name.removesuffix(".values") for name in known if name.endswith(".values") and name.startswith("force.")]
 
 
@@ -148,7 +149,7 @@ def _field_of_held(values: NumberField) -> NumberField:
 
 def value_of(known: Mapping[str, NumberField], name: str, groups: Mapping[str, Mapping[str, Any]]) -> Any:
     """Return the value of a number, with its samples if it has any, or of one of its entries, by its name."""
-    if name in _held_names(known):
+    if name in held_names(known):
         section, owner, path, *_ = _field_of_held(known[f"{name}.values"])
         return _at(groups[section][owner], path)
     owner, index = split_index(name, known)

@@ -46,7 +46,7 @@ def independent_parameters(mechanism: Mechanism) -> list[str]:
     known = mechanism.parameters()
     if mechanism.drawing is None:
         return list(known)
-    own = {"gravity", *parameters_in(mechanism.drawing.groups), *(split_index(name, known)[0] for name in mechanism.changed)}
+    own = {"gravity", *parameters_in(mechanism.drawing.groups), *mechanism.changed_names}
     return [name for name in known if name in own]
 
 

@@ -1,0 +1,92 @@
+"""Numbers of a drawn mechanism that were changed by hand: they stay as they are when its drawing changes.
+
+`Mechanism.changed` has a mark for each entry of a number of the elements: one where it was changed, zero where it follows from
+the drawing. Marks are numbers, not structure: mechanisms with and without changes share one program, and may be stacked.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.scene.fields import is_traced, number
+from udkjax.scene.number_fields import (
+    Groups,
+    NumberField,
+    Sections,
+    groups_of,
+    held_names,
+    parameters_in,
+    parameters_of,
+    split_index,
+    value_of,
+)
+
+
+class Marked(Sections, Protocol):
+    """A mechanism with its marks."""
+
+    changed: Float[Array, "K"] | None
+
+
+def count_marks(mechanism: Sections) -> int:
+    """Return the number of entries of all numbers of the elements."""
+    return sum(np.size(field.value) for field in _present(groups_of(mechanism)).values())
+
+
+def marks_by_name(mechanism: Marked) -> dict[str, Any]:
+    """Return the marks of a mechanism by the names of its numbers, in their shapes."""
+    if mechanism.changed is None:
+        return {}
+    fields, marks = _present(groups_of(mechanism)), mechanism.changed
+    xp = jnp if is_traced(marks) else np
+    ends = np.cumsum([np.size(field.value) for field in fields.values()])
+    parts = xp.split(xp.asarray(marks), ends)  # the last part is empty
+    return {name: part.reshape(np.shape(fields[name].value)) for name, part in zip(fields, parts, strict=False)}
+
+
+def mark_changes(mechanism: Marked, groups: Groups, names: Collection[str]) -> Float[Array, "K"]:
+    """Return the marks of new elements of a mechanism, of which the numbers with these names, or entries of them, are set."""
+    before, found = marks_by_name(mechanism), {}
+    for name, field in _present(groups).items():
+        mark, shape = before.get(name), np.shape(field.value)
+        found[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # samples in place of a number are set, too
+    for given in names:
+        name, index = split_index(given, found)
+        if name in found:
+            which = np.zeros(found[name].shape)
+            which[index] = 1.0
+            found[name] = (jnp if is_traced(found[name]) else np).maximum(found[name], which)
+    return number(_joined(list(found.values())))
+
+
+def changed_by_hand(mechanism: Marked, redrawn: Sections) -> dict[str, Any]:
+    """Return the numbers that differ from those of the mechanism that is drawn anew, since they, or entries, were set by hand."""
+    known, drawn = parameters_of(mechanism), parameters_of(redrawn)
+    held = [name for name in held_names(known) if f"{name}.values" not in drawn]
+    found = {name: value_of(known, name, groups_of(mechanism)) for name in held}
+    for name, mark in marks_by_name(mechanism).items():
+        if not any(name.startswith(f"{x}.") for x in held):
+            found |= _kept(name, mark, known[name].value, drawn[name].value if name in drawn else None)
+    return found
+
+
+def _kept(name: str, mark: Any, value: Any, drawn: Any) -> dict[str, Any]:
+    if drawn is None or np.shape(drawn) != np.shape(value):
+        return {name: value}
+    if not is_traced(mark) and (mark.all() or not mark.any()):
+        return {name: value} if mark.any() else {}
+    xp = jnp if is_traced((mark, value, drawn)) else np  # known numbers stay known
+    return {name: number(xp.where(mark != 0, value, drawn))}
+
+
+def _present(groups: Groups) -> Mapping[str, NumberField]:
+    """Return the numbers that there are in elements, by name."""
+    return {name: field for name, field in parameters_in(groups).items() if field.value is not None}
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    xp = jnp if is_traced(parts) else np
+    return xp.concatenate([xp.ravel(x) for x in parts]) if parts else np.zeros(0)
