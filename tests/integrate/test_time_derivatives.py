@@ -51,6 +51,22 @@ def test_second_derivatives_by_times_and_numbers():
     assert_allclose(second(x), wanted, atol=1e-5 * np.abs(wanted).max())
 
 
+def test_members_share_what_is_differentiated():
+    """Where the states of a batch are batched by their changes alone, too; at once and compiled."""
+    arm, shares = ARMS["driven"], jnp.array([0.9, 1.1])
+
+    def f(x):
+        def run(share):
+            return states(arm.with_parameters({"body.lower.mass": share * x[2]}), x[:2]).sum()
+
+        return jax.vmap(run)(shares).sum()
+
+    x = np.append(X, 1.3)
+    wanted = differences(jax.jit(f), x)
+    for transform in (jax.grad(f), jax.jit(jax.grad(f))):
+        assert_allclose(transform(x), wanted, rtol=1e-6)
+
+
 def test_control_intervals_change_by_length_and_time():
     arm = ARMS["driven"]
 

@@ -129,16 +129,30 @@ def test_a_member_does_not_depend_on_its_neighbours():
 
 
 SHARDED = """
-import jax, jax.numpy as jnp, numpy as np
+import jax, jax.numpy as jnp, numpy as np, udkjax as udk
 from jax.sharding import AxisType, PartitionSpec as P
 from test_composition import INERTIAS, angle
 assert len(jax.devices()) == 2
 mesh = jax.make_mesh((2,), ("members",), axis_types=(AxisType.Auto,))
-run = jax.shard_map(jax.vmap(angle), mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
-slope = jax.shard_map(jax.vmap(jax.grad(angle)), mesh=mesh, in_specs=P("members"), out_specs=P("members"), check_vma=False)
+spread = P("members")
 xs = jnp.concatenate([INERTIAS, INERTIAS + 0.01])
-np.testing.assert_allclose(jax.jit(run)(xs), jax.vmap(angle)(xs), rtol=0, atol=1e-13)
-np.testing.assert_allclose(jax.jit(slope)(xs), jax.vmap(jax.grad(angle))(xs), rtol=1e-9)
+run, slope = jax.vmap(angle)(xs), jax.vmap(jax.grad(angle))(xs)
+for check in (True, False):
+    shard = lambda f: jax.jit(jax.shard_map(f, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=check))
+    np.testing.assert_allclose(shard(jax.vmap(angle))(xs), run, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(shard(jax.vmap(jax.grad(angle)))(xs), slope, rtol=1e-9)
+
+# A number that all devices share: its cotangent is the sum over them.
+loss = lambda factor, xs: jnp.mean(jax.vmap(angle)(factor * xs))
+shared = lambda factor, xs: jax.lax.pmean(loss(factor, xs), "members")
+found = jax.jit(jax.shard_map(jax.value_and_grad(shared), mesh=mesh, in_specs=(P(), spread), out_specs=P()))(1.01, xs)
+np.testing.assert_allclose(found, jax.value_and_grad(loss)(1.01, xs), rtol=1e-9)
+
+drawn = udk.library.four_bar()
+closed = lambda x: udk.assemble(drawn.with_parameters({"pin.B": jnp.stack([x, 1.0])})).q.sum()
+places = jnp.linspace(0.5, 0.6, 4)
+found = jax.jit(jax.shard_map(jax.vmap(jax.grad(closed)), mesh=mesh, in_specs=spread, out_specs=spread))(places)
+np.testing.assert_allclose(found, jax.vmap(jax.grad(closed))(places), rtol=1e-9)
 """
 
 

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float
@@ -20,6 +19,7 @@ from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, num
 from udkjax.expressions.deferred import deferred
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.expressions.numpy_program import evaluate_as
+from udkjax.expressions.varying_axes import result_type
 from udkjax.printing import prints_table, units
 from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
@@ -122,7 +122,9 @@ def _batch(given: Any, axes: Any, programs: ScenePrograms) -> tuple[Any, int]:
 
 scales_p = Primitive("scales")
 scales_p.def_impl(lambda numbers, programs: jax.device_put(evaluate_scales(np.asarray(numbers), programs)))
-scales_p.def_abstract_eval(lambda numbers, programs: ShapedArray((*numbers.shape[:-1], programs.scale_count), numbers.dtype))
+scales_p.def_abstract_eval(
+    lambda numbers, programs: result_type((*numbers.shape[:-1], programs.scale_count), [numbers], numbers.dtype)
+)
 batching.primitive_batchers[scales_p] = _batch
 mlir.register_lowering(scales_p, mlir.lower_fun(scales_by_jax, multiple_results=False))
 evaluate_as(scales_p, evaluate_scales)

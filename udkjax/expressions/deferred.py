@@ -20,6 +20,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.expressions.numpy_program import Meter, TooLongError, count_operations, numpy_program
+from udkjax.expressions.varying_axes import varies
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -42,6 +43,8 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if jax.config.jax_disable_jit:
             return function(*args, **kwargs)
+        if any(varies(x) for x in jax.tree.leaves((args, kwargs))):  # within a program of devices, whose types say so
+            return by_jit(*args, **kwargs)
         try:
             program, leaves, out = trace_once(function, args, kwargs)
         except _ClosesOverError:

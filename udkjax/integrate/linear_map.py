@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.expressions.numpy_program import TooLongError, expand_as
+from udkjax.expressions.varying_axes import result_type
 from udkjax.integrate.traced_numbers import Mask, replaced, select
 from udkjax.pinv.linear_primitive import linear_primitive
 
@@ -186,7 +187,7 @@ def _apply(linear: Linear, vector: Array) -> Array:
 
 @eqxi.filter_primitive_def
 def _shape(linear, vector):
-    return jax.core.ShapedArray((sum(map(math.prod, linear.T.inputs)),), vector.dtype)
+    return result_type((sum(map(math.prod, linear.T.inputs)),), jax.tree.leaves((linear, vector)), vector.dtype)
 
 
 @eqxi.filter_primitive_jvp

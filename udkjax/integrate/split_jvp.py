@@ -18,6 +18,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array, PyTree
 
 from udkjax.expressions.numpy_program import expand_as
+from udkjax.expressions.varying_axes import result_type
 
 Shapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its change
 Parts = Callable[..., tuple[list[Array], list[Array]]]  # (at, direction) -> value, change, each a list of arrays
@@ -70,8 +71,7 @@ class Both:
 
 
 def _avals(*xs: Array, both: Both) -> list[jax.core.ShapedArray]:
-    del xs
-    return [jax.core.ShapedArray(x.shape, x.dtype) for part in both.shapes for x in part]
+    return [result_type(x.shape, xs, x.dtype) for part in both.shapes for x in part]
 
 
 def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int | None]]:

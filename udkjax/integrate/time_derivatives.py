@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from udkjax.expressions.varying_axes import zero_of
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.linear_map import DifferentiableFunction, Linear
 from udkjax.integrate.native_equations import equations_for_diffrax
@@ -38,7 +39,9 @@ def _move(
     problem: Problem, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"], s: Float[Array, ""]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     problem_of, numbers = split_numbers(problem)
-    q, v = _state_after(StateAfter(RatesOfState(problem_of)), [s, t, q, v, *numbers])
+    # A state is batched wherever its changes are: JAX takes for granted that rules of derivatives return values as they were.
+    zero = sum(map(zero_of, (s, t, *numbers)))
+    q, v = _state_after(StateAfter(RatesOfState(problem_of)), [s, t, q + zero, v + zero, *numbers])
     return q, v
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
+from udkjax.expressions.varying_axes import vary_together
 from udkjax.integrate.gradients import TreeDef
 from udkjax.scene.fields import number
 
@@ -57,7 +58,7 @@ def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     known = KnownNumbers([None if isinstance(x, Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves])
-    return TreeOfNumbers(rest, known, structure), [x for x in leaves if isinstance(x, Tracer)]
+    return TreeOfNumbers(rest, known, structure), vary_together([x for x in leaves if isinstance(x, Tracer)])
 
 
 def select(xs: Sequence[Any], which: Mask) -> list[Any]:

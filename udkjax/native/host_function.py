@@ -15,12 +15,12 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
 from udkjax.expressions.numpy_program import evaluate_as
+from udkjax.expressions.varying_axes import result_type
 from udkjax.native.ffi import API, ARGUMENTS, BUFFERS, DATA, DIMS, EXTENSIONS, MAJOR, METADATA, MINOR, RANK, RESULTS, VERSION
 
 CREATE_ERROR = 48  # offset in XLA_FFI_Api: a function of a text and a code
@@ -53,7 +53,7 @@ def _evaluate(*inputs: np.ndarray, function: HostFunction) -> list[np.ndarray]:
 
 
 def _abstract_eval(*inputs: Any, function: HostFunction) -> list[Any]:
-    return [ShapedArray(tuple(shape), np.dtype(float)) for shape in function.shapes(_members(inputs))]
+    return [result_type(shape, inputs) for shape in function.shapes(_members(inputs))]
 
 
 def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunction) -> tuple[list[Array], list[int]]:

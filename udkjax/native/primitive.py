@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
@@ -22,6 +21,7 @@ from jaxtyping import Array
 from udkjax.equations.scales import evaluate_scales, scales_by_jax, scales_p
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.expressions.numpy_program import evaluate_as
+from udkjax.expressions.varying_axes import result_type
 from udkjax.native import machine
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
@@ -245,7 +245,7 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
 
 
 def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
-    return [ShapedArray(shape, np.dtype(float)) for shape in operation.shapes(inputs, times)]
+    return [result_type(shape, inputs) for shape in operation.shapes(inputs, times)]
 
 
 def _batch(

@@ -10,6 +10,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from udkjax.expressions.varying_axes import zero_of
+
 
 def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Callable, transpose: Callable) -> Primitive:
     """Make a primitive of four rules for one operator and one vector; batches map them.
@@ -34,7 +36,7 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
         *operator, vector = inputs
         size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
         if axes[-1] is None:
-            vector = jnp.broadcast_to(vector + sum(map(_zero, operator)), (size, *vector.shape))
+            vector = jnp.broadcast_to(vector + sum(map(zero_of, operator)), (size, *vector.shape))
             axes = (*axes[:-1], 0)
         found = jax.vmap(partial(member.bind, **params), in_axes=tuple(axes))(*operator, vector)
         return found, [0] * len(found)
@@ -48,11 +50,3 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=True))
     return primitive
-
-
-def _zero(x: Array) -> Array | float:
-    """Return a zero that is batched wherever x is, by the `vmap`s around this one as well; XLA folds it."""
-    if jnp.size(x) == 0:
-        return 0.0
-    first = jnp.ravel(x)[0]
-    return jax.lax.select(first == first, 0.0, 0.0)

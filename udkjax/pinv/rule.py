@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import Numbers, Scalar
+from udkjax.expressions.varying_axes import result_type
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
 
@@ -233,7 +234,7 @@ def _apply(plus: Plus, b):
 def _shape_of_apply(plus, b):
     structs = jtu.tree_map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (plus, b))
     out = jax.eval_shape(_apply, *structs)
-    return jax.core.ShapedArray(out.shape, out.dtype)
+    return result_type(out.shape, jax.tree.leaves((plus, b)), out.dtype)
 
 
 @eqxi.filter_primitive_jvp

@@ -22,6 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.equations.control_flow import sequential
+from udkjax.expressions.varying_axes import result_type
 from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.seldom import call_seldom
 from udkjax.pinv.linear_primitive import linear_primitive
@@ -167,7 +168,7 @@ def _apply(operator: _Operator, vector: Array) -> Array:
 @eqxi.filter_primitive_def
 def _shape(operator, vector):
     K, three, n, P = operator.matrix.shape
-    return jax.core.ShapedArray((P if operator.is_transposed else K * three * n,), vector.dtype)
+    return result_type((P if operator.is_transposed else K * three * n,), jax.tree.leaves((operator, vector)), vector.dtype)
 
 
 @eqxi.filter_primitive_jvp

@@ -1,0 +1,47 @@
+"""Types of the results of primitives, and inputs of one type, where values vary over the devices of `jax.shard_map`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray, Tracer
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Array
+
+
+def result_type(shape: Sequence[int], inputs: Sequence[Any], dtype: Any = float) -> ShapedArray:
+    """Return the type of an array that a primitive makes of inputs of these types: it varies over devices as they do."""
+    dtype = jnp.result_type(dtype)
+    varying = max(inputs, key=_axis_count, default=None)
+    if varying is None or not _axis_count(varying):
+        return ShapedArray(shape, dtype)
+    sharding = NamedSharding(varying.sharding.mesh, PartitionSpec(*[None] * len(shape)))
+    return varying.update(shape=tuple(shape), dtype=dtype, weak_type=False, sharding=sharding)
+
+
+def vary_together(xs: Sequence[Array]) -> list[Array]:
+    """Return arrays that all vary over the devices over which any of them does: the cotangents of others are sums over these."""
+    if not any(map(varies, xs)):
+        return list(xs)
+    zero = sum(zero_of(x) for x in xs)
+    return [x + zero for x in xs]
+
+
+def varies(x: Any) -> bool:
+    """Return whether anything is an array that varies over devices."""
+    return isinstance(x, Tracer) and _axis_count(jax.typeof(x)) > 0
+
+
+def zero_of(x: Array) -> Array | float:
+    """Return a zero that is batched, and varies over devices, as x does, by the `vmap`s around this one as well; XLA folds it."""
+    if jnp.size(x) == 0:
+        return 0.0
+    first = jnp.ravel(x)[0]
+    return jax.lax.select(first == first, jnp.zeros_like(first), jnp.zeros_like(first))
+
+
+def _axis_count(type_: Any) -> int:
+    """Return the number of the axes of devices over which values of a type vary."""
+    manual = getattr(type_, "manual_axis_type", None)
+    return len(manual.varying) if manual is not None else 0
