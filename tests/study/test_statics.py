@@ -7,6 +7,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from udkjax.study.curve import KnownCurve
 
 LENGTHS, GROUND = (1.0, 2.5, 2.0), 2.5
 STIFFNESS, FREE_LENGTH = 60.0, 1.2
@@ -22,6 +23,16 @@ def test_the_papers_linkage_hanging():
     np.testing.assert_allclose(np.asarray(found.s.imag), np.sqrt(3.5 * 9.81 / 3.05) * np.array([-1.0, 1.0]), rtol=1e-12)
     shape = np.asarray(found.shapes[0]) / float(found.shapes[0, 0, 2])
     np.testing.assert_allclose(shape, [[0.5, 0, 1], [0.5, 0, 1], [0.5, 0, 1], [1, 0, 0]], atol=1e-10)
+
+
+def test_no_step_is_tried_from_a_position_of_rest(monkeypatch):
+    mech, tried = udk.library.parallelogram(-1.3), []
+    rest = udk.equilibrium(mech)
+    correct = KnownCurve.correct
+    monkeypatch.setattr(KnownCurve, "correct", lambda *given, **choices: tried.append(1) or correct(*given, **choices))
+    again = udk.equilibrium(mech, rest.state)
+    assert not tried and bool(again.balanced)
+    assert bool(udk.equilibrium(mech).balanced) and tried
 
 
 def test_the_papers_linkage_standing_is_unstable():

@@ -210,6 +210,10 @@ def _settle(
     def at(q: Float[Array, "n"]) -> Linearization:
         return by.call(linearize, mechanism, analysis, free, t, q)
 
+    def is_unsettled(state: Settling) -> Bool[Array, ""]:
+        _, here, k, better = state
+        return better & (k < MOST_NEWTON_STEPS) & (xp.linalg.norm(here.force) > FORCE_ROUNDING * scale.force)
+
     def body(state: Settling) -> Settling:
         q, here, k, _ = state
         step = here.directions @ _towards_rest(here, scale, stable, curve)
@@ -232,12 +236,11 @@ def _settle(
 
         first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, here
         _, _, better, new, there = by.while_loop(worse, trial, first)
-        better = better & (size > FORCE_ROUNDING * scale.force)
         new, there = jax.tree.map(lambda x, y: xp.where(better, x, y), (new, there), (q, here))
         return new, there, k + 1, better
 
     start = q, at(q), xp.asarray(0), xp.asarray(True)
-    return by.while_loop(lambda s: (s[2] < MOST_NEWTON_STEPS) & s[3], body, start)[0]
+    return by.while_loop(is_unsettled, body, start)[0]
 
 
 def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:

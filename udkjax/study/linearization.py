@@ -45,14 +45,14 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
     """
     w, root, still = analysis.scales.weights, uk.inverse_sqrt_mass(mechanism), jnp.zeros_like(q)
     F = lambda q, v: loads.force(mechanism, t, q, v)  # noqa: E731
-    V = _null_space(uk.D(mechanism, t, q, w), free) if mechanism.constraints else jnp.eye(len(q))
+    force = F(q, still)
     if mechanism.constraints:
         D = uk.D(mechanism, t, q, w)
-        plus = SVD(analysis.scales.rank_tol).plus(D)
+        V, plus = _null_space(D, free), SVD(analysis.scales.rank_tol).plus(D)
         N = root[:, None] * (V - plus @ (D @ V))
-        multipliers = w * (plus.T @ (root * F(q, still)))
+        multipliers = w * (plus.T @ (root * force))
     else:
-        N, multipliers = root[:, None] * V, jnp.zeros(0)
+        N, multipliers = jnp.diag(root), jnp.zeros(0)
 
     def residual_force(q: Float[Array, "n"]) -> Float[Array, "n"]:
         pull = jax.grad(lambda q: jnp.sum(multipliers * constraints.psi(mechanism, t, q)))(q)
@@ -61,7 +61,6 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
     K = jax.jacfwd(residual_force)(q)
     C = -jax.jacfwd(lambda v: F(q, v))(still)
     M = loads.mass(mechanism)
-    force = F(q, still)
     return Linearization(N, N.T @ (M[:, None] * N), N.T @ C @ N, N.T @ K @ N, N.T @ force, force, multipliers)
 
 
