@@ -16,6 +16,7 @@ from tests.scaling import scaled
 from udkjax.scene import GROUND
 from udkjax.study.accuracy import pendulum
 from udkjax.study.diagnosis import fixes
+from udkjax.study.diagnosis.configuration import RankedPositions
 
 COS, SIN = Fraction(3, 5), Fraction(4, 5)
 ANGLE = float(np.arctan2(4.0, 3.0))
@@ -311,3 +312,21 @@ def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
     assert len(found.redundancies) == 2 and len(found.cure) == 2
     assert found.cured is not None and udk.analyse(found.cured).redundant == ()
     assert len(built) == sum(len(r.fixes) for r in found.redundancies) + 1
+
+
+def test_positions_of_a_large_scene_are_closed_without_singular_vectors(monkeypatch):
+    """The walk to the next rank change takes hundreds of positions, and of each the singular values alone."""
+    mech, decompose, found = udk.library.n_four_bar(20), np.linalg.svd, []
+    positions = RankedPositions(mech, 1e-6)
+    start = positions.at(0.0, np.ravel(udk.assemble(mech).q))
+    direction = start.right[:, 0]
+
+    def counted(matrix, *given, compute_uv=True, **choices):
+        found.append(compute_uv)
+        return decompose(matrix, *given, compute_uv=compute_uv, **choices)
+
+    monkeypatch.setattr(np.linalg, "svd", counted)
+    moved = positions.displace(start, direction, 0.1)
+    assert moved is not None and not found
+    assert moved.rank == start.rank and found == [False]
+    assert np.abs(positions.rows.residual(0.0, moved.q)).max() < 1e-12

@@ -73,6 +73,14 @@ class PositionRows(Protocol[Position]):
         """Return Psi, the lengths of the rows of D, and D with rows of length one."""
         ...
 
+    def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
+        """Return Psi, each row over its scale."""
+        ...
+
+    def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
+        """Return -W D^+ Psi."""
+        ...
+
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> Position | None:
         """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
         ...

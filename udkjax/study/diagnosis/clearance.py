@@ -84,14 +84,20 @@ def _walk(positions: RankedPositions, start: Configuration, rank: int, side: flo
         if moved is None or moved.rank > rank or (heading.any() and positions.distance(last, moved) < NEIGHBOUR_STEP / 4):
             break
         path.append(moved)
-        if moved.right.shape[1]:
-            onward = moved.right @ (moved.right.T @ heading)
-            heading = onward / np.linalg.norm(onward)
+        if heading.any():
+            heading = _onward([c.q / positions.unit for c in path[-3:]])
         if len(path) > 3 and positions.distance(start, moved, turns=False) < NEIGHBOUR_STEP:
             return path[1:], True
         if len(path) > 2 and more > POINTS_BESIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
             more = POINTS_BESIDE
     return path[1:], False
+
+
+def _onward(places: list[np.ndarray]) -> np.ndarray:
+    """Return the direction to the next of two or three places on a path: of three, that of the parabola through them."""
+    *before, last = np.diff(places, axis=0)
+    onward = 2 * last - before[0] * np.linalg.norm(last) / np.linalg.norm(before[0]) if before else last
+    return onward / np.linalg.norm(onward)
 
 
 def _has_kink(sigma: list[float]) -> bool:

@@ -3,28 +3,58 @@
 All of it is NumPy on the scene's programs: nothing is compiled for it. Rows and columns are scaled as in determinacy.py.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import LONGEST_STEP, close_position, is_closed
+from udkjax.equations.redundancy import PositionRows, kinematic_rows
+from udkjax.scene.mechanism import Mechanism
 
 NEIGHBOUR_STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
 N_NEIGHBOURS = 12  # of a neighbourhood
 SMALLEST_MOVE = 0.01  # of a step: positions nearer than that to each other are the same
 
 
-class Configuration(NamedTuple):
-    """A closed position and the singular value decomposition of its scaled Jacobian J = U S V^T."""
+class Configuration:
+    """A closed position and its scaled Jacobian J = U S V^T, decomposed as far as it is asked for.
 
-    t: float  # s
-    q: np.ndarray  # (n,)
-    J: np.ndarray  # (m, n)
-    u: np.ndarray
-    sigma: np.ndarray
-    vt: np.ndarray
-    rank: int
+    Args:
+        t: time (s).
+        q: coordinates (n,).
+        J: scaled Jacobian (m, n).
+        rank_tol: singular values up to so much of the largest count as zero.
+    """
+
+    def __init__(self, t: float, q: np.ndarray, J: np.ndarray, rank_tol: float):
+        self.t, self.q, self.J, self._rank_tol = t, q, J, rank_tol
+
+    @cached_property
+    def sigma(self) -> np.ndarray:
+        """The singular values alone, which take a fraction of the time of all."""
+        return singular_values(self.J)
+
+    @cached_property
+    def rank(self) -> int:
+        """The number of singular values that count."""
+        return count_rank(self.sigma, self._rank_tol)
+
+    @cached_property
+    def _vectors(self) -> tuple[np.ndarray, np.ndarray]:
+        u, _, vt = np.linalg.svd(self.J) if self.J.size else (np.eye(len(self.J)), None, np.eye(self.J.shape[1]))
+        return u, vt
+
+    @property
+    def u(self) -> np.ndarray:
+        """The left singular vectors, (m, m)."""
+        return self._vectors[0]
+
+    @property
+    def vt(self) -> np.ndarray:
+        """The right singular vectors, (n, n), row by row."""
+        return self._vectors[1]
 
     @property
     def left(self) -> np.ndarray:
@@ -48,10 +78,11 @@ class Configuration(NamedTuple):
 
 
 class RankedPositions:
-    """The closed positions of one mechanism."""
+    """The closed positions of one mechanism of known numbers."""
 
-    def __init__(self, rows: KinematicRows, rank_tol: float):
-        self.rows, self.rank_tol = rows, rank_tol
+    def __init__(self, mechanism: Mechanism, rank_tol: float):
+        rows = self.rows = KinematicRows(mechanism)
+        self.rank_tol, self._mechanism = rank_tol, mechanism
         length = float(rows.scales.length)
         self.unit = np.tile([length, length, 1.0], rows.size // 3)
         self.row_unit = np.asarray(rows.scales.rows, float)
@@ -59,14 +90,19 @@ class RankedPositions:
     def at(self, t: float, q: np.ndarray) -> Configuration:
         """Return the configuration of closed coordinates."""
         J = self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
-        return Configuration(t, q, J, *decompose(J, self.rank_tol))
+        return Configuration(t, q, J, self.rank_tol)
+
+    @cached_property
+    def _closing(self) -> PositionRows:
+        return kinematic_rows(self._mechanism)  # sparse, of large scenes
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
         """Return the closed position nearest to q, or None."""
         if not self.rows.count:
             return self.at(t, q)
-        position = self.rows.close(t, q)
-        return None if position is None else self.at(t, position.q)
+        q = close_position(self._closing, t, q, np)
+        psi = self.rows.psi(t, q)
+        return self.at(t, q) if is_closed(self.rows.scales, q, 0 * q, psi, 0 * psi, np) else None
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
         """Return the closed position nearest to one that is displaced by a step along a direction, in scaled coordinates."""
@@ -106,9 +142,11 @@ class JointForces(NamedTuple):
     direction: float | None  # of a joint that holds a point: the only one (rad) in which its force is unique, if there is one
 
 
-def decompose(J: np.ndarray, rank_tol: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Return U, the singular values, V^T and the rank of a matrix, which may have no entries."""
-    if not J.size:
-        return np.eye(len(J)), np.zeros(0), np.eye(J.shape[1]), 0
-    u, sigma, vt = np.linalg.svd(J)
-    return u, sigma, vt, int(np.sum(sigma > rank_tol * sigma[0]))
+def singular_values(J: np.ndarray) -> np.ndarray:
+    """Return the singular values of a matrix, which may have no entries."""
+    return np.linalg.svd(J, compute_uv=False) if J.size else np.zeros(0)
+
+
+def count_rank(sigma: np.ndarray, rank_tol: float) -> int:
+    """Return how many singular values count, in descending order: those above `rank_tol` of the largest."""
+    return int(np.sum(sigma > rank_tol * sigma[:1]))

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_direction
 from udkjax.equations.redundancy import choose_dispensable
 from udkjax.integrate.assembly import State, close, require_closed
@@ -11,7 +10,7 @@ from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channels import StateHistory
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions, decompose
+from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions, count_rank, singular_values
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
 from udkjax.study.diagnosis.diagnosis import Diagnosis
 from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fixes_of
@@ -61,8 +60,8 @@ def diagnose(
     closure = close(mechanism, t, state)
     require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # velocities have no part in it
     q = np.asarray(closure.state.q, float)
-    rows = KinematicRows(mechanism)
-    positions = RankedPositions(rows, rank_tol)
+    positions = RankedPositions(mechanism, rank_tol)
+    rows = positions.rows
     current = positions.at(float(t), q.ravel())
     neighbours = positions.around(current)
     ordinary = max([current.rank, *(c.rank for c in neighbours)])
@@ -82,7 +81,7 @@ def diagnose(
         rows=rows.count,
         rank=current.rank,
         ordinary_rank=ordinary,
-        joint_rank=decompose(current.J[of_joints], rank_tol)[3],
+        joint_rank=count_rank(singular_values(current.J[of_joints]), rank_tol),
         joint_rows=len(of_joints),
         can_move=bool(neighbours),
         redundancies=tuple(found),
@@ -133,9 +132,8 @@ def _cure(
     at = usual
     while best is not None:
         done.append(best)
-        rows = KinematicRows(best.mechanism)
-        ranked = RankedPositions(rows, positions.rank_tol)
-        at, owners = [ranked.at(c.t, c.q) for c in at], [name for name, _ in rows.names]
+        ranked = RankedPositions(best.mechanism, positions.rank_tol)
+        at, owners = [ranked.at(c.t, c.q) for c in at], [name for name, _ in ranked.rows.names]
         left = _dependencies(best.mechanism, at[0], at, owners)[0]
         if not left or len(done) == MOST_FIXES:
             return tuple(done)

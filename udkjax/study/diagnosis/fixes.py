@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.dense_rows import KinematicRows
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Constraint, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
+from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, count_rank, singular_values
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
 SMALLEST_PIVOT = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
@@ -193,8 +192,8 @@ def _effect(
     for k, position in enumerate(at):
         rest = np.delete(position.J, own, axis=0)
         remaining = np.concatenate([rest, change.remaining_rows(position.J[own], position.q, places)])
-        sigma = np.linalg.svd(remaining, compute_uv=False) if remaining.size else np.zeros(0)
-        rank = int(np.sum(sigma > rank_tol * sigma[0])) if remaining.size else 0
+        sigma = singular_values(remaining)
+        rank = count_rank(sigma, rank_tol)
         fall = position.redundancy - (len(remaining) - rank)
         if rank != position.rank or (k and fall != falls):
             return -1, float(conditioning)
@@ -204,7 +203,7 @@ def _effect(
 
 def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
     """Return True if the changed mechanism is closed in all positions, has the same mobility there, and fewer redundant rows."""
-    positions = RankedPositions(KinematicRows(after), rank_tol)
+    positions = RankedPositions(after, rank_tol)
     ranked = [positions.at(position.t, position.q) for position in at]
     closed = all(
         np.max(np.abs(positions.rows.residual(c.t, c.q)), initial=0.0) < rank_tol * max(1.0, positions.rows.scales.size(c.q, np))
