@@ -141,6 +141,8 @@ from udkjax.study.kinematics import kinematics as kinematics
 from udkjax.study.kinematics import travel as travel
 from udkjax.study.modes import Modes as Modes
 from udkjax.study.modes import modes as modes
+from udkjax.study.motion_ranges import MotionRanges as MotionRanges
+from udkjax.study.motion_ranges import motion_ranges as motion_ranges
 from udkjax.study.position_batch import BatchPositions as BatchPositions
 from udkjax.study.position_batch import PositionBatch as PositionBatch
 from udkjax.study.power_balance import PowerBalance as PowerBalance

@@ -97,6 +97,77 @@ def test_travel_has_two_ends_and_exact_derivatives():
     assert (float(free.lower), float(free.upper)) == (-np.inf, np.inf)
 
 
+@pytest.mark.parametrize("stages", fast([3, 5], [1, 2, 3, 4, 5]))
+def test_travel_ends_at_toggles_where_branches_meet(stages):
+    """All bars of a lift are upright there, and each may turn to either side; on the way all are level."""
+    found = udk.travel(udk.library.scissor_lift(stages, 0.7, length=2.5), "body.platform.y")
+    np.testing.assert_allclose([found.lower, found.upper], 2.5 * stages * np.array([-1, 1]), rtol=4e-15)
+    np.testing.assert_allclose(np.abs(found.upper_q[: 2 * stages, 2]), np.pi / 2, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_travel_of_traced_lifts_ends_there_too():
+    lift = udk.library.scissor_lift(2)
+    found = jax.jit(lambda m: udk.travel(lift.with_parameters({"body.platform.mass": m}), "body.platform.y"))(3.0)
+    np.testing.assert_allclose([found.lower, found.upper], [-2.0, 2.0], rtol=4e-15)
+
+
+class Level(udk.Joint):
+    """Two origins at one height: no joint of these two bodies alone, since it does not turn with them."""
+
+    def residual(self, t, *frames):
+        return [frames[1].y - frames[0].y]
+
+
+def with_bodies(mech, bodies, joints):
+    return udk.Mechanism({**mech.bodies, **bodies}, {**mech.joints, **joints})
+
+
+def with_hung(kind):
+    """The four-bar that stops, and what hangs on its coupler or on the ground; on a pendulum a wheel."""
+    mech = udk.library.four_bar(np.pi / 3, lengths=STUCK[:3], ground=STUCK[3])
+    x, y, _ = np.asarray(mech.q0)[mech.body_names.index("coupler")]
+    wheel = lambda on, place: ({"wheel": udk.Body(1.0, 0.1, place, 0.2)}, {"axle": udk.Revolute([on, "wheel"], [place, (0, 0)])})  # noqa: E731
+    if kind == "wheel on the ground":
+        return with_bodies(mech, *wheel("ground", (0.0, 3.0)))
+    rod = {"rod": udk.Body(1.0, 0.1, [x, y - 0.5], 0.0)}
+    pin = {"hook": udk.Revolute(["coupler", "rod"], [(0.0, 0.0), (0.0, 0.5)])}
+    if kind == "pendulum with a wheel":
+        return with_bodies(
+            mech,
+            {**rod, "wheel": udk.Body(1.0, 0.1, [x, y - 1.0], 0.2)},
+            {**pin, "axle": udk.Revolute(["rod", "wheel"], [(0.0, -0.5), (0.0, 0.0)])},
+        )
+    return with_bodies(mech, {"rod": udk.Body(1.0, 0.1, [x + 0.5, y], 0.0)}, {"level": Level(["coupler", "rod"])})
+
+
+@pytest.mark.parametrize("kind", ["wheel on the ground", "pendulum with a wheel"])
+def test_what_hangs_on_one_body_limits_no_travel(kind):
+    mech, plain = with_hung(kind), udk.library.four_bar(np.pi / 3, lengths=STUCK[:3], ground=STUCK[3])
+
+    def ends(mech):
+        found = udk.travel(mech, "body.crank.angle")
+        return found, jnp.stack([found.lower, found.upper])
+
+    (found, values), (bare, expected) = ends(mech), ends(plain)
+    np.testing.assert_array_equal(values, expected)
+    np.testing.assert_allclose(found.upper_q[:3], bare.upper_q, atol=1e-12)
+    assert np.abs(udk.equations.psi(mech, 0.0, found.upper_q)).max() < 1e-12
+    assert np.all(np.isfinite(found.lower_q))
+    number = "joint.D.points[0][0]"
+    slopes = [jax.jvp(lambda g, m=m: ends(m.with_parameters({number: g}))[1], (STUCK[3],), (1.0,))[1] for m in (mech, plain)]
+    np.testing.assert_allclose(*slopes, atol=1e-12)
+    with pytest.raises(udk.SceneError, match="drive or hold"):  # positions of all do not follow
+        udk.kinematics(mech, "body.crank.angle", [1.0])
+    free = udk.travel(mech, "body.wheel.angle") if kind == "wheel on the ground" else None
+    assert free is None or (float(free.lower), float(free.upper)) == (-np.inf, np.inf)
+
+
+def test_what_does_not_move_along_is_not_carried():
+    with pytest.raises(udk.SceneError, match="drive or hold"):
+        udk.travel(with_hung("level"), "body.crank.angle")
+
+
 def test_peaucellier_draws_a_straight_line():
     mech = udk.library.peaucellier()
     found = udk.kinematics(mech, "body.crank.angle", np.linspace(np.pi / 6, -1.5, 40))

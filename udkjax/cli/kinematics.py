@@ -11,8 +11,7 @@ from udkjax.extras import OptionalImport
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from udkjax import Mechanism
-    from udkjax.study.kinematics import Kinematics, Travel
+    from udkjax.study.kinematics import Travel
 
 with OptionalImport():
     import tyro
@@ -56,6 +55,7 @@ def kinematics(
     from udkjax.printing import format_number
     from udkjax.show.summary import table
     from udkjax.study.drive import constant_speed, value_of
+    from udkjax.study.motion_ranges import range_lines
 
     travel = udk.travel(mech, driver)
     rate = (constant_speed(mech, driver) or 1.0) if rate is None else rate
@@ -81,7 +81,8 @@ def kinematics(
             lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(found.values), names, strict=True) if n == name)
     if others is not None:
         lines["branches"] = f"{len(others)} at {first:g}"
-    lines |= outputs(mech, found, driver)
+    ranges = udk.motion_ranges(mech, found, driver)
+    lines |= range_lines(ranges)
     columns = measure_channels(mech, found, measured)
     results: dict[str, object] = {
         "driver": driver,
@@ -89,6 +90,7 @@ def kinematics(
         "values": found.values,
         "status": names,
         "limit": found.limit,
+        "ranges": {name: getattr(ranges, name) for name in ("swings", "strokes", "transmission_angles")},
         "bodies": list(found.bodies),
         **{name: getattr(found, name) for name in ("q", "v", "a")},
         "channels": {name: values for name, (values, _) in columns.items()},
@@ -114,33 +116,6 @@ def kinematics(
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:
         fail(f"{count - reached} values are not reached: {names[int(np.argmin(np.asarray(found.reached)))].replace('_', ' ')}")
-
-
-def outputs(mech: "Mechanism", found: "Kinematics", driver: str) -> dict[str, str]:
-    """Return the ranges of links on the ground along a motion, and those of the angles between other links, as words."""
-    import numpy as np
-
-    import udkjax as udk
-    from udkjax.study.drive import element_of
-
-    lines, q, driving = {}, np.asarray(found.q)[np.asarray(found.reached)], element_of(mech, driver).bodies
-    for name, joint in mech.joints.items():
-        if not isinstance(joint, udk.Revolute | udk.Prismatic) or not len(q):
-            continue
-        moving = [body for body in joint.bodies if body != "ground"]
-        if len(moving) == 2 and isinstance(joint, udk.Revolute) and not set(moving) & set(driving):
-            try:
-                angles = np.degrees(np.asarray(udk.transmission_angle(mech, found, name))[np.asarray(found.reached)])
-            except udk.SceneError:  # of links with more pins there is none
-                continue
-            if angles.max() > 0:  # else all pins of a link are in one place
-                lines[f"angle at {name}"] = f"{angles.min():.4g} to {angles.max():.4g} deg between its links"
-        elif len(moving) == 1:
-            x, y, turned = np.ptp(q[:, mech.body_names.index(moving[0])], axis=0)
-            whole = turned > 2 * math.pi * (1 - 1e-9)
-            turns = "turns all the way round" if whole else f"turns by {math.degrees(turned):.4g} deg"
-            lines[moving[0]] = turns if isinstance(joint, udk.Revolute) else f"slides by {math.hypot(x, y):.4g} m"
-    return lines
 
 
 def _end(travel: "Travel", side: int) -> str:

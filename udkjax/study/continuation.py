@@ -18,6 +18,7 @@ A value so near to a meeting of branches that its own E is of no use is found ac
 Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -25,9 +26,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.control_flow import sequential
+from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.structure import ArrayLibrary
+from udkjax.integrate.seldom import call_seldom
 from udkjax.printing import PrintsWords
-from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing
+from udkjax.study.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing, find_toggle
 from udkjax.study.curve import AbstractCurve
 
 FIRST_STEP, LONGEST_ARC, SHORTEST_ARC = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
@@ -208,9 +212,11 @@ def _advance(
     """Return the state after a step to `at`, of the length eta, if that step counts."""
     xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
     rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
-    near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
+    near, clearance = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding, curve.clearance(at)
+    # A residual along what E^+ truncates stays; it is of second order in the step, and a step further is corrected again.
+    closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(at) <= CLOSED_TOL))
     good = near & (turned @ tau >= LARGEST_BEND) & closed
-    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (curve.clearance(at) < NEAR_LOSS))  # only a close tangent leads across
+    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # only a close tangent leads across
     good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # else on a branch that comes close
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
@@ -256,6 +262,12 @@ def _narrow(
     ended = (xp.abs(sigma - last.sigma) <= 2 * float(np.finfo(end.dtype).eps) * end) | (value == 0)
     ended = ended | (last.tries + 1 >= MAX_SECANTS)
     narrowed = state._replace(search=_Search(sigma, value, *other, last.tries + 1))
+
+    def beside() -> Array:
+        toggle, is_known = _at_seldom(curve, find_toggle, at, state.tau)
+        return xp.where(is_known, toggle, at)
+
+    at = curve.by.cond(ended & ~for_value & (curve.clearance(at) < NEAR_LOSS), beside, lambda: at)
     # At the toggle: the value lies behind it, at it to rounding, or before.
     room = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
     ahead = (target - at[-1]) * way
@@ -272,6 +284,11 @@ def _narrow(
     return _choose(ended, _choose(for_value, at_value, at_toggle, xp), narrowed, xp)
 
 
+def _at_seldom(curve: AbstractCurve, function: Callable[..., T], *given: Array) -> T:
+    """Return function(curve, *given), which a program hardly ever reaches."""
+    return function(curve, *given) if curve.by.xp is np else call_seldom(function, curve, *given)
+
+
 def _record(curve: AbstractCurve, state: _State) -> _State:
     """Store the point of the curve that is the next value's, where it is one, unless it is that of the start.
 
@@ -285,7 +302,7 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
     current = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
 
     def beside() -> tuple[Crossing, Array]:
-        other, is_known = find_crossing(curve, X, tau)
+        other, is_known = _at_seldom(curve, find_crossing, X, tau)
         return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, current), is_known
 
     found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (current, xp.asarray(False)))

@@ -26,6 +26,7 @@ SPACINGS = (0.04, 0.015, 0.005)
 NEAREST_NODE, FARTHEST_NODE = 2, 7
 # Bounds on how the polynomials through twelve and ten values differ in q, q' and q'', scaled: a hundred times their error.
 ACCEPTED_DIFFERENCES = (1e-9, 1e-7, 1e-5)
+ROOT_STEPS = 6  # of Newton's method to the extremum of a polynomial: it doubles the digits, from two on
 
 
 def weights(last: int) -> np.ndarray:
@@ -79,6 +80,66 @@ def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array
     slope = xp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
     slope = slope / xp.linalg.norm(slope) * xp.where(slope @ tau < 0, -1.0, 1.0)
     return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
+
+
+def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Bool[Array, ""]]:
+    """Find a toggle where branches meet: where the value along the branch has an extremum, from points on both sides.
+
+    They lie at known distances along tau, of which q and the value are polynomials, as of the value elsewhere.
+
+    Args:
+        curve: the curve.
+        X: a point close to the toggle.
+        tau: the direction of the branch there, roughly.
+
+    Returns:
+        The toggle, and whether it is to be relied on.
+    """
+    by, xp = curve.by, curve.by.xp
+    found, doubt = by.map(lambda h: _extremum(curve, X, tau, h), xp.asarray(SPACINGS, X.dtype))
+    best = xp.argmin(doubt)
+    return found[best], doubt[best] < 1.0
+
+
+def _extremum(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array]:
+    """Return the extremum of the value by points h apart, and how far it is from being accepted: below one it is."""
+    by, xp = curve.by, curve.by.xp
+    along = NEAREST_NODE * h * xp.array([-1.0, 1.0])[:, None] * tau
+
+    def outward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        before, last = state
+        ahead = xp.where(k == NEAREST_NODE, X + along, last + (last - before))
+        at, are_closed = by.map(curve.correct, ahead)
+        inner = at + (xp.mean(at, 0) - at) / NEAREST_NODE  # a step h before the nearest
+        return (xp.where(k == NEAREST_NODE, inner, last), at), (at, are_closed)
+
+    start = xp.stack([X, X])
+    _, (sides, closed) = by.scan(outward, (start, start), xp.arange(NEAREST_NODE, FARTHEST_NODE + 1.0))
+    points = xp.concatenate([sides[::-1, 0], sides[:, 1]])  # (12, n + 1)
+    places = (points - X) @ tau / (FARTHEST_NODE * h)
+    level, all_of, fewer = points, [points[0]], [points[1]]  # divided differences, from the first point and from the second on
+    for k in range(1, len(points)):
+        level = (level[1:] - level[:-1]) / (places[k:] - places[:-k])[:, None]
+        all_of.append(level[0])
+        fewer += [level[1]] if k < len(points) - 2 else []
+    root = xp.zeros((), X.dtype)
+    for _ in range(ROOT_STEPS):
+        _, slope, bend = _evaluate_at(root, all_of, places)
+        root = xp.clip(root - slope[-1] / bend[-1], -1.0, 1.0)
+    at = _evaluate_at(root, all_of, places)[0]
+    doubt = xp.max(xp.abs(at - _evaluate_at(root, fewer, places[1:])[0])) / ACCEPTED_DIFFERENCES[0]
+    at = at - curve.plus(curve.slopes(at), NEAR_LOSS) @ curve.residual(at)  # the part that E resolves well is closed to rounding
+    known = xp.all(closed) & curve.is_closed(at) & (xp.abs(root) < 1.0) & xp.isfinite(doubt)
+    return at, xp.where(known, doubt, xp.inf)
+
+
+def _evaluate_at(x: Array, coefficients: list[Array], places: Array) -> tuple[Array, Array, Array]:
+    """Return Newton's polynomial, its slope and its second derivative at x."""
+    value, slope, bend = coefficients[-1], 0.0 * coefficients[-1], 0.0 * coefficients[-1]
+    for k in range(len(coefficients) - 2, -1, -1):
+        ahead = x - places[k]
+        bend, slope, value = bend * ahead + 2 * slope, slope * ahead + value, value * ahead + coefficients[k]
+    return value, slope, bend
 
 
 def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:

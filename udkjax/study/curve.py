@@ -51,8 +51,12 @@ class AbstractCurve(ABC):
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Return True if the residual is what rounding leaves of it."""
         xp = self.by.xp
-        size = xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
-        return size <= ROUNDING_UNITS * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
+        return self.violation(X) <= ROUNDING_UNITS * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
+
+    def violation(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
+        """Return the largest row of Psi in units of its scale."""
+        xp = self.by.xp
+        return xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
 
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
         """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""

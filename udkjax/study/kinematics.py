@@ -24,9 +24,10 @@ from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.fields import Numbers, library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.branches import SAME_POSITION
+from udkjax.study.carried_bodies import carried_bodies
 from udkjax.study.continuation import Points, Reached, follow, no_points
 from udkjax.study.curve import AbstractCurve, Curve, KnownCurve
-from udkjax.study.drive import Drive, Driven, drive
+from udkjax.study.drive import Drive, Driven, drive, element_of
 from udkjax.study.position_derivatives import with_derivative, with_derivatives
 
 UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
@@ -196,13 +197,23 @@ def kinematics(
 def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, Scalar] | None = None) -> Travel:
     """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
 
-    Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. `lower` and `upper` have exact
+    Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. Bodies that hang on a single other
+    one, as a free wheel or a pendulum, limit nothing: at the toggles they are as they were to it. `lower` and `upper` have exact
     derivatives by every number of the mechanism.
     """
     if driver is None:
         raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
-    driven, q = _start(mechanism, driver, 0.0, state, held)
-    return solve(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
+    carried = carried_bodies(mechanism, driver, held)
+    if not carried.carrier:
+        driven, q = _start(mechanism, driver, 0.0, state, held)
+        return solve(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
+    is_driver = isinstance(driver, str) and driver in mechanism.drivers
+    coordinate = driver if is_driver else element_of(mechanism, driver)  # a pin may be of what is left out
+    start = assemble(mechanism, 0.0, state, throw=False).q
+    rest = start[carried.kept(len(start))]
+    found = travel(carried.without(mechanism), coordinate, State(rest, jnp.zeros_like(rest)), held)
+    lower_q, upper_q = (carried.carry(start, jax.lax.stop_gradient(q)) for q in (found.lower_q, found.upper_q))
+    return eqx.tree_at(lambda x: (x.lower_q, x.upper_q), found, (lower_q, upper_q))
 
 
 def _kinematics(

@@ -148,5 +148,5 @@ def singular_values(J: np.ndarray) -> np.ndarray:
 
 
 def count_rank(sigma: np.ndarray, rank_tol: float) -> int:
-    """Return how many singular values count, in descending order: those above `rank_tol` of the largest."""
+    """Return the number of singular values, the largest first, that are above `rank_tol` of the largest."""
     return int(np.sum(sigma > rank_tol * sigma[:1]))
