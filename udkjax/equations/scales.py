@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, numbers_as_vector
+from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, known_numbers_joined, numbers_as_vector
 from udkjax.expressions.deferred import deferred
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.expressions.numpy_program import evaluate_as
@@ -77,13 +77,13 @@ def known_scales(mechanism: Mechanism) -> Scales:
 
 def traced_scales(mechanism: Mechanism) -> Scales:
     """Return the same in a trace; without derivatives."""
-    return _traced_scales(jax.lax.stop_gradient(mechanism.without_origin))
+    numbers = known_numbers_joined([*mechanism.at(0.0).numbers, *NO_THRESHOLDS])
+    return _traced_scales(jax.lax.stop_gradient(numbers), scene_programs(mechanism))
 
 
 @deferred
-def _traced_scales(mechanism: Mechanism) -> Scales:
-    numbers = numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS])
-    return _unpack(scales_p.bind(numbers, programs=scene_programs(mechanism)))
+def _traced_scales(numbers: list[ArrayLike], programs: ScenePrograms) -> Scales:
+    return _unpack(scales_p.bind(numbers_as_vector(numbers), programs=programs))
 
 
 def _unpack(found: Any) -> Scales:

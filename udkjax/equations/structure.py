@@ -49,16 +49,22 @@ def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
 
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
-    """Return numbers and arrays as one vector, in order: by NumPy where they are known, and what is known in a row is one."""
-    parts = []
-    for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
-        if traced:
-            parts += [jnp.ravel(jnp.asarray(x, float)) for x in group]
-        else:
-            parts.append(np.concatenate([np.ravel(np.asarray(x, float)) for x in group]))
+    """Return numbers and arrays as one vector, in order: by NumPy where they are known."""
+    parts = [jnp.ravel(jnp.asarray(x, float)) if isinstance(x, Tracer) else np.asarray(x) for x in known_numbers_joined(numbers)]
     if len(parts) < 2:
         return parts[0] if parts else np.zeros(0)
     return jnp.concatenate(parts)
+
+
+def known_numbers_joined(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
+    """Return the same numbers and arrays, with one vector of NumPy for all that are known in a row."""
+    parts = []
+    for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
+        if traced:
+            parts += group
+        else:
+            parts.append(np.concatenate([np.ravel(np.asarray(x, float)) for x in group]))
+    return parts
 
 
 class ElementStructure(NamedTuple):
