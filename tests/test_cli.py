@@ -1,4 +1,5 @@
 import json
+import subprocess
 import sys
 from pathlib import Path
 from typing import get_args
@@ -288,6 +289,11 @@ def test_a_defect_keeps_its_traceback(monkeypatch, error):
     monkeypatch.setattr("udkjax.show.doctor.facts", raised)
     with pytest.raises(type(error)):
         udkjax("doctor")
+
+
+def test_the_package_runs_as_the_command():
+    said = subprocess.run([sys.executable, "-m", "udkjax", "--version"], capture_output=True, text=True, check=True, timeout=120)
+    assert said.stdout == f"udkjax {udk.__version__}\n"
 
 
 def test_the_version_is_said_without_importing_anything(capsys):

@@ -76,7 +76,7 @@ def test_inverse(tmp_path, capsys):
         np.testing.assert_allclose(data.effort.sel(driver="motor"), torque)
         save(data, tmp_path / "i.csv")
     heading, *lines = (tmp_path / "i.csv").read_text().splitlines()
-    assert heading == "time,effort.motor [N m or N],power.motor [W]"
+    assert heading == "time,effort.motor [N m],power.motor [W]"
     np.testing.assert_array_equal([float(line.split(",")[1]) for line in lines], torque)
     rate = power[0] / torque[0]
     np.testing.assert_allclose(power, rate * torque)
@@ -187,7 +187,7 @@ def test_inverse_and_simulate_draw_what_they_find(tmp_path, capsys):
     found = results(capsys, "simulate", scene, "--t1", 0.2, "--dt", 0.1, "--out", out, "--channels", "driver.motor.load")
     assert [Path(name).name for name in found["files"]] == ["s.csv", "s.png", "s-channels.png"]
     for row in csv.DictReader(out.open()):
-        assert float(row["driver.motor.load [N m]"]) == pytest.approx(float(row["effort.motor [N m or N]"]), rel=1e-9)
+        assert float(row["driver.motor.load [N m]"]) == pytest.approx(float(row["effort.motor [N m]"]), rel=1e-9)
 
 
 def test_kinematics_says_what_the_links_do(tmp_path, capsys):

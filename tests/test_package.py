@@ -48,7 +48,7 @@ def violations(root: Path) -> list[str]:
         floor = place.parts[0].removesuffix(".py")
         if floor == "__init__":
             continue
-        known = BELOW.get(floor, set(BELOW) | {"*"} if floor == "cli" else None)
+        known = BELOW.get(floor, set(BELOW) | {"*"} if floor in ("cli", "__main__") else None)
         if known is None:
             found.append(f"{place}: no floor of this name")
             continue

@@ -47,8 +47,9 @@ def inverse(
         rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
         energies = {"work": found.works[name], "swing": found.swings[name]}
         results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms, **energies}
+    units = sorted({unit for _, unit in found.effort_units}, reverse=True)
     variables = {
-        "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), "N m or N"),
+        "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), " or ".join(units)),
         "power": (("time", "driver"), np.stack([np.asarray(x) for x in found.powers.values()], 1), "W"),
     }
     if plot is not None:

@@ -207,7 +207,8 @@ class Solution(PrintsTable):
             if found := efforts(mechanism, self):
                 data = data.assign_coords(driver=list(found))
                 data["effort"] = ("time", "driver"), np.stack([np.asarray(x) for x in found.values()], 1)
-                data["effort"].attrs = {"long_name": "what drivers exert along their coordinates", "units": "N m or N"}
+                units = sorted({mechanism.drivers[name].effort_unit for name in found}, reverse=True)
+                data["effort"].attrs = {"long_name": "what drivers exert along their coordinates", "units": " or ".join(units)}
         return data
 
 

@@ -202,6 +202,7 @@ def _read(text: str) -> _Unit:
         name = _WORDS.get(name, name)
         if name not in _UNITS:
             meant = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == f"{name}".lower()]
+            meant += ["; cycles a second are rev/s"] if f"{name}".endswith("Hz") else []
             cure = meant[0] if meant else f": they are made of {', '.join(_UNITS)}"
             raise ValueError(f"{quote(text)} is no unit known here{cure}")
         found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))

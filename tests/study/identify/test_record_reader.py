@@ -305,7 +305,7 @@ def test_units_are_told_as_people_write_them(units, wanted, expected):
         ("mm", "rad", '"mm" does not fit; it is measured in rad, deg, rev'),
         ("N", "N m", "it is measured in N m, N mm, kN m"),
         ("rad/s", "rad/s2", "it is measured in rad/s2, deg/s2"),
-        ("Hz", "rad/s", '"Hz" is no unit known here'),
+        ("Hz", "rad/s", '"Hz" is no unit known here; cycles a second are rev/s'),
         ("5 m", "m", "is no unit known here"),
         ("%", "m", "is no unit known here"),
     ],
