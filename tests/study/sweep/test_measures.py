@@ -41,6 +41,17 @@ def test_a_users_arrays_are_labelled_by_their_shapes():
     assert guess_label("x", (), 6, 4).dims == ()
 
 
+def test_arrays_of_a_function_without_a_name_go_by_their_own():
+    data = udk.sweep(FOUR_BAR, {"body.crank.mass": [1.0]}, TS[:2], lambda m, s: {"top": jnp.max(s.q[:, 0, 1])}, progress=False)
+    assert "top" in data and not [name for name in data if "lambda" in str(name)]
+
+
+@pytest.mark.parametrize("wrong", [lambda m, s: np.max(np.asarray(s.q)), lambda m, s: s.q if s.q[-1, 0, 0] > 0 else -s.q])
+def test_a_measure_that_cannot_be_traced_is_refused_with_the_cure(wrong):
+    with pytest.raises(udk.SweepError, match=r'measure "lambda": write it in jax\.numpy'):
+        udk.sweep(FOUR_BAR, {"body.crank.mass": [1.0, 2.0]}, TS[:2], wrong, progress=False)
+
+
 def test_channels_are_measures():
     ts = TS[:3] / 10
     axes = {"body.crank.mass": [1.0, 2.0]}

@@ -20,6 +20,7 @@ from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
 from udkjax.study.channels import Channel, channel_of
+from udkjax.study.sweep.dimensions import SweepError
 
 UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, Scalar]])
 OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)
@@ -77,6 +78,9 @@ class Measure:
         return replace(self, labels={key if alone else f"{key}_{name}": label for name, label in self.labels.items()})
 
 
+NAMELESS = "lambda"  # the name of a function that has none
+
+
 def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Label:
     """Label the result of a user's function by its shape."""
     dims = [f"{name}_{k}" for k in range(len(shape))]
@@ -130,10 +134,15 @@ def _evaluate_channel(channel: Channel, run: MeasuredRun) -> dict[str, Array]:
 
 
 def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array]:
-    """Call a user's function, whose single array has the measure's name."""
-    found = function(run.mechanism, run.solution)
+    """Call a user's function, whose single array has the measure's name, and several that name before theirs, if it has one."""
+    try:
+        found = function(run.mechanism, run.solution)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
+        cure = "write it in jax.numpy, without numpy, float() and `if` of what is computed: members are computed side by side"
+        raise SweepError([f"measure {quote(name)}: {cure}"]) from None
     if isinstance(found, Mapping):
-        return {f"{name}_{key}": jnp.asarray(value) for key, value in found.items()}
+        front = "" if name == NAMELESS else f"{name}_"
+        return {f"{front}{key}": jnp.asarray(value) for key, value in found.items()}
     return {name: jnp.asarray(found)}
 
 

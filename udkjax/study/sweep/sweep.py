@@ -65,8 +65,8 @@ def sweep(
         measure: measures to store of each member; nothing else is stored. By name: "final" (q and v at the end), "states" (at
             all `ts`), "violation" (the largest, m and rad), "energy_drift" (J), "error" (the largest of a coordinate and of an
             angle, against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x" (at all `ts`). Or a
-            function of (mechanism, solution), which returns an array or a dict of arrays; or several of these, in a list, or in
-            a dict of names.
+            function of (mechanism, solution), by jax.numpy, which returns an array or a dict of arrays; or several, in a list or
+            in a dict of names.
         design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are ranges (low, high), or frozen distributions
             of scipy.stats, and all of them lie along the dimension "member".
         reference: of the measure "error": a Solution, coordinates (T, bodies, 3), or a function (mechanism, ts) of them.
