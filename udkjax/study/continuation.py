@@ -174,17 +174,29 @@ def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _St
     ahead = X + eta * tau
     ahead = xp.append(ahead[:-1], xp.where(lands, target, ahead[-1]))
     at, closed = curve.correct(ahead, fixed=lands | starts)
-    turned, side = curve.tangent(at, tau)
+    turned, side, clearance = curve.tangent(at, tau)
 
     def begin() -> _State:  # where branches meet, one of them is taken
         return state._replace(X=at, tau=turned, side=side, event=xp.where(closed, _LANDS, Reached.open))
 
     def narrow() -> _State:
-        return _narrow(curve, state, target, way, eta, at, turned)
+        return _narrow(curve, state, target, way, eta, at, turned, clearance)
 
     def advance() -> _State:
         return _advance(
-            curve, state._replace(tau=tau, side=turn * state.side), target, way, eta, lands, ahead, at, closed, turned, side, most
+            curve,
+            state._replace(tau=tau, side=turn * state.side),
+            target,
+            way,
+            eta,
+            lands,
+            ahead,
+            at,
+            closed,
+            turned,
+            side,
+            clearance,
+            most,
         )
 
     cond = curve.by.cond
@@ -207,12 +219,13 @@ def _advance(
     closed: Bool[Array, ""],
     turned: Float[Array, "n+1"],
     side: Float[Array, ""],
+    clearance: Float[Array, ""],
     most: int,
 ) -> _State:
     """Return the state after a step to `at`, of the length eta, if that step counts."""
     xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
     rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
-    near, clearance = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding, curve.clearance(at)
+    near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
     # A residual along what E^+ truncates stays; it is of second order in the step, and a step further is corrected again.
     closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(at) <= CLOSED_TOL))
     good = near & (turned @ tau >= LARGEST_BEND) & closed
@@ -252,6 +265,7 @@ def _narrow(
     sigma: Float[Array, ""],
     at: Float[Array, "n+1"],
     tangent: Float[Array, "n+1"],
+    clearance: Float[Array, ""],
 ) -> _State:
     """Return the state of a search after it looked at sigma: for the toggle first, and then for the value if it lies before."""
     xp, last, end = curve.by.xp, state.search, state.h
@@ -267,7 +281,7 @@ def _narrow(
         toggle, is_known = _at_seldom(curve, find_toggle, at, state.tau)
         return xp.where(is_known, toggle, at)
 
-    at = curve.by.cond(ended & ~for_value & (curve.clearance(at) < NEAR_LOSS), beside, lambda: at)
+    at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), beside, lambda: at)
     # At the toggle: the value lies behind it, at it to rounding, or before.
     room = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
     ahead = (target - at[-1]) * way

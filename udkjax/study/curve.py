@@ -14,6 +14,7 @@ from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
+from udkjax.pinv.svd import SVDFactors
 from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.drive import Driven
@@ -43,6 +44,10 @@ class AbstractCurve(ABC):
     @abstractmethod
     def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Any:
         """Return E^+, truncated where singular values are below `tol` of the largest."""
+
+    @abstractmethod
+    def inverse_singular_values(self, plus: Any) -> Float[Array, "k"]:
+        """Return 1/sigma of E^+ in the order of descending sigma, zero for what is truncated."""
 
     @abstractmethod
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -87,18 +92,23 @@ class AbstractCurve(ABC):
         sigma = xp.linalg.svd(E, compute_uv=False)
         return sigma[len(X) - 2] / xp.where(sigma[0] > 0, sigma[0], 1.0)
 
-    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> tuple[Array, Array]:
-        """Return the tangent that keeps the direction of one before, and on which side of a meeting of branches it is, +-1.
+    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> tuple[Array, Array, Array]:
+        """Return the tangent that keeps the direction of one before, on which side of a meeting of branches it is, and clearance.
 
-        The side is the sign of det [E; tau] of independent rows: along a branch it changes where that meets another alone, and
-        not at toggles. It is 1 where it is not known which rows are independent.
+        The side is the sign of det [E; tau] of independent rows, +-1: along a branch it changes where that meets another alone,
+        and not at toggles. It is 1 where it is not known which rows are independent. The clearance is `clearance(X)`, of the
+        same decomposition, or zero where E^+ is truncated.
         """
         xp, E = self.by.xp, self.slopes(X)
-        tau = before - self.plus(E) @ (E @ before)
+        plus = self.plus(E)
+        tau = before - plus @ (E @ before)
+        inverse = self.inverse_singular_values(plus)
+        last = inverse[len(X) - 2] if min(E.shape) >= len(X) - 1 else xp.zeros(())
+        clearance = xp.where(last == 0, 0.0, inverse[0] / xp.where(last == 0, 1.0, last)) if len(inverse) else last
         size = xp.linalg.norm(tau)
         tau = tau / xp.where(size > 0, size, 1.0)
         A = xp.concatenate([E[np.array(self.independent, int)], tau[None]])
-        return tau, xp.linalg.slogdet(A)[0] if A.shape[0] == A.shape[1] else xp.ones(())
+        return tau, xp.linalg.slogdet(A)[0] if A.shape[0] == A.shape[1] else xp.ones(()), clearance
 
     def derivatives(self, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
         """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
@@ -140,6 +150,11 @@ class Curve(AbstractCurve):
     def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Plus:
         return SVD(tol).plus(E)
 
+    def inverse_singular_values(self, plus: Plus) -> Float[Array, "k"]:
+        factors = plus.factors
+        assert isinstance(factors, SVDFactors)
+        return factors.inverse
+
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
         return gamma(self.mechanism, s, q, v)
 
@@ -173,6 +188,9 @@ class KnownCurve(AbstractCurve):
 
     def plus(self, E: Any, tol: float = RANK_TOL) -> TruncatedPseudoinverse:
         return TruncatedPseudoinverse.of(E, tol)
+
+    def inverse_singular_values(self, plus: TruncatedPseudoinverse) -> np.ndarray:
+        return plus.inverse
 
     def gamma(self, s: Any, q: Any, v: Any) -> Any:
         return self.terms.gamma(s, q, v)
