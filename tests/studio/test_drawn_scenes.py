@@ -35,3 +35,12 @@ def test_what_cannot_be_drawn_is_named():
     welded = udk.Mechanism({"a": wheel}, {"held": udk.Weld(("ground", "a"), [(0, 0), (0, 0)])})
     with pytest.raises(udk.SceneError, match=r"joint 'held'.*Weld"):
         drawing_text_of(welded)
+
+
+def test_a_drawing_stays_as_it_is_unless_a_number_departs_from_it():
+    """One that was changed by hand is drawn anew, with that number: a body's mass, which no link of a density has."""
+    pins, bar = {"O": (0.0, 0.0), "A": (0.3, 0.4)}, udk.Link(["O", "A"], density=7850.0, width=0.02, thickness=0.01)
+    drawn = udk.Drawing(pins, {"bar": bar}, ground=["O"]).mechanism()
+    assert drawing_text_of(drawn) == udk.dumps(drawn) and "density" in udk.dumps(drawn)
+    heavier = udk.loads(drawing_text_of(drawn.with_parameters({"body.bar.mass": 7.0})))
+    assert float(heavier.bodies["bar"].mass) == 7.0

@@ -41,7 +41,7 @@ Place = np.ndarray
 
 def drawing_text_of(mechanism: Mechanism) -> str:
     """Return a mechanism as the text of a drawing; raise `SceneError` where it cannot be drawn."""
-    if isinstance(mechanism.drawing, Drawing) and not mechanism.changed:
+    if isinstance(mechanism.drawing, Drawing) and not mechanism.departs_from_drawing:
         return dumps(mechanism)
     return dumps(_Draft(mechanism).drawing())
 
