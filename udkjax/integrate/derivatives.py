@@ -28,15 +28,16 @@ CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the 
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
-def differentiable(problem: Problem) -> IntegratorOutput:
+def differentiable(problem: Problem, has_known_times: bool) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
     None are taken along numbers that do not depend on what is differentiated, nor along those of the step controller: steps are
-    taken as they are.
+    taken as they are; nor along times that were known before the problem was traced.
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)
-    return run_of_times(_integrate, problem) if isinstance(problem.ts, Tracer) else _integrate(problem)
+    moves = isinstance(problem.ts, Tracer) and not has_known_times
+    return run_of_times(_integrate, problem) if moves else _integrate(problem)
 
 
 def _integrate(problem: Problem) -> IntegratorOutput:

@@ -208,7 +208,7 @@ def _run(
                 run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
                 return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
-    given = bare, analysis, number(ts), state, closure, choices.arrays()
+    given = bare, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
     if is_within_jit():  # in which known numbers are traced, too
         return _simulate(*given)
     takes_diffrax = choices.take_diffrax or not isinstance(system, Mechanism)
@@ -222,13 +222,14 @@ def _simulate(
     state: State | None,
     closure: Closure | None,
     choices: Choices,
+    has_known_times: bool,
 ) -> tuple[Solution, Any, Any]:
     compiled = compile_mechanism(system, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, closure, choices)
     if choices.adjoint is not None or choices.meter is not None:
         raw = integrate_by_diffrax(run.problem, choices.adjoint, choices.meter)
     else:
-        raw = differentiable(run.problem)
+        raw = differentiable(run.problem, has_known_times)
     return _finish(run, raw, getattr(system, "body_names", ()), choices)
 
 
