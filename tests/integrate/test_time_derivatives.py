@@ -67,6 +67,14 @@ def test_members_share_what_is_differentiated():
         assert_allclose(transform(x), wanted, rtol=1e-6)
 
 
+def test_times_may_be_a_list_of_which_some_are_traced():
+    of_list, of_array = (jax.grad(lambda t, f=f: udk.simulate(ARMS["driven"], f(t)).q.sum())(0.5) for f in TIMES)
+    assert of_list == of_array != 0.0
+
+
+TIMES = lambda t: [0.0, t], lambda t: jnp.stack([0.0, t])
+
+
 def test_control_intervals_change_by_length_and_time():
     arm = ARMS["driven"]
 

@@ -28,7 +28,7 @@ CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the 
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
-def differentiable(problem: Problem, has_known_times: bool) -> IntegratorOutput:
+def differentiable(problem: Problem, has_known_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
     None are taken along numbers that do not depend on what is differentiated, nor along those of the step controller: steps are

@@ -120,6 +120,7 @@ def simulate(
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
     require_output_times("ts", ts)
+    ts = jnp.asarray(ts) if is_traced(ts) else ts  # of a list, too
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
         raise ArgumentError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
     if state is None and isinstance(mechanism, ConstrainedSystem):
