@@ -73,7 +73,7 @@ def _claims() -> Iterable[Claim]:
         for target in (1e-6, 1e-8, 1e-10):
             at: dict[str, Any] = {"start": start, "target": target}
             against = _reciprocal(value("times_ours", name="C++", **at))
-            yield Claim(f"20 s, {motion}, error {target:.0e}: time, in times C++", "trajectory", 0.6, against)
+            yield Claim(f"20 s, {motion}, error {target:.0e}: time, in times C++", "trajectory", 1.0, against)
             against = _least("times_ours", scripts, **at)
             yield Claim(f"20 s, {motion}, error {target:.0e}: a script's time, in times ours", "trajectory", 20.0, against, True)
     batch: dict[str, Any] = {"start": -45.0, "outputs": "end only"}
