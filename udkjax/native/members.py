@@ -80,25 +80,7 @@ def write_finish(module: Module):
     """Write what is left of the members whose lanes are marked in `due`: their first and last states, and how they ended."""
     f, s = module.function("finish_members", [(POINTER, "work"), (POINTER, "call")])
     times = module.field(f, "times")
-    # Why the step size fell to nothing: a number that is not finite, at the end or right ahead, or something else.
-    stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT)) & (s.code < float(CROSSED))
-    with f.if_(f.any_of(stopped)):
-        for share in (0.0, LOOK_AHEAD):
-            later = (s.end - s.start) * share
-            setattr(s, "state t", s.point3_t + later)
-            with f.each(module.rowcount) as r:
-                v = module.vector(f, "point3 v", r)
-                module.put(f, "state q", r, f.fma(module.broadcast(f, later), v, module.vector(f, "point3 q", r)))
-                module.put(f, "state v", r, v)
-            module.invoke(f, "equation_terms")
-            total = f.variable(0.0)
-            with f.each(module.code.term_count) as i:
-                total.value = f.fma(module.entry(f, "terms", i), 0.0, total.value)
-            if module.is_formulated:
-                module.accelerate(f, "result a")
-                with f.each(module.n) as i:
-                    total.value = f.fma(module.entry(f, "result a", i), 0.0, total.value)
-            s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
+    _find_cause(module, f, s)
     # The last state, once more to the manifold; and then the first, which is taken as it is.
     with f.each(module.rowcount) as r:
         for x in "qv":
@@ -129,6 +111,28 @@ def write_finish(module: Module):
         module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
         _clear_outputs(module, f, s, k)
     module.end_members(f, s)
+
+
+def _find_cause(module: Module, f: Function, s: Lane):
+    """Find out why steps fell to nothing: by a number that is not finite, at the end of the run or right ahead, or otherwise."""
+    stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT)) & (s.code < float(CROSSED))
+    with f.if_(f.any_of(stopped)):
+        for share in (0.0, LOOK_AHEAD):
+            later = (s.end - s.start) * share
+            setattr(s, "state t", s.point3_t + later)
+            with f.each(module.rowcount) as r:
+                v = module.vector(f, "point3 v", r)
+                module.put(f, "state q", r, f.fma(module.broadcast(f, later), v, module.vector(f, "point3 q", r)))
+                module.put(f, "state v", r, v)
+            module.invoke(f, "equation_terms")
+            total = f.variable(0.0)
+            with f.each(module.code.term_count) as i:
+                total.value = f.fma(module.entry(f, "terms", i), 0.0, total.value)
+            if module.is_formulated:
+                module.accelerate(f, "result a")
+                with f.each(module.n) as i:
+                    total.value = f.fma(module.entry(f, "result a", i), 0.0, total.value)
+            s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
 
 
 def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
