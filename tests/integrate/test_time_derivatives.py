@@ -33,7 +33,12 @@ def differences(f, x, h=1e-4):
 
 
 @pytest.mark.parametrize(
-    ("name", "transform"), [("driven", jax.jacfwd), *((name, jax.jacrev) for name in ("driven", "splined", "held"))]
+    ("name", "transform"),
+    [
+        ("driven", jax.jacfwd),
+        ("splined", jax.jacrev),
+        *(pytest.param(name, jax.jacrev, marks=pytest.mark.slow) for name in ("driven", "held")),
+    ],
 )
 def test_states_change_by_times_as_by_differences(name, transform):
     f = jax.jit(lambda x: states(ARMS[name], x))
