@@ -61,9 +61,9 @@ def integrate_by_diffrax(
     right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
-    found = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides)
-    q, v = (jnp.where(found.kept[:, None], y, jnp.nan) for y in (q, v))
-    return found._replace(q=q, v=v)
+    output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides)
+    q, v = (jnp.where(output.kept[:, None], y, jnp.nan) for y in (q, v))
+    return output._replace(q=q, v=v)
 
 
 def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:

@@ -17,7 +17,7 @@ from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
 REACH_STEPS = 32  # from the last good state to the time of the failure
-REACH_HALVINGS = 34  # of the step in which it fails: to 2e-12 of that time
+REACH_HALVINGS = 34  # of the step in which it fails: to 2e-12 of the way to that time
 # Of the largest singular value of D: those below belong to the dead point; the position is known to 1e-5 or so.
 DEAD_POINT_TOL = 1e-2
 INVOLVED_SHARE = 1e-3  # of the largest row of a combination: a row below has no part in it
