@@ -1,15 +1,9 @@
 """`udkjax statics`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 from udkjax.cli.common import Json, Scene, fail, refuse, show
 from udkjax.cli.datasets import load_to_write, write
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from udkjax import Mechanism
 
 
 def statics(
@@ -40,10 +34,11 @@ def statics(
 
     import udkjax as udk
     from udkjax.study.channels import LOADS
+    from udkjax.study.resting_forces import force_lines, resting_forces
 
     one = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
     found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)
-    forces = [forces_at(mech, e.q, t) for e in found]
+    forces = [resting_forces(mech, e.q, t) for e in found]
     results = {
         "bodies": mech.body_names,
         "equilibria": [
@@ -70,48 +65,7 @@ def statics(
                     values = [held.forces[pin][body][k] for held in forces]
                     variables[f"pin.{pin}.{body}.{part}"] = (("equilibrium",), values, unit)
         write(out, text, variables, {"body": list(mech.body_names)}, {"t": t, "starts": starts})
-    words = (f"{mech.name or 'mechanism'}, {e}\n{words_of(mech, held)}" for e, held in zip(found, forces, strict=True))
+    words = (f"{mech.name or 'mechanism'}, {e}\n{force_lines(mech, held)}" for e, held in zip(found, forces, strict=True))
     show(results, "\n".join(words), json)
     if not found:
         fail("no position of rest was found near the initial guess; try --stable, or --starts 64")
-
-
-class RestingForces(NamedTuple):
-    """Efforts of drivers (N, N m), and forces x and y (N) and a torque (N m) at pins on bodies, that hold a mechanism at rest."""
-
-    efforts: dict[str, float]
-    forces: dict[str, dict[str, list[float]]]
-    unique: dict[str, dict[str, bool]]  # whether equilibrium alone determines the force
-
-
-def forces_at(mech: "Mechanism", q: "ArrayLike", t: float) -> RestingForces:
-    """Return the forces in a position of rest, where drivers stand still as they are at time t (s)."""
-    import numpy as np
-
-    import udkjax as udk
-    from udkjax.study.drive import with_halted_drivers
-    from udkjax.study.reaction_peaks import RestingPositions, unique_pin_forces
-
-    still, q = with_halted_drivers(mech, t), np.asarray(q)
-    rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))
-    at_pins = udk.pin_reactions(still, rest)
-    forces = {pin: {body: np.asarray(load)[0].tolist() for body, load in on.items()} for pin, on in at_pins.items()}
-    efforts = {name: float(effort[0]) for name, effort in udk.efforts(still, rest).items()}
-    return RestingForces(efforts, forces, unique_pin_forces(still, rest))
-
-
-def words_of(mech: "Mechanism", held: RestingForces) -> str:
-    """Describe the forces: a line for each driver, and one for each pin and body."""
-    import numpy as np
-
-    from udkjax.printing import align_columns, format_number
-
-    loads = [load[:2] for on in held.forces.values() for load in on.values()]
-    scale = float(np.max(np.abs(loads), initial=0.0))
-    rows = [(f"{name} holds by", format_number(x, mech.drivers[name].effort_unit)) for name, x in held.efforts.items()]
-    for pin, on in held.forces.items():
-        for body, (fx, fy, _) in on.items():
-            components = ", ".join(format_number(x, scale=scale) for x in (fx, fy))
-            known = "" if held.unique[pin][body] else ", not unique: of least norm"
-            rows.append((f"at {pin} on {body}", f"{format_number(np.hypot(fx, fy), 'N', scale)}: ({components}) N{known}"))
-    return "\n".join(align_columns(rows)) if rows else "  no forces: nothing holds it"

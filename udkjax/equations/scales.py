@@ -1,6 +1,7 @@
 """The characteristic length, rate and mass of a mechanism, the units of every threshold.
 
-See analysis.py for what they mean. They are computed alike by NumPy, where all numbers are known, and by JAX in a trace.
+See analysis.py for what they mean. They are one program (scale_program.py), which NumPy runs where all numbers are known, machine
+code in a trace, and JAX on other devices.
 """
 
 from functools import lru_cache
