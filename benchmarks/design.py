@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import udkjax as udk
-from udkjax.study.design.design import DesignSearch
+from udkjax.synthesis.design import DesignSearch
 
 CASES = Path(__file__).parents[1] / "tests" / "data" / "path_synthesis.json"
 STARTS, SEEDS = 300, 100

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
+from udkjax.positions.channels import channel_of
 from udkjax.study.channel_values import measure
-from udkjax.study.channels import channel_of
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.unknowns import Unknowns, apply_values
 

@@ -14,7 +14,7 @@ import xarray
 from tests.command_line import udkjax
 from udkjax.cli.datasets import save
 from udkjax.cli.exits import exit_codes
-from udkjax.integrate.assembly import AssemblyWarning
+from udkjax.positions.assembly import AssemblyWarning
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

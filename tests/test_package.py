@@ -15,18 +15,28 @@ from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
-GROUND_FLOOR = {"annotations", "extras", "lazy_names", "printing"}  # every floor may import them
+GROUND_FLOOR = {"annotations", "extras", "lazy_names", "printing", "progress"}  # every floor may import them
+PROGRAMS = {"expressions", "programs"}
+EQUATIONS = PROGRAMS | {"pinv", "scene", "transforms", "equations"}
+POSITIONS = EQUATIONS | {"native", "positions"}
+STUDY = POSITIONS | {"integrate", "statics", "synthesis", "study"}
 BELOW = {
     **{module: set() for module in GROUND_FLOOR},
     "expressions": set(),
-    "pinv": {"expressions"},
-    "scene": {"expressions"},
-    "equations": {"scene", "pinv", "expressions"},
-    "native": {"equations", "scene", "pinv", "expressions"},
-    "integrate": {"native", "equations", "scene", "pinv", "expressions"},
-    "study": {"integrate", "equations", "scene", "pinv", "expressions"},
-    "show": {"native", "study", "integrate", "equations", "scene", "pinv", "expressions"},
-    "studio": {"show", "native", "study", "integrate", "equations", "scene", "pinv", "expressions"},
+    "programs": set(),
+    "pinv": PROGRAMS,
+    "scene": PROGRAMS,
+    "transforms": PROGRAMS | {"pinv", "scene"},
+    "equations": EQUATIONS,
+    "native": EQUATIONS,
+    "positions": POSITIONS,
+    # Side by side: what positions a mechanism has, and how it moves.
+    "statics": POSITIONS,
+    "synthesis": POSITIONS,
+    "integrate": POSITIONS,
+    "study": STUDY,
+    "show": STUDY,
+    "studio": STUDY | {"show"},
 }
 ONLY_IN = {
     "diffrax": {"integrate", "cli"},

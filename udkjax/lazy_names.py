@@ -5,13 +5,23 @@ import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package, from the imports of its stub, which editors read, too."""
+    """Return `__getattr__`, `__dir__` and `__all__` of a package, from the imports of its stub, which editors read, too.
+
+    A name of the stub stays what the stub says where a module of the package has the same name: `from udkjax.integrate import
+    simulate` is the function, whether or not `udkjax.integrate.simulate` is loaded already.
+    """
     stub = (pkgutil.get_data(package, "__init__.pyi") or b"").decode()
     homes = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)}
+
+    class Face(ModuleType):
+        def __setattr__(self, name: str, value: Any) -> None:
+            if not (isinstance(value, ModuleType) and value.__name__ == homes.get(name)):
+                super().__setattr__(name, value)
 
     def find(name: str) -> Any:
         if name not in homes:
@@ -24,4 +34,5 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
     def list_names() -> list[str]:
         return sorted([*homes, *({"__version__"} & vars(sys.modules[package]).keys())])
 
+    sys.modules[package].__class__ = Face
     return find, list_names, [*homes]

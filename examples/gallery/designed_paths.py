@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import udkjax as udk
-from udkjax.study.design.goal_file import read_design
+from udkjax.synthesis.goal_file import read_design
 
 GOALS = Path(__file__).parents[1] / "goals"
 NAMES = ("straight_line", "letter_d", "walking_foot")

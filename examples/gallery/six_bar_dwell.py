@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import udkjax as udk
-from udkjax.study.design.goal_file import read_design
+from udkjax.synthesis.goal_file import read_design
 
 GOAL = Path(__file__).parents[1] / "goals" / "dwell.toml"
 TURN = 1.0  # s, at 60 rpm

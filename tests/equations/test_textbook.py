@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.choices import fast
-from tests.programs import dense, evaluate_programs
+from tests.run_programs import dense, evaluate_programs
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.scene_programs import scene_programs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from udkjax.expressions.deferred import deferred
+from udkjax.programs.deferred import deferred
 
 
 @jax.custom_jvp

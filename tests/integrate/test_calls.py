@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.expressions.deferred import _trace, deferred_p
 from udkjax.native import primitive
+from udkjax.programs.deferred import _trace, deferred_p
 
 ROOT = Path(udk.__file__).parent
 TS = np.linspace(0.0, 0.2, 5)

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests import loops
 from tests.choices import fast
-from tests.programs import run
+from tests.run_programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse

@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.positions.channels import Quantity, channel_of, channels_of
 from udkjax.study.channel_values import measure
-from udkjax.study.channels import Quantity, channel_of, channels_of
 
 OMEGA, STEP = 4.0, 1e-3
 TIMES = 0.3 + STEP * np.arange(-6, 7)

@@ -12,7 +12,7 @@ def check(scene: Scene, /, json: Json = False) -> None:
         scene: the mechanism.
     """
     mech, _ = load(scene)
-    from udkjax.integrate.assembly import check as checked
+    from udkjax.positions.assembly import check as checked
     from udkjax.show.summary import check_summary
 
     found = checked(mech)

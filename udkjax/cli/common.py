@@ -11,7 +11,7 @@ A command is a function of its options that imports what it needs when it runs:
         '''
         mech, _ = load(scene)
         from udkjax.show.summary import table
-        from udkjax.study.modes import modes as compute
+        from udkjax.statics.modes import modes as compute
 
         found = compute(mech)
         show({"frequencies": found.frequencies}, table(mech.name, {...}), json)
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from udkjax import Mechanism
-    from udkjax.study.channels import Channel, StateHistory
+    from udkjax.positions.channels import Channel, StateHistory
 
     Columns = dict[str, tuple[np.ndarray, str]]  # values over time and their unit, by name
 
@@ -94,7 +94,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
         json: whether JSON was asked for.
     """
     if json:
-        from udkjax.study.report import plain
+        from udkjax.scene.wording import plain
 
         print(text, file=sys.stderr)
         print(json_text.dumps(plain(results), ensure_ascii=False, allow_nan=False), flush=True)
@@ -107,7 +107,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
 
 def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
     """Return the channels of these names, or say what is wrong with one and exit."""
-    from udkjax.study.channels import channel_of
+    from udkjax.positions.channels import channel_of
 
     found = []
     for name in names:
@@ -122,7 +122,7 @@ def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Seque
     """Return the values of channels over a motion."""
     import numpy as np
 
-    from udkjax.expressions.deferred import deferred
+    from udkjax.programs.deferred import deferred
     from udkjax.study.channel_values import measure
 
     if not channels:
@@ -136,7 +136,7 @@ def choose_driver(mech: "Mechanism", given: str | None) -> str:
     if given is None and len(mech.driver_names) > 1:
         refuse(f"--driver: the scene has {len(mech.driver_names)}; name one of {', '.join(mech.driver_names)}")
     if given is None and not mech.driver_names:
-        from udkjax.study.drive import suggested_coordinate
+        from udkjax.positions.drive import suggested_coordinate
 
         refuse(f"--driver: the scene has none; name a coordinate, such as {suggested_coordinate(mech)}")
     return next(iter(mech.drivers)) if given is None else given

@@ -39,8 +39,8 @@ def design(
     import numpy as np
 
     from udkjax.show.summary import table
-    from udkjax.study.design.goal_file import read_design
-    from udkjax.study.synthesis.complete_design import CompleteSearch
+    from udkjax.synthesis.complete.complete_design import CompleteSearch
+    from udkjax.synthesis.goal_file import read_design
 
     try:
         search = read_design(goal)

@@ -11,7 +11,7 @@ from udkjax.extras import OptionalImport
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from udkjax.study.kinematics import Travel
+    from udkjax.positions.kinematics import Travel
 
 with OptionalImport():
     import tyro
@@ -52,10 +52,10 @@ def kinematics(
     import numpy as np
 
     import udkjax as udk
+    from udkjax.positions.drive import constant_speed, value_of
+    from udkjax.positions.motion_ranges import range_lines
     from udkjax.printing import format_number
     from udkjax.show.summary import table
-    from udkjax.study.drive import constant_speed, value_of
-    from udkjax.study.motion_ranges import range_lines
 
     travel = udk.travel(mech, driver)
     rate = (constant_speed(mech, driver) or 1.0) if rate is None else rate

@@ -32,9 +32,9 @@ def reactions(
     import numpy as np
 
     import udkjax as udk
+    from udkjax.positions.channels import LOADS
     from udkjax.printing import PrintedTable, format_number, text_table
-    from udkjax.study.channels import LOADS
-    from udkjax.study.reaction_peaks import cam_forces, unique_pin_forces
+    from udkjax.statics.reaction_peaks import cam_forces, unique_pin_forces
 
     sol = udk.simulate(mech, ts, throw=False)
     found = {pin: {body: np.asarray(x) for body, x in at.items()} for pin, at in udk.pin_reactions(mech, sol).items()}

@@ -58,7 +58,7 @@ def report(
     if not -180 < start < 0 or start == -90:
         refuse(f"--start {start:g}: between -180 and 0 degrees the links swing without becoming collinear; at -90 they hang")
 
-    from udkjax.study.progress import report_progress
+    from udkjax.progress import report_progress
 
     cases, page, record, study = (_module(name) for name in ("cases", "page", "record", "study"))
     if from_file:

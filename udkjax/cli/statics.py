@@ -33,8 +33,8 @@ def statics(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.study.channels import LOADS
-    from udkjax.study.resting_forces import force_lines, resting_forces
+    from udkjax.positions.channels import LOADS
+    from udkjax.statics.resting_forces import force_lines, resting_forces
 
     one = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
     found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)

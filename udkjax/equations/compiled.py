@@ -11,7 +11,7 @@ from typing import ParamSpec, TypeVar
 import jax.numpy as jnp
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.expressions.deferred import deferred
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from udkjax.equations.structure import ArrayLibrary
-from udkjax.expressions.deferred import deferred
+from udkjax.programs.deferred import deferred
 from udkjax.scene.fields import is_traced, is_within_jit
 
 State = TypeVar("State")

@@ -14,9 +14,9 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 

@@ -17,11 +17,11 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, known_numbers_joined, numbers_as_vector
-from udkjax.expressions.deferred import deferred
 from udkjax.expressions.loop_program import ArrayLoops
-from udkjax.expressions.numpy_program import evaluate_as
-from udkjax.expressions.varying_axes import result_type
 from udkjax.printing import prints_table, units
+from udkjax.programs.deferred import deferred
+from udkjax.programs.numpy_program import evaluate_as
+from udkjax.programs.varying_axes import result_type
 from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
 

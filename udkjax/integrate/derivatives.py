@@ -17,12 +17,12 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.integrate import native_engine
-from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.linear_map import DifferentiableFunction, Linear, change_along
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.integrate.split_jvp import split_jvp
 from udkjax.integrate.time_derivatives import run_of_times
-from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
+from udkjax.transforms.gradients import stop_gradients
+from udkjax.transforms.linear_map import DifferentiableFunction, Linear, change_along
+from udkjax.transforms.split_jvp import split_jvp
+from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
 
 CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the step controller
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives

@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.constrained import Constrained
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -19,6 +18,7 @@ from udkjax.integrate.projection import project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
 from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, evaluations
 from udkjax.native.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.transforms.gradients import stop_gradients
 
 
 def integrate_by_diffrax(

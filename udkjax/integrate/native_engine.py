@@ -15,11 +15,11 @@ from udkjax.equations.formulations import FormulatedSystem
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
-from udkjax.integrate.packing import active_numbers, cotangent_tree, number_tangents
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.formulations import formulation_tol
 from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
 from udkjax.native.operations import MarkRows
+from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
 from udkjax.native.primitive import call_known, native_p
 from udkjax.native.record import PER_BREAKPOINT, STORED
 from udkjax.native.runs import RunStates

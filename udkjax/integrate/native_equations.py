@@ -22,7 +22,6 @@ from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_known, evaluation_of
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.layout import INPUTS
@@ -30,6 +29,7 @@ from udkjax.native.operations import Accelerate, FindTangentPart, ProjectStates,
 from udkjax.native.primitive import machine_code, native_p
 from udkjax.pinv import SVD, OneOf, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
 
 
 class NativeEquations(WrappedSystem):

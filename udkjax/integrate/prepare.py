@@ -11,9 +11,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.assembly import Closure, State, close, moves_from_guess
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.outcome import increases, usable
 from udkjax.integrate.problem import Problem
@@ -21,10 +19,12 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit
 from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
+from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.scene.checks import traced_numbers_hold
 from udkjax.scene.fields import number
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
 
 if TYPE_CHECKING:
     import diffrax

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
-from udkjax.integrate.gradients import stop_gradients
+from udkjax.transforms.gradients import stop_gradients
 
 
 @jax.tree_util.register_dataclass

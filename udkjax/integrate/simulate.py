@@ -17,12 +17,9 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import AssemblyWarning, Closure, State, require_closed
 from udkjax.integrate.causes.find import explained
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.native_engine import integrate_known
 from udkjax.integrate.outcome import FinishedRun, counts, outcome
 from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, begin, begin_known, prepare_run
@@ -31,10 +28,13 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
 from udkjax.native.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
+from udkjax.positions.assembly import AssemblyWarning, Closure, State, require_closed
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import is_traced, is_within_jit, make_module, number, put_arrays
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
+from udkjax.transforms.gradients import stop_gradients
 
 if TYPE_CHECKING:
     import diffrax

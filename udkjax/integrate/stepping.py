@@ -13,18 +13,18 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers, Scalar
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate import simulate
+from udkjax.positions.assembly import State
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import is_within_jit, make_module, number
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
 
 STORED_POINTS = 6  # accepted steps of one interval that reverse mode has stored; of more than that it runs again
 MOST_STEPS_OF_INTERVAL = 1_000  # within one interval

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.expressions.varying_axes import zero_of
-from udkjax.integrate.gradients import stop_gradients
-from udkjax.integrate.linear_map import DifferentiableFunction, Linear
 from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.integrate.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
+from udkjax.programs.varying_axes import zero_of
+from udkjax.transforms.gradients import stop_gradients
+from udkjax.transforms.linear_map import DifferentiableFunction, Linear
+from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
 
 
 def run_of_times(run: Callable[[Problem], IntegratorOutput], problem: Problem) -> IntegratorOutput:

@@ -19,9 +19,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.expressions.numpy_program import evaluate_as
-from udkjax.expressions.varying_axes import result_type
 from udkjax.native.ffi import API, ARGUMENTS, BUFFERS, DATA, DIMS, EXTENSIONS, MAJOR, METADATA, MINOR, RANK, RESULTS, VERSION
+from udkjax.programs.numpy_program import evaluate_as
+from udkjax.programs.varying_axes import result_type
 
 CREATE_ERROR = 48  # offset in XLA_FFI_Api: a function of a text and a code
 INTERNAL = 13  # the code of errors of programs

@@ -1,7 +1,7 @@
 """The operations of machine code: a class for each, with its module and the shapes of its inputs and outputs.
 
 An operation is all that its code depends on but the number of lanes. Inputs and outputs have the members first; an input that
-all members share has only one. Those that integrate are in runs.py.
+all members share has only one. Those that integrate are in runs.py, those that find positions in position_operations.py.
 """
 
 from abc import ABC, abstractmethod
@@ -18,13 +18,10 @@ from jaxtyping import ArrayLike
 
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.native.closing import Closing
-from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
 from udkjax.native.conditions import Conditions
 from udkjax.native.event_states import EventStates
 from udkjax.native.formulations import FormulationCode
 from udkjax.native.layout import FORMULATION_SETTINGS, OUTPUTS, SETTINGS, SHARE
-from udkjax.native.marching import Marching
 from udkjax.native.memory import Memory
 from udkjax.native.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -112,64 +109,6 @@ class Operation(ABC):
 
 
 @dataclass(frozen=True)
-class Close(Operation):
-    """Close a mechanism: its state, what is left of Psi and Psi_dot, and the rank of Psi_q."""
-
-    settings: ClassVar[tuple[str, ...]] = Closing.settings
-    in_lanes: ClassVar[bool] = False
-    results: ClassVar[int] = len(Closing.results)
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return Closing(self.code, vector)
-
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
-        return [(2 * self.code.coordinate_count,), (2 * self.code.row_count,), (1,)]
-
-
-@dataclass(frozen=True)
-class CloseTangents(Close):
-    """Close, with the changes of the state along directions."""
-
-    active: tuple[bool, ...] = ()
-
-    @property
-    def tangents(self) -> int:
-        return 3
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return ClosingForward(self.code, vector, self.active)
-
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
-        return [*super().outputs(inputs, times), (inputs[-1].shape[1], 2 * self.code.coordinate_count)]
-
-
-@dataclass(frozen=True)
-class CloseSecondTangents(CloseTangents):
-    """Close, with the second derivatives of the state along pairs of directions."""
-
-    @property
-    def tangents(self) -> int:
-        return 6
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return ClosingTwice(self.code, vector, self.active)
-
-
-@dataclass(frozen=True)
-class CloseCotangents(Close):
-    """Close, and walk back from cotangents of the state to those of all numbers and of the guess."""
-
-    active: tuple[bool, ...] = ()
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return ClosingReverse(self.code, vector, self.active)
-
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
-        n = self.code.coordinate_count
-        return [*super().outputs(inputs, times), (self.code.number_count,), (n,), (n,)]
-
-
-@dataclass(frozen=True)
 class StateOperation(Operation):
     """A function of single states."""
 
@@ -254,16 +193,3 @@ class FindScales(Operation):
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
         return [(self.code.scale_count,)]
-
-
-@dataclass(frozen=True)
-class March(Operation):
-    """Follow the positions of a driven mechanism over values: q, q', q'', their sides, and how many are to be relied on."""
-
-    settings: ClassVar[tuple[str, ...]] = Marching.settings
-
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return Marching(self.code, width, vector)
-
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
-        return [*[(times, self.code.coordinate_count)] * 3, (times,), (1,)]

@@ -20,8 +20,6 @@ from jaxtyping import Array
 
 from udkjax.equations.scales import evaluate_scales, scales_by_jax, scales_p
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.expressions.numpy_program import evaluate_as
-from udkjax.expressions.varying_axes import result_type
 from udkjax.native import machine
 from udkjax.native.ffi import handler
 from udkjax.native.layout import INFO, INPUTS, OUTPUTS
@@ -30,6 +28,8 @@ from udkjax.native.memory import Memory
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.program import UnsupportedError
 from udkjax.native.steps import STEP_LIMIT
+from udkjax.programs.numpy_program import evaluate_as
+from udkjax.programs.varying_axes import result_type
 
 QUICK_MEMBERS = 16  # of a call by code that is compiled quickly
 QUICK_STEPS = 4_000  # of all its members: some 20 ms

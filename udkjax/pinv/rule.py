@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import Numbers, Scalar
-from udkjax.expressions.varying_axes import result_type
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
+from udkjax.programs.varying_axes import result_type
 
 # Accelerators round float32 products to ten bits by default.
 dot = partial(jnp.matmul, precision="highest")

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from udkjax.extras import OptionalImport
+from udkjax.positions.kinematics import Kinematics
 from udkjax.scene import Mechanism
 from udkjax.show.plots import draw_angles, draw_motion, draw_reactions
 from udkjax.show.style import COLOURS, DASHES, legend, plain
-from udkjax.study.kinematics import Kinematics
 
 with OptionalImport():
     from matplotlib.axes import Axes

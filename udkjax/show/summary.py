@@ -7,16 +7,16 @@ from jaxtyping import ArrayLike
 
 from udkjax.equations import efforts
 from udkjax.integrate import Solution
-from udkjax.integrate.assembly import Check, check_lines, numbered
 from udkjax.integrate.solution import format_work
+from udkjax.positions.assembly import Check, check_lines, numbered
 from udkjax.printing import align_columns, format_number
 from udkjax.scene import Mechanism
+from udkjax.scene.wording import plural, row_label
 from udkjax.study.accuracy import Accuracy
-from udkjax.study.report import plural, row_label
 
 
 def check_summary(mech: Mechanism, found: Check) -> str:
-    """Describe the findings of `udkjax.integrate.assembly.check` in a mechanism."""
+    """Describe the findings of `udkjax.positions.assembly.check` in a mechanism."""
     lines = check_lines(found)
     lines["constraint rows"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant rows"] = ", ".join(row_label(mech, *row) for row in found.redundant) or "none"

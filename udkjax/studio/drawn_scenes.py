@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.integrate.assembly import assemble
+from udkjax.positions.assembly import assemble
 from udkjax.scene import (
     GROUND,
     Body,

@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 
 from udkjax.integrate import SimulationError
-from udkjax.integrate.assembly import AssemblyError
+from udkjax.positions.assembly import AssemblyError
+from udkjax.positions.continuation import Reached
+from udkjax.positions.kinematics import travel
 from udkjax.scene import GROUND, Mechanism, SceneError
 from udkjax.scene.joints import Revolute, Slot
+from udkjax.scene.wording import plural
+from udkjax.statics.equilibrium import equilibrium
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import force_curves, holding_curves
-from udkjax.study.continuation import Reached
 from udkjax.study.diagnosis import Diagnosis, diagnose
 from udkjax.study.diagnosis.fixes import Fix
-from udkjax.study.equilibrium import equilibrium
-from udkjax.study.kinematics import travel
-from udkjax.study.report import plural
 
 Json = dict[str, Any]
 MOST_FIXES = 8  # fixes listed for one redundancy

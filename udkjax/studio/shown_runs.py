@@ -7,12 +7,12 @@ import numpy as np
 
 from udkjax.equations import analyse, efforts
 from udkjax.integrate import Solution, simulate
-from udkjax.integrate.assembly import close
+from udkjax.positions.assembly import close
+from udkjax.positions.channels import StateHistory
+from udkjax.positions.drive import constant_speed, with_halted_drivers
 from udkjax.scene import Driver, Mechanism, SceneError
 from udkjax.show.player.measure_curves import measures_of
-from udkjax.study.channels import StateHistory
-from udkjax.study.drive import constant_speed, with_halted_drivers
-from udkjax.study.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
+from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 
 Json = dict[str, Any]
 TURNS = 2  # of the slowest motor that a run shows

@@ -14,14 +14,14 @@ from jaxtyping import Array, Bool, Float
 from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.textbook import prepare
-from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD
+from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, Quantity, StateHistory, locate, point_of_pin
+from udkjax.positions.channels import Point as Place
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import LOADS, POINT_UNITS, Channel, Quantity, StateHistory, locate, point_of_pin
-from udkjax.study.channels import Point as Place
 
 
 def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Channel | Quantity]) -> Float[Array, "T C"]:

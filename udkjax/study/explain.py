@@ -13,9 +13,9 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import left_null_space, uniqueness
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import State, assemble
 from udkjax.pinv import SVD
+from udkjax.positions.assembly import State, assemble
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism

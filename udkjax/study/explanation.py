@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from udkjax.equations.determinacy import unique_direction
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.report import plain, plural, row_label
+from udkjax.scene.wording import plain, plural, row_label
 
 MOST_MATRIX_COLUMNS = 18  # columns of a matrix that fit beside each other
 SMALLEST_PRINTED = 1e-12  # relative to the largest of an array: printed as 0

@@ -27,18 +27,18 @@ from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.load_scale import load_sizes
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD
+from udkjax.positions.channels import StateHistory
+from udkjax.positions.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
+from udkjax.positions.kinematics import Kinematics, kinematics
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import CALLED, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import StateHistory
-from udkjax.study.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
-from udkjax.study.kinematics import Kinematics, kinematics
 
 
 class InverseDynamics(PrintsTable):

@@ -21,14 +21,14 @@ from udkjax.equations.constraints import bodies
 from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.expressions.deferred import deferred
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.positions.channels import StateHistory
 from udkjax.printing import PrintedTable, format_number, prints_table, units
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import StateHistory
 
 
 @prints_table

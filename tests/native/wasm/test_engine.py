@@ -8,10 +8,11 @@ import udkjax as udk
 from tests.choices import fast
 from tests.wasm_host import Host, run_without_contraction
 from udkjax.equations import analyse
-from udkjax.integrate import march, native_closing, native_engine
+from udkjax.integrate import native_engine
 from udkjax.integrate.events import phase_code
-from udkjax.native import operations, primitive, runs
+from udkjax.native import position_operations, primitive, runs
 from udkjax.native.wasm import wasm_module
+from udkjax.positions import march, native_closing
 
 TIMES = np.linspace(0.0, 2.0, 41)
 SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds
@@ -110,7 +111,7 @@ def test_marching(monkeypatch):
     operation, inputs, times = known_call(
         monkeypatch, march, lambda: udk.kinematics(mechanism, "motor", np.linspace(0.0, 1.0, 21))
     )
-    assert isinstance(operation, operations.March)
+    assert isinstance(operation, position_operations.March)
     wasm, native = both(operation, inputs, times)
     for x, y in zip(wasm, native, strict=True):
         assert_array_equal(x, y)

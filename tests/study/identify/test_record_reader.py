@@ -9,8 +9,8 @@ import xarray
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.positions.channels import Quantity
 from udkjax.scene.units import conversion_factor
-from udkjax.study.channels import Quantity
 from udkjax.study.identify.record_reader import records_of
 from udkjax.study.identify.records import IdentificationError, Record, Start
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from udkjax.integrate import Result
-from udkjax.study.progress import report_progress
+from udkjax.progress import report_progress
 from udkjax.study.sweep.plan import Chunk
 from udkjax.study.sweep.sweep import SweepProgress, Watch, duration
 

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from udkjax.equations.constraints import vector
 from udkjax.equations.structure import evaluate_by_kind
-from udkjax.expressions.deferred import deferred
+from udkjax.programs.deferred import deferred
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism

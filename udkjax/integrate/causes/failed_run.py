@@ -8,8 +8,8 @@ import numpy as np
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.redundancy import PositionRows, dense, kinematic_rows
-from udkjax.integrate.causes.open_rows import name_open_rows
 from udkjax.integrate.solution import Result
+from udkjax.positions.open_rows import name_open_rows
 from udkjax.scene.mechanism import Mechanism
 
 

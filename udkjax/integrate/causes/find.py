@@ -9,10 +9,10 @@ import numpy as np
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.causes.element_loads import ElementLoads, element_loads
 from udkjax.integrate.causes.failed_run import FailedRun
-from udkjax.integrate.causes.open_rows import MOST_NAMED, explain_open, name_not_finite
 from udkjax.integrate.causes.reach import explain_reach
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import is_explicit
+from udkjax.positions.open_rows import MOST_NAMED, explain_open, name_not_finite
 from udkjax.scene.mechanism import Mechanism
 
 BESIDE = 1e-9  # of the span: between two instants so close only what jumps changes much

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udkjax.integrate.gradients import stop_gradients
+from udkjax.transforms.gradients import stop_gradients
 
 # Of the largest |b|, rows of unit size: a y above minus that is not negative. Rounding errors are some 1e-15 of it, more where
 # rows nearly depend on one another.

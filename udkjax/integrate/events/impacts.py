@@ -41,7 +41,7 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.events.complementarity import diagonal, solve_complementarity, times
 from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
-from udkjax.integrate.gradients import stop_gradients
+from udkjax.transforms.gradients import stop_gradients
 
 # (u . u) / (n M^(-1) n): the square of the sine between a contact's row and those of the constraints, in the metric of M. At a
 # sine of 1e-8, half of the digits, u is what rounding leaves of the difference of two rows, and no impulse follows from it.

@@ -13,7 +13,7 @@ from udkjax.integrate.events.crossings import ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions
 from udkjax.integrate.events.runs import Members, RunState, take
 from udkjax.integrate.events.system import StateValues, System
-from udkjax.integrate.gradients import stop_gradients
+from udkjax.transforms.gradients import stop_gradients
 
 
 class JumpResult(NamedTuple):

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.equations.scales import mass_of
-from udkjax.expressions.numpy_program import Meter, numpy_program
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.actions import Impact
 from udkjax.integrate.events.added_joints import added_joints, joint_numbers
@@ -27,11 +26,12 @@ from udkjax.integrate.events.phase_code import PhaseCode, phase_arrays, phase_pl
 from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.events.plain_system import run_plain
 from udkjax.integrate.events.runs import EventRun, RunState, results, runs_before, shapes_of_run
-from udkjax.integrate.gradients import TreeDef, stop_gradients
 from udkjax.integrate.problem import Problem
 from udkjax.native.conditions import Conditions
 from udkjax.native.host_function import call_host
+from udkjax.programs.numpy_program import Meter, numpy_program
 from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.transforms.gradients import TreeDef, stop_gradients
 
 SHARED, NUMBERS = 9, 5  # arrays of a run besides those of its phases, and which are the numbers of conditions
 

@@ -15,8 +15,8 @@ from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
 from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberRuns, Members, RunState, take
 from udkjax.integrate.events.system import StateValues, System
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.solution import Result
+from udkjax.transforms.gradients import stop_gradients
 
 CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
 

@@ -16,10 +16,10 @@ from udkjax.integrate.events.known_run import run_by_machine_code
 from udkjax.integrate.events.loop import condition_values
 from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_member, without_member
 from udkjax.integrate.events.runs import EventRun, RunState
-from udkjax.integrate.gradients import TreeDef, stop_gradients
 from udkjax.integrate.solution import Result
-from udkjax.integrate.traced_numbers import replaced, select
 from udkjax.native.conditions import Conditions
+from udkjax.transforms.gradients import TreeDef, stop_gradients
+from udkjax.transforms.traced_numbers import replaced, select
 
 OUTPUTS = 32  # of one piece
 

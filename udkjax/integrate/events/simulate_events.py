@@ -14,8 +14,6 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import Closure, State
 from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
 from udkjax.integrate.events.condition_program import watched_conditions, with_known_functions
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
@@ -25,15 +23,17 @@ from udkjax.integrate.events.known_run import KnownRun, event_arrays, known_plan
 from udkjax.integrate.events.phases import Phases, phases_of
 from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.events.runs import EventRun
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
 from udkjax.native.conditions import Conditions
+from udkjax.positions.assembly import Closure, State
+from udkjax.programs.deferred import deferred
 from udkjax.scene.checks import quote
 from udkjax.scene.fields import is_traced, is_within_jit, number, put_arrays
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
 
 UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
 

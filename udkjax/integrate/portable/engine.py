@@ -12,7 +12,6 @@ import numpy as np
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import compile_known
 from udkjax.integrate.events.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
@@ -24,10 +23,12 @@ from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.native.evaluation import Evaluation
 from udkjax.native.layout import INFO, INPUTS
-from udkjax.native.operations import Close, MarkRows, Operation
+from udkjax.native.operations import MarkRows, Operation
+from udkjax.native.position_operations import Close
 from udkjax.native.steps import SMALLEST_STEP
 from udkjax.native.wasm import compile_wasm, wasm_module
 from udkjax.native.wasm.object_code import LinkedModule
+from udkjax.positions.assembly import State
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism

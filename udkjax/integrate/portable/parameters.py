@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
-from udkjax.integrate.packing import SampleRows
 from udkjax.native.ir import Function
+from udkjax.native.packing import SampleRows
 from udkjax.native.program import consecutive, write
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_in, split_index

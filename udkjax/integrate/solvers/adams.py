@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.solvers.divided_differences import HIGHEST, DifferenceInterpolation, StepCoefficients, step_coefficients
 from udkjax.integrate.solvers.multistep import (
     LOST_STEP,
@@ -31,6 +30,7 @@ from udkjax.integrate.solvers.multistep import (
     tolerances_from_controller,
     vector_field,
 )
+from udkjax.transforms.gradients import stop_gradients
 
 # Of the iteration, as in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names are behind them.
 ITERATIONS = 3  # MAXCOR

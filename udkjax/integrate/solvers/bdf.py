@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from udkjax.integrate.gradients import stop_gradients
 from udkjax.integrate.solvers import newton
 from udkjax.integrate.solvers.multistep import (
     LOST_STEP,
@@ -27,6 +26,7 @@ from udkjax.integrate.solvers.multistep import (
     tolerances_from_controller,
     vector_field,
 )
+from udkjax.transforms.gradients import stop_gradients
 
 Vector = Float[Array, "n"]
 Terms = PyTree[diffrax.AbstractTerm]

@@ -6,8 +6,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from udkjax.expressions.deferred import deferred_if_traced
 from udkjax.printing import PrintedTable
+from udkjax.programs.deferred import deferred_if_traced
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.description import drawing_table

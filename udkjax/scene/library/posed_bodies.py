@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from udkjax.expressions.deferred import deferred_if_traced
+from udkjax.programs.deferred import deferred_if_traced
 from udkjax.scene.arguments import bind_arguments
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import array_namespace, number

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from udkjax.equations import analyse
-from udkjax.integrate.assembly import close
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.program import UnsupportedError
+from udkjax.positions.assembly import close
 from udkjax.scene import Mechanism
 from udkjax.scene.requirements import ArgumentError
 from udkjax.show.player.followers import followers

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from udkjax.equations import Analysis, analyse, efforts, energy, reactions, singular_values, unique_reactions, violation
 from udkjax.equations.determinacy import STATIC_RANK_TOL
-from udkjax.expressions.deferred import deferred
+from udkjax.programs.deferred import deferred
 from udkjax.scene import GROUND, Mechanism
 from udkjax.study.accuracy import conserves_energy
 

@@ -30,13 +30,13 @@ from numpy.typing import ArrayLike
 from udkjax.equations import analyse
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
+from udkjax.positions.channels import locate
 from udkjax.scene import Mechanism
 from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import Json, floats, pack, unpack
 from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
 from udkjax.show.player.symbols import symbols_of
-from udkjax.study.channels import locate
 
 Record = Json
 Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.study.row_spaces import null_space
+from udkjax.pinv.row_spaces import null_space
 
 DEPENDS = 1e-6  # the length of rows of N, whose columns are orthonormal: rounding leaves far less
 

@@ -4,11 +4,11 @@ import numpy as np
 
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_direction
 from udkjax.equations.redundancy import choose_dispensable
-from udkjax.integrate.assembly import State, close, require_closed
+from udkjax.positions.assembly import State, close, require_closed
+from udkjax.positions.channels import StateHistory
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import StateHistory
 from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions, count_rank, singular_values
 from udkjax.study.diagnosis.dependence import Dependency, dependencies

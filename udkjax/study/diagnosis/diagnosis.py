@@ -6,12 +6,12 @@ import numpy as np
 
 from udkjax.printing import PrintedTable, html_table
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.wording import plain, plural, row_label
 from udkjax.study.diagnosis.clearance import Clearance, RankChange
 from udkjax.study.diagnosis.configuration import JointForces
 from udkjax.study.diagnosis.fixes import Fix, Redundancy
 from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
-from udkjax.study.report import plain, plural, row_label
 
 LABEL_WIDTH = 14  # characters of a section's title
 MOST_FIXES_SHOWN = 8  # fixes of one set that are printed

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import constraints
-from udkjax.expressions.deferred import deferred
+from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 

@@ -17,12 +17,13 @@ from scipy.interpolate import BPoly
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.determinacy import singular_values
 from udkjax.equations.quantities import equations_of
-from udkjax.expressions.deferred import deferred
-from udkjax.integrate import State, simulate
+from udkjax.integrate import simulate
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD
+from udkjax.positions.assembly import State
+from udkjax.positions.channels import StateHistory
+from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import StateHistory
 
 SAMPLES_PER_OUTPUT = 4  # samples from one output to the next, to look for minima
 PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated anew

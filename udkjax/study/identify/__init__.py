@@ -11,7 +11,7 @@ gradient_check                                     whether derivatives are right
 identification, estimate, experiment_design        what users call, and what they get
 """
 
-from udkjax.study.channels import Quantity as Quantity
+from udkjax.positions.channels import Quantity as Quantity
 from udkjax.study.identify.estimate import Estimate as Estimate
 from udkjax.study.identify.experiment_design import Candidate as Candidate
 from udkjax.study.identify.experiment_design import Design as Design

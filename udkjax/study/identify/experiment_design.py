@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from udkjax.integrate.assembly import State
+from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, prints_table
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import suggestion

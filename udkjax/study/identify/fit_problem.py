@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.equations.analysis import analyse
-from udkjax.integrate.assembly import AssemblyError, State, assemble
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
+from udkjax.positions.assembly import AssemblyError, State, assemble
+from udkjax.positions.channels import Quantity, channel_of
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channels import Quantity, channel_of
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
 from udkjax.study.identify.parameters import ParametersLike, unknowns_of
 from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, Tolerances

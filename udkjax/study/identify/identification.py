@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.integrate.solution import CAUSES, Result
+from udkjax.progress import ProgressOption, report_progress
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
@@ -23,7 +24,6 @@ from udkjax.study.identify.records import Estimated, IdentificationError, Noise,
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.noise import Whiteness, whiteness_of
-from udkjax.study.progress import ProgressOption, report_progress
 
 MOST_REWEIGHTINGS = 2  # fits, each with the noise that the one before left
 SAME_WEIGHT_RATIO = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error

@@ -21,15 +21,15 @@ from jaxtyping import Array
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
 from udkjax.equations.scales import known_scales
-from udkjax.expressions.deferred import deferred
-from udkjax.integrate.assembly import close, require_closed
+from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
+from udkjax.positions.assembly import close, require_closed
+from udkjax.programs.deferred import deferred
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.wording import join_names, ratio
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesses
-from udkjax.study.report import join_names, ratio
-from udkjax.study.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 
 # Of what a parameter does to Psi at all, the part along N that counts as none. Where there is none, differences and positions
 # that are closed to 1e-11 leave 5e-12 of it; a parameter that opens a loop leaves a tenth or more.

@@ -12,12 +12,12 @@ from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import owner_of, parameters_of, split_index
+from udkjax.scene.quantities import Length, Setter, parameter_value
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
 from udkjax.scene.units import units_of
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
-from udkjax.study.quantities import Length, Setter, parameter_value
 
 
 def length(*bodies: str, as_rod: bool = False) -> Length:

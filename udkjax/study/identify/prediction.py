@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from udkjax.integrate.assembly import State, close
 from udkjax.integrate.simulate import simulate
+from udkjax.positions.assembly import State, close
+from udkjax.positions.channels import Channel, Quantity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
-from udkjax.study.channels import Channel, Quantity
 from udkjax.study.identify.unknowns import Target, apply_values
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Program
 

@@ -8,10 +8,10 @@ from typing import TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from udkjax.positions.channels import Channel, Quantity, channel_of
 from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import conversion_factor
-from udkjax.study.channels import Channel, Quantity, channel_of
 from udkjax.study.identify.records import ByChannel, IdentificationError, Key, Noise, Record, key_of
 from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
 

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
 
 from udkjax.extras import OptionalImport
-from udkjax.integrate.assembly import State
+from udkjax.positions.assembly import State
+from udkjax.positions.channels import Channel, Quantity
 from udkjax.scene.checks import Mistakes, quote
 from udkjax.scene.requirements import describe
-from udkjax.study.channels import Channel, Quantity
 
 if TYPE_CHECKING:
     import xarray
@@ -67,7 +67,7 @@ class Record:
     Args:
         times: increasing (T,), s.
         values: arrays (T,) by channel, not a number where nothing was measured. Channels are named as in
-            `udkjax.study.channels` ("body.crank.angle"), or `Quantity`s of the user's own.
+            `udkjax.positions.channels` ("body.crank.angle"), or `Quantity`s of the user's own.
         noise: standard deviation of all channels, or of each by channel, a number or (T,). Where it is not given, it is estimated
             from the residuals of the fit.
         initial_state: the `State` or `Start` at t0; by default the scene's own.

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.integrate.assembly import State
+from udkjax.positions.assembly import State
 from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
 from udkjax.study.identify.least_squares import (
     COARSE_STEP,

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from udkjax.extras import OptionalImport
+from udkjax.positions.channels import RATES
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import abbreviate, quote, suggestion
-from udkjax.study.channels import RATES
 from udkjax.study.identify.records import ByChannel
 
 if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
+from udkjax.pinv.row_spaces import echelon, null_space
+from udkjax.scene.wording import join_names
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
-from udkjax.study.report import join_names
-from udkjax.study.row_spaces import echelon, null_space
 
 POOR_ERROR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
 HIGH_CORRELATION = 0.98  # of two parameters: their difference is known ten times worse than their sum

@@ -16,14 +16,14 @@ from scipy.special import expit, logit
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.scales import known_scales
-from udkjax.integrate.assembly import State, assemble
+from udkjax.positions.assembly import State, assemble
+from udkjax.positions.channels import RATES, UNITS
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError, quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.study.channels import RATES, UNITS
+from udkjax.scene.quantities import Setter, parameter_value
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
-from udkjax.study.quantities import Setter, parameter_value
 
 Transform = Literal["positive", "bounded", "free"]
 BOUND_DISTANCE = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it

@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from udkjax.annotations import Numbers
-from udkjax.integrate.assembly import State
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.pinv import Auto, Dense, Elimination, OneOf
+from udkjax.positions.assembly import State
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.quantities import Setter
 from udkjax.study.choices import Choice
-from udkjax.study.quantities import Setter
 
 # The settings of a run that are choices; what each is where none is given, or given as None.
 CHOICES = {

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.assembly import State
 from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
+from udkjax.positions.assembly import State
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism

@@ -12,8 +12,8 @@ from scipy import stats
 from udkjax.extras import OptionalImport
 from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion, unknown_key
 from udkjax.scene.mechanism_tables import parse_toml
+from udkjax.scene.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.choices import CHOICES, Choice, choice
-from udkjax.study.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped
 
 Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"

@@ -16,10 +16,10 @@ from udkjax.equations.quantities import energy, violation
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
+from udkjax.positions.channels import Channel, channel_of
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
-from udkjax.study.channels import Channel, channel_of
 from udkjax.study.sweep.dimensions import SweepError
 
 UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, Scalar]])

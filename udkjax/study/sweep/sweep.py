@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from udkjax.extras import require
 from udkjax.integrate.solution import Result
+from udkjax.progress import Progress, ProgressOption, report_progress
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.progress import Progress, ProgressOption, report_progress
 from udkjax.study.sweep.axes import AxisValues, SweepDesign
 from udkjax.study.sweep.chunks import MEMORY, compute_members
 from udkjax.study.sweep.dataset import assemble

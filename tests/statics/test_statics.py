@@ -1,0 +1,233 @@
+"""Equilibria and vibration, against closed forms and a reduction to one coordinate."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.choices import fast
+from udkjax.positions.curve import KnownCurve
+
+LENGTHS, GROUND = (1.0, 2.5, 2.0), 2.5
+STIFFNESS, FREE_LENGTH = 60.0, 1.2
+
+
+def test_the_papers_linkage_hanging():
+    mech = udk.library.parallelogram(-1.3)
+    rest = udk.equilibrium(mech)
+    assert bool(rest.stable)
+    np.testing.assert_allclose(rest.q[:3, 2], -np.pi / 2, atol=1e-12)
+    found = udk.modes(mech, rest.state)
+    np.testing.assert_allclose(found.omega2, [3.5 * 9.81 / 3.05], rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(found.s.imag), np.sqrt(3.5 * 9.81 / 3.05) * np.array([-1.0, 1.0]), rtol=1e-12)
+    shape = np.asarray(found.shapes[0]) / float(found.shapes[0, 0, 2])
+    np.testing.assert_allclose(shape, [[0.5, 0, 1], [0.5, 0, 1], [0.5, 0, 1], [1, 0, 0]], atol=1e-10)
+
+
+def test_no_step_is_tried_from_a_position_of_rest(monkeypatch):
+    mech, tried = udk.library.parallelogram(-1.3), []
+    rest = udk.equilibrium(mech)
+    correct = KnownCurve.correct
+    monkeypatch.setattr(KnownCurve, "correct", lambda *given, **choices: tried.append(1) or correct(*given, **choices))
+    again = udk.equilibrium(mech, rest.state)
+    assert not tried and bool(again.balanced)
+    assert bool(udk.equilibrium(mech).balanced) and tried
+
+
+def test_the_papers_linkage_standing_is_unstable():
+    mech = udk.library.parallelogram(1.4)
+    rest = udk.equilibrium(mech)
+    assert bool(rest.balanced)
+    assert not bool(rest.stable)
+    np.testing.assert_allclose(rest.omega2, [-3.5 * 9.81 / 3.05], rtol=1e-12)
+    downhill = udk.equilibrium(mech, stable=True)
+    np.testing.assert_allclose(np.cos(downhill.q[:3, 2] + np.pi / 2), 1.0, atol=1e-12)
+
+
+def spring_four_bar(stiffness=STIFFNESS, scale=1.0):
+    """A spring along the diagonal from the crank's pin to the rocker's pivot."""
+    a, b, c = (scale * x for x in LENGTHS)
+    mech = udk.library.four_bar(1.0, lengths=(a, b, c), ground=scale * GROUND, density=1.0 / scale)
+    spring = udk.Spring(("ground", "crank"), [(scale * GROUND, 0.0), (a / 2, 0.0)], stiffness, scale * FREE_LENGTH)
+    return udk.Mechanism(dict(mech.bodies), dict(mech.joints), {}, {"spring": spring}, mech.gravity)
+
+
+def spring_rod():
+    """A rod on a pin, held up by a spring."""
+    return udk.Mechanism(
+        {"rod": udk.Body(2.5, 0.3, [0.5, 0.0])},
+        {"D": udk.Revolute(("ground", "rod"), [(0.0, 0.0), (-0.5, 0.0)])},
+        forces={"spring": udk.Spring(("ground", "rod"), [(0.2, 1.5), (0.4, 0.1)], STIFFNESS, FREE_LENGTH)},
+    )
+
+
+def reduced_pose(s):
+    """Middles and angles of the bodies of `spring_four_bar` at the crank's angle s, and the length of its spring."""
+    a, b, c = LENGTHS
+    end = a * jnp.stack([jnp.cos(s), jnp.sin(s)])
+    to = jnp.array([GROUND, 0.0]) - end
+    d2 = to @ to
+    x = (d2 + b**2 - c**2) / (2 * d2)
+    pin = end + x * to + jnp.sqrt(b**2 / d2 - x**2) * jnp.stack([-to[1], to[0]])
+    middles = jnp.stack([end / 2, (end + pin) / 2, (jnp.array([GROUND, 0.0]) + pin) / 2])
+    angles = jnp.stack([s, jnp.arctan2(pin[1] - end[1], pin[0] - end[0]), jnp.arctan2(pin[1], pin[0] - GROUND)])
+    return middles, angles, jnp.sqrt(d2)
+
+
+@jax.jit
+def reduction(s):
+    """V' and V'' of one coordinate, the crank's angle, and its inertia J."""
+    m = jnp.array(LENGTHS)
+
+    def V(s):
+        middles, _, d = reduced_pose(s)
+        return 9.81 * m @ middles[:, 1] + STIFFNESS * (d - FREE_LENGTH) ** 2 / 2
+
+    middles, angles, _ = jax.jacfwd(reduced_pose)(s)
+    return jax.grad(V)(s), jax.hessian(V)(s), m @ jnp.sum(middles**2, 1) + (m**3 / 12) @ angles**2
+
+
+def reduced(s):
+    """Equilibrium and omega^2 = V''/J in closed form, where V' = 0."""
+    for _ in range(20):
+        slope, bend, _ = reduction(s)
+        s = s - slope / bend
+    _, bend, J = reduction(s)
+    return float(s), float(bend / J)
+
+
+def test_a_four_bar_with_a_diagonal_spring_against_its_reduction():
+    mech = spring_four_bar()
+    rest = udk.equilibrium(mech)
+    s, omega2 = reduced(float(rest.q[0, 2]))
+    assert abs(float(rest.q[0, 2]) - s) < 1e-12
+    np.testing.assert_allclose(rest.omega2, [omega2], rtol=1e-11)
+    np.testing.assert_allclose(udk.modes(mech, rest.state).omega2, [omega2], rtol=1e-11)
+
+
+def held_up(length):
+    """A body that two forces hold against its weight: all loads vanish, but for rounding."""
+    weight = 0.1 * length**3 * 9.81
+    forces = {"one": udk.Force("b", [0.0, weight / 3]), "two": udk.Force("b", [0.0, weight * (2 / 3)])}
+    return udk.Mechanism({"b": udk.Body(0.1 * length**3, 0.1 * length**5)}, {}, {}, forces)
+
+
+def see_saw(length):
+    """Two bodies that balance about a pin in any position."""
+    at = length * np.array([np.cos(0.3), np.sin(0.3)])
+    bodies = {"a": udk.Body(1.0, 0.1 * length**2, at, 0.3), "b": udk.Body(3.0, 0.1 * length**2, -at / 3, 0.3)}
+    points = [(length / 3, 0.0), (-length, 0.0)]
+    joints = {
+        "pin": udk.Revolute(["ground", "a"], [(0.0, 0.0), (-length, 0.0)]),
+        "weld": udk.Weld(["b", "a"], [points[0], points[1]]),
+    }
+    return udk.Mechanism(bodies, joints)
+
+
+@pytest.mark.parametrize("stable", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scene", [held_up, see_saw])
+def test_rest_where_all_loads_vanish_is_indifferent(scene, stable):
+    """What is left is compared with the scale of forces, not with what is left of them; nothing moves by rounding."""
+    for length in (1e-6, 1e3):
+        mech = scene(length)
+        rest = udk.equilibrium(mech, stable=stable)
+        assert bool(rest.balanced) and float(rest.residual) < 1e-14
+        assert rest.kind == "indifferent" and not bool(rest.stable)
+        np.testing.assert_allclose(rest.q, mech.q0, rtol=1e-9, atol=1e-9 * length)
+    pushed = udk.Mechanism(mech.bodies, mech.joints, {}, {"push": udk.Torque(["ground", "b"], 1e-6 * 9.81 * length**4)})
+    assert not bool(udk.equilibrium(pushed).balanced)
+
+
+def test_a_scene_without_a_degree_of_freedom_rests_where_its_drivers_hold_it():
+    mech = udk.library.slider_crank()
+    rest, found = udk.equilibrium(mech, t=0.1), udk.modes(mech, t=0.1)
+    assert bool(rest.stable) and rest.omega2.shape == (0,) and rest.kind == "stable"
+    np.testing.assert_allclose(rest.q, udk.assemble(mech, 0.1).q, atol=1e-12)
+    assert found.omega2.shape == found.s.shape == (0,) and found.shapes.shape == (0, 3, 3)
+    slope = jax.jit(jax.jacfwd(lambda t: udk.equilibrium(mech, t=t).q))(0.1)
+    step = 1e-5
+    np.testing.assert_allclose(
+        slope, (udk.assemble(mech, 0.1 + step).q - udk.assemble(mech, 0.1 - step).q) / (2 * step), atol=1e-7
+    )
+
+
+def test_equilibria_from_many_starts():
+    """On one assembly branch the reduction finds them, too."""
+    mech = spring_four_bar()
+    found = udk.equilibria(mech, starts=6, seed=1)
+    assert bool(found[0].stable)
+    upper = [e for e in found if np.sin(float(e.q[1, 2] - e.q[2, 2])) < 0]
+    for e in upper:
+        s, omega2 = reduced(float(e.q[0, 2]))
+        assert abs(np.sin((float(e.q[0, 2]) - s) / 2)) < 1e-11
+        np.testing.assert_allclose(e.omega2, [omega2], rtol=1e-9)
+    assert {bool(e.stable) for e in upper} == {True, False}  # along a closed curve there are as many of either
+    assert len(upper) % 2 == 0
+
+
+def test_size_does_not_matter():
+    """Scaled by 1e-6, with the same masses and stiffness times length: angles and, with g scaled too, frequencies are alike."""
+    rest, small = udk.equilibrium(spring_four_bar()), spring_four_bar(scale=1e-6)
+    small = small.with_parameters({"gravity": 1e-6 * np.array([0.0, -9.81])})
+    found = udk.equilibrium(small)
+    assert bool(found.balanced)
+    np.testing.assert_allclose(found.q[:, 2], rest.q[:, 2], atol=1e-11)
+    np.testing.assert_allclose(found.omega2, rest.omega2, rtol=1e-10)
+
+
+def test_damped_modes_are_those_of_the_quadratic_problem():
+    """A disc on a torsion spring with a damper: s = -zeta omega +- i omega sqrt(1 - zeta^2)."""
+    k, c, inertia = 5.0, 0.3, 0.2
+    mech = udk.Mechanism(
+        {"disc": udk.Body(1.0, inertia)},
+        {"pin": udk.Revolute(("ground", "disc"), [(0.0, 0.0), (0.0, 0.0)])},
+        forces=[udk.TorsionSpring(("ground", "disc"), k, damping=c)],
+    )
+    found = udk.modes(mech)
+    zeta = c / (2 * np.sqrt(k * inertia))
+    exact = np.sqrt(k / inertia) * np.array([-zeta - 1j * np.sqrt(1 - zeta**2), -zeta + 1j * np.sqrt(1 - zeta**2)])
+    np.testing.assert_allclose(found.s, exact, rtol=1e-12)
+    np.testing.assert_allclose(found.damping, zeta, rtol=1e-12)
+
+
+def test_modes_of_a_double_pendulum():
+    mech = udk.library.double_pendulum()
+    rest = udk.equilibrium(mech, stable=True)
+    found = udk.modes(mech, rest.state)
+    for k in range(2):  # the shapes are orthogonal in M and K: here by energy, T = omega^2 V'' along the shape
+        M = np.asarray(udk.equations.mass(mech)).reshape(-1, 3)
+        assert abs(float(np.sum(M * np.asarray(found.shapes[k]) ** 2)) - 1.0) < 1e-12
+    assert abs(float(np.sum(M * np.asarray(found.shapes[0]) * np.asarray(found.shapes[1])))) < 1e-12
+    assert np.all(np.asarray(found.omega2) > 0)
+
+
+VIBRATING = {"rod": (spring_rod, "rod", 0.0), "four-bar": (spring_four_bar, "coupler", GROUND)}
+
+
+@pytest.mark.parametrize("name", fast(["rod"], VIBRATING))
+def test_frequencies_have_exact_derivatives(name):
+    """Through the equilibrium, which moves: against differences."""
+    make, body, place = VIBRATING[name]
+    mech = make()
+
+    def frequency(x):
+        changed = mech.with_parameters({"force.spring.stiffness": x[0], f"body.{body}.mass": x[1], "joint.D.points[0][0]": x[2]})
+        rest = udk.equilibrium(changed)
+        found = udk.modes(changed, rest.state)
+        return jnp.stack([found.frequencies[0], found.s[1].imag])
+
+    x, h = jnp.array([STIFFNESS, 2.5, place]), 1e-5
+    both = jax.jit(lambda x, d: jax.jvp(frequency, (x,), (d,)))
+    for d in np.eye(3):
+        np.testing.assert_allclose(both(x, d)[1], (both(x + h * d, d)[0] - both(x - h * d, d)[0]) / (2 * h), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_batch_of_equilibria_has_a_code_for_each_member():
+    mech = spring_four_bar()
+    stiffness = np.linspace(1.0, 100.0, 1000)
+    found = jax.jit(jax.vmap(lambda k: udk.equilibrium(mech.with_parameters({"force.spring.stiffness": k}))))(stiffness)
+    assert found.balanced.shape == (1000,)
+    assert np.all(np.asarray(found.residual)[np.asarray(found.balanced)] <= 1e-9)
+    assert float(np.mean(found.balanced)) > 0.9

@@ -1,0 +1,109 @@
+"""Numbers as machine code takes them: all numbers of a scene in one vector, their changes and cotangents, and samples."""
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, PyTree
+
+from udkjax.scene.held import row_size, rows_of, with_row
+from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
+
+
+def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:
+    """Return a mask of the numbers of a tree, and of two thresholds behind them, that are active: they have derivatives."""
+    leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active)), strict=True)
+    return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
+
+
+def number_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array]) -> Array:
+    """Return the tangents of all numbers of a tree, and of two thresholds, as one vector: zeros of those that are not active."""
+    leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active, change)), strict=True)
+    moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
+    which = np.array(active_numbers(numbers, active))
+    # Two operations, however many pieces there are: each would take XLA as long as a hundred steps of a small scene.
+    return jnp.concatenate([*moving, np.zeros(1)])[np.where(which, np.cumsum(which) - 1, np.sum(which))]
+
+
+def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool]) -> PyTree[Array]:
+    """Return the tree of the cotangents of what is active, from those of all numbers, in order."""
+    leaves, tree = jax.tree.flatten(numbers, is_leaf=lambda x: x is None)
+    parts, place = [], 0
+    for x, m in zip(leaves, leaves_and_none(active), strict=True):
+        size = 0 if x is None else np.size(x)
+        parts.append(bars[place : place + size].reshape(np.shape(x)) if m is True else None)
+        place += size
+    return jax.tree.unflatten(tree, parts)
+
+
+def leaves_and_none(tree: PyTree) -> list[Any]:
+    """Return the leaves of a tree, None among them."""
+    return jax.tree.leaves(tree, is_leaf=lambda x: x is None)
+
+
+class SampleRows:
+    """The rows of all that has samples in a mechanism, side by side, one for each interval between the breakpoints of a run."""
+
+    def __init__(self, mechanism: Mechanism, breakpoints: Float[Array, "K"] | None):
+        self.samples = mechanism.samples
+        self._breakpoints = breakpoints
+
+    def breakpoints(self, xp: ModuleType) -> Any:
+        """Return the breakpoints of the run in their order: by NumPy where they are known."""
+        if self._breakpoints is None:
+            return np.zeros(0)
+        traced = isinstance(self._breakpoints, Tracer)
+        return xp.sort(stop_gradients(self._breakpoints)) if traced else np.sort(np.asarray(self._breakpoints))
+
+    def stand_in(self, mechanism: Mechanism, marks: bool = False) -> Mechanism:
+        """Return the mechanism that programs are made of, or the tree of its changes, or, with `marks`, of what is active."""
+        found = {}
+        for place, given in mechanism.samples.items():
+            present = [leaf for leaf in leaves_and_none(given) if leaf is not None]
+            zeros = np.zeros(row_size(self.samples[place])) if present else None
+            found[place] = with_row(self.samples[place], any(leaf is True for leaf in present) if marks else zeros)
+        return mechanism.with_samples(found)
+
+    def places(self, mechanism: Mechanism) -> tuple[int, ...]:
+        """Return the places of a row's numbers among all numbers of the mechanism that programs are made of."""
+        if not self.samples:
+            return ()
+        blank = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), self.stand_in(mechanism))
+        marked = blank.with_samples({place: with_row(x, np.ones(row_size(x), bool)) for place, x in self.samples.items()})
+        return tuple(np.flatnonzero(np.concatenate([np.ravel(x) for x in marked.numbers])).tolist())
+
+    def rows(self, xp: ModuleType, samples: Sequence[Any] | None = None) -> Any:
+        """Return the rows (K + 1, R), of other `samples` if they are given."""
+        breakpoints = self.breakpoints(xp)
+        columns = []
+        for x in self.samples.values() if samples is None else samples:
+            traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
+            rows, own = rows_of(x, xp if traced else np), x.breakpoints
+            if any(isinstance(b, Tracer) for b in (breakpoints, own)):
+                after = xp.concatenate([xp.full(1, -np.inf), breakpoints])
+                columns.append(rows[xp.searchsorted(stop_gradients(xp.asarray(own)), after, side="right")])
+            elif np.array_equal(own, breakpoints):
+                columns.append(rows)
+            else:
+                columns.append(rows[np.searchsorted(np.asarray(own, float), np.append(-np.inf, breakpoints), side="right")])
+        return xp.concatenate(columns, axis=1)
+
+    def changes(self, mechanism: Mechanism) -> Array:
+        """Return the change of the rows along that of a mechanism."""
+        leaves, form = jax.tree.flatten(list(self.samples.values()))
+        given = leaves_and_none(list(mechanism.samples.values()))
+        along = [jax.numpy.zeros(np.shape(x)) if dx is None else dx for x, dx in zip(leaves, given, strict=True)]
+        return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (along,))[1]
+
+    def with_cotangents(self, mechanism: Mechanism, active: Mechanism, bars: Array) -> Mechanism:
+        """Return a mechanism of cotangents with those of what has samples, from those of the rows."""
+        leaves, form = jax.tree.flatten(list(self.samples.values()))
+        marks = leaves_and_none(list(active.samples.values()))
+        (found,) = jax.vjp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), leaves)[1](bars)
+        kept = [bar if mark is True else None for bar, mark in zip(found, marks, strict=True)]
+        return mechanism.with_samples(dict(zip(self.samples, jax.tree.unflatten(form, kept), strict=True)))

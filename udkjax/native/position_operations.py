@@ -1,0 +1,82 @@
+"""The operations of machine code that find positions: closing, with its derivatives, and following the positions of a drive."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from udkjax.native.closing import Closing
+from udkjax.native.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
+from udkjax.native.marching import Marching
+from udkjax.native.module import Module
+from udkjax.native.operations import Operation, Shape
+
+
+@dataclass(frozen=True)
+class Close(Operation):
+    """Close a mechanism: its state, what is left of Psi and Psi_dot, and the rank of Psi_q."""
+
+    settings: ClassVar[tuple[str, ...]] = Closing.settings
+    in_lanes: ClassVar[bool] = False
+    results: ClassVar[int] = len(Closing.results)
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return Closing(self.code, vector)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [(2 * self.code.coordinate_count,), (2 * self.code.row_count,), (1,)]
+
+
+@dataclass(frozen=True)
+class CloseTangents(Close):
+    """Close, with the changes of the state along directions."""
+
+    active: tuple[bool, ...] = ()
+
+    @property
+    def tangents(self) -> int:
+        return 3
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return ClosingForward(self.code, vector, self.active)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [*super().outputs(inputs, times), (inputs[-1].shape[1], 2 * self.code.coordinate_count)]
+
+
+@dataclass(frozen=True)
+class CloseSecondTangents(CloseTangents):
+    """Close, with the second derivatives of the state along pairs of directions."""
+
+    @property
+    def tangents(self) -> int:
+        return 6
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return ClosingTwice(self.code, vector, self.active)
+
+
+@dataclass(frozen=True)
+class CloseCotangents(Close):
+    """Close, and walk back from cotangents of the state to those of all numbers and of the guess."""
+
+    active: tuple[bool, ...] = ()
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return ClosingReverse(self.code, vector, self.active)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        n = self.code.coordinate_count
+        return [*super().outputs(inputs, times), (self.code.number_count,), (n,), (n,)]
+
+
+@dataclass(frozen=True)
+class March(Operation):
+    """Follow the positions of a driven mechanism over values: q, q', q'', their sides, and how many are to be relied on."""
+
+    settings: ClassVar[tuple[str, ...]] = Marching.settings
+
+    def module(self, width: int, beside: int, vector: int) -> Module:
+        return Marching(self.code, width, vector)
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+        return [*[(times, self.code.coordinate_count)] * 3, (times,), (1,)]

@@ -1,0 +1,292 @@
+"""Assembly: from the initial guess of a scene to positions and velocities that satisfy its constraints.
+
+Positions by damped Gauss-Newton in the mass metric, with Psi of all rows,
+
+    q <- q - s M^(-1/2) D^+ Psi,       D = Psi_q M^(-1/2),
+
+the smallest change that removes the linearized residual; s limits the length of a step, so that the branch of the guess is kept,
+and is halved until the residual falls: no step makes a state worse. Velocities by v - M^(-1/2) D^+ Psi_dot, which leaves the free
+motion of the guess as it is and satisfies the drivers. D^+ is truncated, so redundant rows do no harm, and its derivative is the
+one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
+They take the characteristic length as fixed: from a guess so far away that steps are limited, it has a share in where they lead.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from udkjax.annotations import Numbers, Scalar
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.constraints import psi
+from udkjax.equations.dense_rows import DenseRows
+from udkjax.equations.element_programs import has_rheonomic_joints
+from udkjax.equations.position_closure import is_closed
+from udkjax.equations.redundancy import dependent_constraints
+from udkjax.equations.scales import Scales
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.positions import native_closing
+from udkjax.positions.closure import close_by_jax, close_by_machine_code, from_moment
+from udkjax.positions.open_rows import explain_open
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
+from udkjax.programs.deferred import deferred
+from udkjax.scene.arguments import checked
+from udkjax.scene.description import poses_table
+from udkjax.scene.fields import ROUNDING, is_traced, is_within_jit, number, number_called
+from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.suspicions import body_sizes, suspicions
+
+
+class State(PrintsTable):
+    """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3).
+
+    Of a `ConstrainedSystem`: (n,) each.
+
+    Args:
+        q: coordinates (bodies, 3): x, y (m) and angle (rad).
+        v: their rates (bodies, 3): m/s and rad/s.
+    """
+
+    q: Float[Array, "bodies 3"] | Float[Array, "n"]
+    v: Float[Array, "bodies 3"] | Float[Array, "n"]
+
+    def __init__(self, q: Numbers, v: Numbers):
+        self.q, self.v = number_called("q")(q), number_called("v")(v)
+
+    _units = units(q="m, m, rad", v="m/s, m/s, rad/s")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.q) == 2 and np.shape(self.q)[1] == 3:
+            return poses_table("state", (), self.q, self.v)
+        return fields_table(self, self._units if np.ndim(self.q) > 2 else {}, f"states {np.shape(self.q)}")
+
+
+class AssemblyError(ValueError):
+    """A mechanism cannot be closed, or not moved as its drivers ask. `state` is the best that was found.
+
+    Attributes:
+        message: the joints that stay open.
+        state: the best `State` that was found.
+    """
+
+    def __init__(self, message: str, state: State):
+        super().__init__(message)
+        self.state = state
+
+
+class Closure(NamedTuple):
+    """An assembled state, what is left of Psi (m, rad) and Psi_dot (m/s, rad/s), row by row, and the rank of D there."""
+
+    state: State
+    psi: Float[Array, "m"]
+    psi_dot: Float[Array, "m"]
+    rank: Int[Array, ""]
+    scales: Scales
+    is_closed: Bool[Array, ""]  # whether the residuals are within `CLOSED_TOL` of the scene's scales, or rounding
+
+
+@checked
+def assemble(
+    mechanism: Mechanism, t: Scalar = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
+) -> State:
+    """Close a mechanism at time t (s), from `state` or from the initial guess of its bodies.
+
+    A state that satisfies all constraints is returned as it is, up to rounding. Differentiable to second order with respect to
+    every number of the mechanism and the guess, also where constraints are redundant. `analysis` is that of `udkjax.analyse`, by
+    default made here. Raises `AssemblyError`, which names the joints that stay open; with `throw=False`, or when numbers are
+    traced, the best state found is returned instead.
+    """
+    closure = close(mechanism, t, state, analysis=analysis)
+    if throw:
+        require_closed(mechanism, closure, t, state)
+    return closure.state
+
+
+def close(
+    mechanism: Mechanism,
+    t: Scalar = 0.0,
+    state: State | None = None,
+    analysis: Analysis | None = None,
+) -> Closure:
+    """Close a mechanism as `assemble` does, and return the residuals with the state, in place of an error.
+
+    Where all numbers are known the closure is, too, also while something else is traced.
+    """
+    if not mechanism.is_concrete or is_traced((t, state)):
+        analysis = analyse(mechanism) if analysis is None else analysis
+        close = _close if is_within_jit() else _close_compiled  # in which known numbers are traced, too
+        moment = mechanism.without_origin.at(t)
+        if isinstance(t, Tracer) and not has_rheonomic_joints(moment):
+            moment, t = from_moment(moment, t), 0.0
+        return close(moment, analysis, t, state)
+    if analysis is not None and isinstance(analysis.scales.length, Tracer):
+        analysis = None  # the analysis of the known mechanism lasts
+    return _closure_of_known(mechanism, np.asarray(t).item(), state, analysis)
+
+
+@cached_by_identity  # a second run of a mechanism need not close it again
+def _closure_of_known(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
+    with jax.ensure_compile_time_eval():
+        scales = (analyse(mechanism) if analysis is None else analysis).scales
+        guess = State(mechanism.q0, mechanism.v0) if state is None else state
+        q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
+        with np.errstate(all="ignore"):  # a state that is not finite does not close
+            q, v, psi, psi_dot, rank = _close_known(mechanism, scales, t, q, v)
+            closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
+        state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
+        rank, closed = (jax.device_put(np.asarray(x)) for x in (rank, closed))
+        return Closure(state_found, number(psi), number(psi_dot), rank, scales, closed)
+
+
+def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
+    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, of known numbers."""
+    if scene_programs(mechanism).is_small:  # for which it takes longer to compile anything
+        return DenseRows(mechanism, scales).assemble(t, q, v)
+    if native_closing.can_close(mechanism):
+        return native_closing.close_known(mechanism.at(t), scales, t, q, v)
+    from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
+
+    return SparseRows(mechanism).assemble(t, q, v)
+
+
+def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | None) -> Closure:
+    guess = State(mechanism.q0, mechanism.v0) if state is None else state
+    q, v = number(guess.q).ravel(), number(guess.v).ravel()
+    close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
+    q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
+    closed = is_closed(analysis.scales, q, v, psi, psi_dot, jnp)
+    return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales, closed)
+
+
+_close_compiled = deferred(_close)
+
+
+def require_closed(mechanism: Mechanism, closure: Closure, t: Scalar = 0.0, guess: State | None = None) -> None:
+    """Raise an `AssemblyError` where a closure at time t (s) from a guess is not closed; traced values pass."""
+    closed = closure.is_closed
+    if isinstance(closed, Tracer) or closed:
+        return
+    names = [name for name, _ in analyse(mechanism).row_names]
+    psi, psi_dot, rows = (np.asarray(x) for x in (closure.psi, closure.psi_dot, closure.scales.rows))
+    q = np.asarray(mechanism.q0 if guess is None else guess.q).ravel()
+    raise AssemblyError(explain_open(mechanism, np.asarray(t).item(), q, names, psi, psi_dot, rows), closure.state)
+
+
+@prints_table
+class Check(NamedTuple):
+    """The findings on a mechanism's constraints before it moves."""
+
+    bodies: int
+    coordinates: int
+    rows: int
+    rank: int  # in general: elsewhere than in a singular configuration
+    degrees_of_freedom: int
+    redundant: tuple[tuple[str, int], ...]  # rows that can be left out: the constraint and the row within it
+    dependent: tuple[str, ...]  # the constraints that depend on each other
+    residual_before: float  # the largest |Psi| (m, rad) as given, and assembled
+    residual_after: float
+    closed: bool
+    length: float  # m; characteristic, as in `analyse`
+    time: float  # s
+    mass: float  # kg
+    moved: tuple[str, ...] = ()  # by assembly, far beside their sizes
+    suspicious: tuple[str, ...] = ()  # likely mistakes
+
+    def _table(self) -> PrintedTable:
+        return PrintedTable("mechanism, checked", list(check_lines(self).items()))
+
+
+@checked
+def check(mechanism: Mechanism) -> Check:
+    """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes.
+
+    Bodies that assembly moves by more than a hundredth of their size are named, and what is likely a mistake: points far outside
+    of all bodies, angles that look like degrees, bodies without a joint.
+    """
+    closure = close(mechanism)
+    before = psi(mechanism, 0.0, mechanism.q0)
+    rows = len(before)
+    closed = bool(closure.is_closed)
+    found = analyse(mechanism)
+    rank = int(closure.rank) if found.rank is None or not closed else found.rank
+    return Check(
+        bodies=len(mechanism.body_names),
+        coordinates=3 * len(mechanism.body_names),
+        rows=rows,
+        rank=rank,
+        degrees_of_freedom=3 * len(mechanism.body_names) - rank,
+        redundant=found.redundant if closed else (),
+        dependent=dependent_constraints(mechanism, np.asarray(closure.state.q)) if closed else (),
+        residual_before=float(jnp.abs(before).max(initial=0.0)),
+        residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
+        closed=closed,
+        length=float(found.length),
+        time=float(found.time),
+        mass=float(found.mass),
+        moved=moves_of_assembly(mechanism, closure.state.q) if closed else (),
+        suspicious=tuple(suspicions(mechanism)),
+    )
+
+
+def check_lines(found: Check) -> dict[str, str]:
+    """Return the findings of `check` as texts by title."""
+    lines = {
+        "bodies": f"{found.bodies}",
+        "coordinates": f"{found.coordinates}",
+        "constraint rows": f"{found.rows}",
+        "rank": f"{found.rank}",
+        "degrees of freedom": f"{found.degrees_of_freedom}",
+        "redundant rows": ", ".join(f"{name} (row {row + 1})" for name, row in found.redundant) or "none",
+    }
+    if found.dependent:
+        lines["depend on each other"] = ", ".join(found.dependent)
+    lines["length, time, mass"] = f"{found.length:.3g} m, {found.time:.3g} s, {found.mass:.3g} kg"
+    before, after = (format_number(x, "m or rad", found.length) for x in (found.residual_before, found.residual_after))
+    lines |= {"closure, as given": before, "closure, assembled": after + ("" if found.closed else ": it does not close")}
+    more = [text.removeprefix("assembly ") for text in found.moved]
+    return lines | numbered("assembly", more) | numbered("likely a mistake", list(found.suspicious))
+
+
+def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
+    """Return texts by one title, counted where there are more than one."""
+    return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
+
+
+# Of a body's size: what a drawing to scale, or numbers of three digits, leave open. A number that is mistyped closes silently.
+WORTH_SAYING = 0.01
+
+
+class AssemblyWarning(UserWarning):
+    """Assembly moved a body by more than a hundredth of its size from its initial guess."""
+
+
+def moves_of_assembly(mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> tuple[str, ...]:
+    """Return, in words, how far each body was moved from its initial guess to the assembled q, where that is worth saying."""
+    change = np.asarray(q) - np.asarray(mechanism.q0)
+    distance, angle = np.hypot(change[:, 0], change[:, 1]), np.abs(change[:, 2])
+    if not np.any(change):
+        return ()
+    return tuple(_moves(mechanism, distance, angle))
+
+
+def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> Iterator[str]:
+    sizes = body_sizes(mechanism)
+    for name, distance, angle in zip(mechanism.body_names, distances, angles, strict=True):
+        if distance + angle * sizes[name] > WORTH_SAYING * sizes[name]:
+            parts = {f"{distance:.2g} m": distance, f"{np.degrees(angle):.2g} deg": angle * sizes[name]}
+            amount = " and ".join(text for text, part in parts.items() if part > ROUNDING * sizes[name])
+            yield f"assembly moved {name} by {amount}"
+
+
+def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
+    """Return a warning where assembly moved a body of a mechanism of known numbers far, to the `Closure` at time t (s)."""
+    if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:
+        return ""  # at a later time it is the drivers' business where the bodies are
+    moves = moves_of_assembly(mechanism, closure.state.q)
+    cure = "if that is not meant, a number of these bodies or of their joints is wrong; udk.check says more"
+    return f"{'; '.join(moves)}: {cure}" if moves else ""

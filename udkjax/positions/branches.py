@@ -1,0 +1,91 @@
+"""All ways in which a mechanism can be put together for one value of its driver."""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.annotations import Scalar
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.scales import Scales
+from udkjax.positions.assembly import State, close
+from udkjax.positions.drive import Drive, drive
+from udkjax.programs.deferred import deferred
+from udkjax.scene.arguments import checked
+from udkjax.scene.fields import number
+from udkjax.scene.mechanism import Mechanism
+
+
+@checked
+def branches(
+    mechanism: Mechanism,
+    driver: Drive,
+    value: Scalar,
+    starts: int = 400,
+    seed: int = 0,
+    held: Mapping[str, Scalar] | None = None,
+) -> Float[Array, "k bodies 3"]:
+    """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
+
+    They are those that random positions close to, each found once: none is wrong, but one may be missing. How many there can
+    be at most is known of four-bars (2) and six-bars (4 of Watt, 6 of Stephenson). The same seed gives the same result; angles
+    are within half a turn of zero, and branches in the order of the bodies' angles, the first body's first.
+
+    Args:
+        mechanism: a mechanism without a degree of freedom once its driver holds; its numbers must be known.
+        driver: a driver, or a coordinate by name or as a `Coordinate`, as for `kinematics`; None: all drivers.
+        value: of the driver (rad, m); of None the time (s).
+        starts: number of positions to search from.
+        seed: of these positions.
+        held: values that other drivers or coordinates hold, by name.
+
+    Raises:
+        SceneError: no such driver or coordinate, or positions do not follow from it.
+    """
+    driven = drive(mechanism, driver, 0.0, held)
+    guesses = random_positions(mechanism, starts, seed)
+    q, closed = _close(driven.mechanism, driven.analysis, number(value), guesses)
+    found = np.asarray(q)[distinct_positions(q, closed, driven.analysis.scales)]
+    found[..., 2] = np.angle(np.exp(1j * found[..., 2]))
+    order = np.lexsort(np.round(found[..., 2], 6).T[::-1])
+    return jnp.asarray(found[order])
+
+
+@deferred
+def _close(
+    mechanism: Mechanism, analysis: Analysis, s: Float[Array, ""], guesses: Float[Array, "count bodies 3"]
+) -> tuple[Array, Array]:
+    def one(q: Float[Array, "bodies 3"]) -> tuple[Array, Array]:
+        found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
+        return found.state.q, jnp.asarray(found.is_closed)
+
+    return jax.vmap(one)(guesses)
+
+
+SAME_POSITION = 1e-5  # of the characteristic length, or rad: positions nearer to each other are one
+
+
+def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
+    """Return the given position, and others with random angles and places of all bodies, spread over the mechanism's size."""
+    rng = np.random.default_rng(seed)
+    q = np.asarray(mechanism.q0 if state is None else state.q)
+    found = np.tile(q, (count, 1, 1))
+    spread = max(float(np.ptp(q[:, :2], axis=0).max()), float(analyse(mechanism).length))
+    found[1:, :, 2] += rng.uniform(-np.pi, np.pi, (count - 1, len(q)))
+    found[1:, :, :2] += rng.uniform(-0.5, 0.5, (count - 1, len(q), 2)) * spread
+    return jnp.asarray(found)
+
+
+def distinct_positions(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
+    """Return the indices of positions that count and differ from all before them; whole turns make no difference."""
+    points = np.asarray(q, float)
+    length, different = float(scales.length), []
+    for k in np.flatnonzero(np.asarray(counts)):
+        d = points[k] - points[different]
+        d[..., 2] = 2 * np.abs(np.sin(d[..., 2] / 2))
+        d[..., :2] /= length
+        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME_POSITION:
+            different.append(int(k))
+    return different

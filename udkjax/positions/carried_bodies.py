@@ -1,0 +1,111 @@
+"""Bodies that hang on a single other one: a wheel on its axle, a pendulum on a link.
+
+However that one moves, such bodies may be carried along by it as they are: what joins them to it stays closed. So they limit no
+coordinate of the others, and where they are free to move besides, it follows from the others as if they were not there.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.annotations import Scalar
+from udkjax.equations.analysis import analyse
+from udkjax.equations.dense_rows import KinematicRows
+from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.positions.drive import Coordinate, element_of
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.fields import library_for
+from udkjax.scene.mechanism import Mechanism, Origin
+
+ANY_MOTION = (0.3, -0.2, 0.7)  # characteristic lengths and rad: whatever is invariant under it is so in general
+
+
+class CarriedBodies(NamedTuple):
+    """Bodies to leave out, each with the one that carries it, by their places; -1: the ground."""
+
+    carrier: dict[int, int]
+
+    def without(self, mechanism: Mechanism) -> Mechanism:
+        """Return the mechanism without these bodies, and without forces, on which positions do not depend."""
+        names = [mechanism.body_names[k] for k in self.carrier]
+        keeps = lambda element: not set(names) & set(mechanism.frames_of(element))  # noqa: E731
+        joints = {name: x for name, x in mechanism.joints.items() if keeps(x)}
+        drivers = {name: x for name, x in mechanism.drivers.items() if keeps(x)}
+        bodies = {name: body for name, body in mechanism.bodies.items() if name not in names}
+        with jax.ensure_compile_time_eval():
+            origin = mechanism.origin and Origin(self.without(mechanism.origin.mechanism))
+        return Mechanism(bodies, joints, drivers, {}, mechanism.gravity, mechanism.name, origin)
+
+    def kept(self, count: int) -> np.ndarray:
+        """Return the places of the other bodies, of so many in all."""
+        return np.array([k for k in range(count) if k not in self.carrier], int)
+
+    def carry(self, start: Float[Array, "bodies 3"], others: Float[Array, "kept 3"]) -> Float[Array, "bodies 3"]:
+        """Return the position of all bodies where the others are: these as they were to their carriers at the start."""
+        xp, kept = library_for((start, others)), self.kept(len(start))
+        is_known = xp.all(xp.isfinite(others))
+        placed = dict(zip(kept.tolist(), xp.where(is_known, others, 0.0), strict=True))
+        for k, carrier in self.carrier.items():
+            if carrier < 0:
+                placed[k] = start[k]
+                continue
+            turn = placed[carrier][2] - start[carrier][2]
+            (x, y), (c, s) = (start[k] - start[carrier])[:2], (xp.cos(turn), xp.sin(turn))
+            placed[k] = placed[carrier] + xp.stack([c * x - s * y, s * x + c * y, start[k][2] - start[carrier][2]])
+        found = xp.stack([placed[k] for k in range(len(start))])
+        return xp.where(is_known, found, xp.inf)
+
+
+def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping[str, Scalar] | None) -> CarriedBodies:
+    """Return the bodies that hang on a single other one, where something is free to move while a coordinate is driven.
+
+    Where all numbers of a mechanism are traced it is not known what is free: none.
+    """
+    known = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
+    element, taken = element_of(mechanism, driver), [element_of(mechanism, name) for name in held or {}]
+    if known is None:
+        return CarriedBodies({})
+    freedoms = analyse(known).degrees_of_freedom
+    more = [name for name in (driver, *(held or {})) if not (isinstance(name, str) and name in known.drivers)]
+    if freedoms is None or freedoms <= len(more):
+        return CarriedBodies({})
+    places = {name: k for k, name in enumerate(known.body_names)} | {GROUND: -1}
+    attached = [known.frames_of(x) for x in known.constraints.values()]
+    groups = [{places[body] for body in bodies} for bodies in (*attached, element.bodies, *(x.bodies for x in taken))]
+    asked = {places[body] for x in (element, *taken) for body in x.bodies}
+    carrier: dict[int, int] = {}
+    for body in [-1, *range(len(known.body_names))]:
+        for part in _parts_without(body, groups, len(known.body_names)):
+            hangs = -1 not in part and not part & (asked | set(carrier)) and body not in carrier
+            if hangs and (body < 0 or _is_carried(known, part, body)):
+                carrier |= dict.fromkeys(sorted(part), body)
+    return CarriedBodies(carrier)
+
+
+def _parts_without(body: int, groups: list[set[int]], count: int) -> list[set[int]]:
+    """Return the sets of bodies that are connected with each other without one; the ground is -1."""
+    parts = [{k} for k in range(-1, count) if k != body]
+    for group in groups:
+        joined = [part for part in parts if part & group]
+        if joined:
+            parts = [part for part in parts if not part & group] + [set().union(*joined)]
+    return parts
+
+
+def _is_carried(mechanism: Mechanism, part: set[int], carrier: int) -> bool:
+    """Return True if what joins a part to its carrier does not change where both move as one."""
+    rows, names = KinematicRows(mechanism), mechanism.body_names
+    moving = {names[k] for k in part}
+    of_part = [name for name, x in mechanism.constraints.items() if moving & set(mechanism.frames_of(x))]
+    mask = np.array([owner in of_part for owner, _ in rows.names], bool)
+    q = np.array(mechanism.q0, float)
+    length, (dx, dy, turn) = float(rows.scales.length), ANY_MOTION
+    moved, which = q.copy(), [*part, carrier]
+    c, s = np.cos(turn), np.sin(turn)
+    moved[which, :2] = q[which, :2] @ np.array([[c, s], [-s, c]]) + length * np.array([dx, dy])
+    moved[which, 2] += turn
+    change = (rows.psi(0.0, moved.ravel()) - rows.psi(0.0, q.ravel())) / rows.scales.rows
+    return bool(np.all(np.abs(change[mask]) <= CLOSED_TOL))

@@ -1,0 +1,156 @@
+"""The closure of a mechanism as a function of its numbers: by machine code or by JAX, with derivatives of any order."""
+
+import operator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, TracedRows, close_position, damped_step
+from udkjax.equations.scales import Scales
+from udkjax.equations.textbook import prepare
+from udkjax.pinv import SVD
+from udkjax.positions import native_closing
+from udkjax.scene.drivers import Motion
+from udkjax.scene.fields import Number
+from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.linear_map import DifferentiableFunction, Linear
+from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
+
+Closed = Assembly[Array]
+NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales, t, q, v
+
+
+class MotionFrom(Motion):
+    """A motion law whose time zero is a time of another one (s): of its numbers one, it has derivatives by machine code."""
+
+    motion: Motion
+    start: Number
+
+    def __call__(self, t):
+        return self.motion(self.start + t)
+
+
+def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
+    """Return a mechanism whose drivers are at time zero where they are at time t."""
+    if not mechanism.drivers:
+        return mechanism
+    motions = lambda x: [driver.motion for driver in x.drivers.values()]  # noqa: E731
+    return eqx.tree_at(motions, mechanism, [MotionFrom(motion, t) for motion in motions(mechanism)])
+
+
+def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
+    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D."""
+    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assemble(_close_position, t, q, v)
+
+
+def close_by_machine_code(
+    mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
+) -> Closed:
+    """Return the same as `close_by_jax`, by machine code."""
+    guess, xs = split_numbers((mechanism, analysis, t, q, v))
+    return _close_by_code(AssemblyFunction(guess), xs)
+
+
+class AssemblyFunction(DifferentiableFunction):
+    """q and v of a closed state as a function of the numbers of a guess: a mechanism, its analysis, and t, q and v."""
+
+    guess: TreeOfNumbers
+
+    @property
+    def orders(self) -> int:
+        return 2 if self._has_second else 1
+
+    @property
+    def _has_second(self) -> bool:
+        """True where machine code has second derivatives: where no rows contradict each other beside the manifold."""
+        return self.guess.rest[1].redundant_rows == ()
+
+    def __call__(self, xs: list[Array]) -> list[Array]:
+        return list(close_by_jax(*self.guess(xs))[:2])
+
+    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
+        *_, q, v = self.guess(xs)
+        return [q.shape, v.shape]
+
+    def forward(self, xs: list[Array], has_tangent: Mask, vs: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(xs, has_tangent)
+        if guess is None:
+            return super().forward(xs, has_tangent, vs, run)
+        change = self.guess.changes(has_tangent, vs)
+        return list(native_closing.close_jvp(guess, _native_inputs(which), _native_inputs(change)))
+
+    def backward(self, xs: list[Array], has_tangent: Mask, ws: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(xs, has_tangent)
+        if guess is None:
+            return super().backward(xs, has_tangent, ws, run)
+        found = native_closing.close_vjp(guess, _native_inputs(which), *ws)
+        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
+        return [bar for m, bar in pairs if m is True]
+
+    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
+        guess, which = self._native(xs, tuple(map(operator.or_, active, others)))
+        if guess is None or not self._has_second:
+            return super().twice(xs, active, vs, others, us)
+        changes = (
+            (_native_inputs(self.guess.marks(mask)), _native_inputs(self.guess.changes(mask, dxs)))
+            for mask, dxs in ((active, vs), (others, us))
+        )
+        return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
+
+    def _native(self, xs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
+        """Return the arguments of machine code and the inputs with tangents; None where it has no such derivatives."""
+        which = self.guess.marks(has_tangent)
+        mechanism, analysis, t, q, v = self.guess(xs)
+        others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
+        if others or not native_closing.can_close(mechanism):
+            return None, None
+        return (mechanism, analysis.scales, t, q, v), which
+
+
+def _native_inputs(tree: PyTree) -> PyTree:
+    """Return the mechanism, q and v of a guess: the inputs along which machine code has derivatives."""
+    mechanism, _, _, q, v = tree
+    return mechanism, q, v
+
+
+@eqx.filter_custom_jvp
+def _close_by_code(function: AssemblyFunction, xs: list[Array]) -> Closed:
+    mechanism, analysis, t, q, v = function.guess(xs)
+    return native_closing.close(mechanism, analysis.scales, t, q, v)
+
+
+@_close_by_code.def_jvp
+def _(primals, tangents):
+    function, xs = primals
+    found = _close_by_code(function, xs)
+    has_tangent = tuple(dx is not None for dx in tangents[1])
+    linear = Linear(function=function, xs=xs, run=(), active=has_tangent)
+    return found, (*linear.applied(select(tangents[1], has_tangent)), None, None, None)
+
+
+@jax.custom_jvp
+def _close_position(rows: TracedRows, t: Array, q: Array) -> Array:
+    return close_position(rows, t, q)
+
+
+def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
+    """Take the same steps as `_close_position`, in a loop of fixed length that reverse mode can follow.
+
+    A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
+    the tangent, which it projects to the manifold.
+    """
+
+    def body(q, _):
+        following, better = damped_step(rows, t, q)
+        return jnp.where(better, following, q + rows.correction(t, q)), None
+
+    return jax.lax.scan(body, q, None, length=CLOSURE_ITERATIONS)[0]
+
+
+@_close_position.defjvp
+def _(primals, tangents):
+    _, tangent = jax.jvp(_close_position_plain, primals, tangents)
+    return _close_position(*primals), tangent

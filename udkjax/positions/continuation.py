@@ -1,0 +1,339 @@
+"""Follow the positions of a driven mechanism: a curve Psi(s, q) = 0 of values s and coordinates q, by its arc length.
+
+The curve is smooth also where the mechanism is at a toggle: there s turns back (ds/dsigma = 0 along the arc sigma), which is a
+simple root of a smooth function. With X = (q, s), each measured by its scale, and E = dPsi/dX of weighted rows,
+
+    tangent    tau = (I - E^+ E) tau_before, of unit length: it keeps its direction, so that the curve is never turned around;
+    predictor  X + h tau;        corrector  X <- X - E^+ Psi(X), the smallest change that removes the residual.
+
+A step counts if the corrector converges near the prediction and the tangent has turned little; else it is halved. So the branch
+stays the same, or the curve is lost and says so. E^+ is truncated: redundant constraints do no harm, and where branches meet,
+which costs E rank, the old tangent leads across.
+
+The sign of det [E; tau] changes where a branch meets another, and so it does where a step went over to one that only comes close:
+such a step counts if it is short. Branches that come closer to each other than that are taken for branches that meet.
+
+A value so near to a meeting of branches that its own E is of no use is found across it (crossing.py).
+
+Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from udkjax.equations.control_flow import sequential
+from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.structure import ArrayLibrary
+from udkjax.native.seldom import call_seldom
+from udkjax.positions.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing, find_toggle
+from udkjax.positions.curve import AbstractCurve
+from udkjax.printing import PrintsWords
+
+FIRST_STEP, LONGEST_ARC, SHORTEST_ARC = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
+LARGEST_BEND = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more
+PREDICTION_TOL = 0.3  # of a step: how far its end may lie from the prediction
+MAX_SECANTS = 60  # until a root is rounding; ten are usual
+MAX_TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
+AT_TOGGLE = 8.0  # units of rounding within which a value is that of a toggle
+
+T = TypeVar("T")
+
+
+class Reached(PrintsWords):
+    """Outcome for one value of a driver."""
+
+    closed = 0
+    singular = 1  # closed; branches meet here, and velocities are those of the one that is followed, from both of its sides
+    beyond_limit = 2  # a toggle, the limit of travel, lies before it
+    lost = 3  # no step, however short, follows the branch
+    open = 4  # the mechanism cannot be closed where it starts
+    not_determined = 5  # closed; but velocities do not follow from the driver's: a toggle, or branches too close to distinguish
+
+    @classmethod
+    def has_position(cls, status: Int[Array, "..."]) -> Bool[Array, "..."]:
+        """Tell of which values the position is known."""
+        return (status == cls.closed) | (status == cls.singular) | (status == cls.not_determined)
+
+
+class Points(NamedTuple):
+    """Positions along the values, their derivatives by the value, and what became of each; and the toggle, if one was met."""
+
+    q: Float[Array, "T n"]
+    dq: Float[Array, "T n"]
+    ddq: Float[Array, "T n"]
+    status: Int[Array, "T"]
+    dddq: Float[Array, "T n"]  # where branches meet
+    spacing: Float[Array, "T"]  # of the points of the branch beside it, likewise: h in crossing.py
+    limit: Float[Array, ""]  # the value at the toggle; infinite where none was met
+    limit_q: Float[Array, "n"]
+
+
+class _Search(NamedTuple):
+    """A root along the arc that is being bracketed by the rule of Illinois: secants, of which a side that stays counts half."""
+
+    sigma: Float[Array, ""]  # where the function was looked at last
+    value: Float[Array, ""]
+    other: Float[Array, ""]  # the other side of the bracket
+    other_value: Float[Array, ""]
+    tries: Int[Array, ""]
+
+
+class _State(NamedTuple):
+    X: Float[Array, "n+1"]
+    tau: Float[Array, "n+1"]
+    side: Float[Array, ""]  # of a meeting of branches
+    h: Float[Array, ""]
+    k: Int[Array, ""]  # the next value
+    trials: Int[Array, ""]
+    event: Int[Array, ""]  # a `Reached`, or what else is to be done
+    search: _Search
+    points: Points
+
+
+# Events beside the outcomes of `Reached`: the start is to be closed; X is the next value's; a toggle lies within the next step,
+# or the next value before that toggle, and is searched for.
+_START, _LANDS, _TOGGLE, _VALUE = -1, -2, -3, -4
+
+
+def follow(
+    curve: AbstractCurve,
+    s: Float[Array, ""],
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    points: Points,
+    first: int | Int[Array, ""],
+) -> Points:
+    """Find positions at values[first:], one after another, from a position q at the value s; those before are in `points`.
+
+    Of a batch one member follows another: side by side all would take as many steps as the slowest. Without derivatives.
+    """
+    if curve.by.xp is np:
+        with np.errstate(all="ignore"):  # positions that are not finite are not closed
+            return _follow(curve, s, q, values, points, first) if first < len(values) else points
+    return sequential(_follow, curve, s, q, values, points, first)
+
+
+def _follow(
+    curve: AbstractCurve,
+    s: Float[Array, ""],
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    points: Points,
+    first: int | Int[Array, ""],
+) -> Points:
+    by, xp = curve.by, curve.by.xp
+    X, targets = xp.append(q, s) / curve.units, values / curve.units[-1]
+    zero, none = xp.zeros((), X.dtype), xp.asarray(0)
+    state = _State(
+        X=X,
+        tau=xp.append(xp.zeros_like(X[:-1]), 1.0),
+        side=xp.ones((), X.dtype),
+        h=xp.asarray(FIRST_STEP, X.dtype),
+        k=xp.asarray(first),
+        trials=none,
+        event=xp.asarray(_START),
+        search=_Search(zero, zero, zero, zero, none),
+        points=points,
+    )
+    most = MAX_TRIALS + 4 * len(values)
+
+    def is_underway(state: _State) -> Bool[Array, ""]:
+        return (state.k < len(values)) & ((state.event == Reached.closed) | (state.event == _START) | (state.event <= _TOGGLE))
+
+    def body(state: _State) -> _State:
+        return _record(curve, by.while_loop(is_underway, lambda state: _try(curve, targets, most, state), state))
+
+    def goes_on(state: _State) -> Bool[Array, ""]:
+        return (is_underway(state) | (state.event == _LANDS)) & (state.trials < most)
+
+    state = by.while_loop(goes_on, body, state)
+    event = xp.where(is_underway(state), Reached.lost, state.event)
+    status = xp.where(np.arange(len(values)) >= state.k, event, state.points.status)
+    return state.points._replace(status=status)
+
+
+def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _State) -> _State:
+    """Look at one more point: the start, the end of a step towards the next value or right at it, or one of a search.
+
+    There is one corrector for all, since what is traced more often takes as many times as long to compile.
+    """
+    xp = curve.by.xp
+    X, h, target, starts, searches = state.X, state.h, targets[state.k], state.event == _START, state.event <= _TOGGLE
+    way = xp.where(target >= X[-1], 1.0, -1.0)
+    turn = xp.where(starts | (state.tau[-1] * way >= 0), 1.0, -1.0)
+    tau = turn * state.tau
+    slope = xp.abs(tau[-1])
+    wanted = xp.where(target == X[-1], 0.0, xp.abs(target - X[-1]) / xp.where(slope > 0, slope, 1.0))
+    lands = ~searches & ~starts & ((wanted <= h) & (slope > 0) | (target == X[-1]))
+    eta = xp.where(starts, 0.0, xp.where(searches, _secant(state.search, xp), xp.where(lands, wanted, h)))
+    ahead = X + eta * tau
+    ahead = xp.append(ahead[:-1], xp.where(lands, target, ahead[-1]))
+    at, closed = curve.correct(ahead, fixed=lands | starts)
+    turned, side, clearance = curve.tangent(at, tau)
+
+    def begin() -> _State:  # where branches meet, one of them is taken
+        return state._replace(X=at, tau=turned, side=side, event=xp.where(closed, _LANDS, Reached.open))
+
+    def narrow() -> _State:
+        return _narrow(curve, state, target, way, eta, at, turned, clearance)
+
+    def advance() -> _State:
+        return _advance(
+            curve,
+            state._replace(tau=tau, side=turn * state.side),
+            target,
+            way,
+            eta,
+            lands,
+            ahead,
+            at,
+            closed,
+            turned,
+            side,
+            clearance,
+            most,
+        )
+
+    cond = curve.by.cond
+    return cond(starts, begin, lambda: cond(searches, narrow, advance))
+
+
+def _choose(condition: Bool[Array, ""], a: T, b: T, xp: ArrayLibrary) -> T:
+    return jax.tree.map(lambda x, y: y if x is y else xp.where(condition, x, y), a, b)
+
+
+def _advance(
+    curve: AbstractCurve,
+    state: _State,
+    target: Float[Array, ""],
+    way: Float[Array, ""],
+    eta: Float[Array, ""],
+    lands: Bool[Array, ""],
+    ahead: Float[Array, "n+1"],
+    at: Float[Array, "n+1"],
+    closed: Bool[Array, ""],
+    turned: Float[Array, "n+1"],
+    side: Float[Array, ""],
+    clearance: Float[Array, ""],
+    most: int,
+) -> _State:
+    """Return the state after a step to `at`, of the length eta, if that step counts."""
+    xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
+    rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
+    near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
+    # A residual along what E^+ truncates stays; it is of second order in the step, and a step further is corrected again.
+    closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(at) <= CLOSED_TOL))
+    good = near & (turned @ tau >= LARGEST_BEND) & closed
+    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # only a close tangent leads across
+    good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # else on a branch that comes close
+    folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
+    passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
+    counts = good & ~folds & ~passed
+    shorter = xp.where(passed, 0.5 * eta, xp.where(good, h, 0.5 * eta))
+    longer = xp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), xp.minimum(1.5 * h, LONGEST_ARC), h)
+    lost = ~good & (0.5 * eta < SHORTEST_ARC) | (state.trials > most)
+    event = xp.where(lands & counts, _LANDS, xp.where(lost, Reached.lost, state.event))
+    bracket = _Search(eta, way * turned[-1], xp.zeros_like(eta), way * tau[-1], xp.zeros_like(state.search.tries))
+    return state._replace(
+        X=xp.where(counts, at, X),
+        tau=xp.where(counts, turned, tau),
+        side=xp.where(counts, side, state.side),
+        h=xp.where(folds, eta, xp.where(counts, longer, shorter)),
+        trials=state.trials + 1,
+        event=xp.where(folds, _TOGGLE, event),
+        search=bracket,
+    )
+
+
+def _secant(search: _Search, xp: ArrayLibrary) -> Float[Array, ""]:
+    """Return the zero of the secant of a bracket."""
+    a, fa, b, fb = search.other, search.other_value, search.sigma, search.value
+    slope = fb - fa
+    return xp.clip(b - fb * (b - a) / xp.where(slope != 0, slope, 1.0), xp.minimum(a, b), xp.maximum(a, b))
+
+
+def _narrow(
+    curve: AbstractCurve,
+    state: _State,
+    target: Float[Array, ""],
+    way: Float[Array, ""],
+    sigma: Float[Array, ""],
+    at: Float[Array, "n+1"],
+    tangent: Float[Array, "n+1"],
+    clearance: Float[Array, ""],
+) -> _State:
+    """Return the state of a search after it looked at sigma: for the toggle first, and then for the value if it lies before."""
+    xp, last, end = curve.by.xp, state.search, state.h
+    for_value = state.event == _VALUE
+    value = way * xp.where(for_value, target - at[-1], tangent[-1])
+    crosses = value * last.value < 0
+    other = xp.where(crosses, last.sigma, last.other), xp.where(crosses, last.value, 0.5 * last.other_value)
+    ended = (xp.abs(sigma - last.sigma) <= 2 * float(np.finfo(end.dtype).eps) * end) | (value == 0)
+    ended = ended | (last.tries + 1 >= MAX_SECANTS)
+    narrowed = state._replace(search=_Search(sigma, value, *other, last.tries + 1))
+
+    def beside() -> Array:
+        toggle, is_known = _at_seldom(curve, find_toggle, at, state.tau)
+        return xp.where(is_known, toggle, at)
+
+    at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), beside, lambda: at)
+    # At the toggle: the value lies behind it, at it to rounding, or before.
+    room = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
+    ahead = (target - at[-1]) * way
+    x, points = at * curve.units, state.points
+    beyond = points._replace(limit=x[-1], limit_q=x[:-1])
+    rest = xp.maximum(end - sigma, SHORTEST_ARC)
+    event = xp.where(ahead > room, Reached.beyond_limit, xp.where(ahead >= -room, _LANDS, _VALUE))
+    start = (target - state.X[-1]) * way
+    bracket = _Search(sigma, ahead, xp.zeros_like(sigma), start, xp.zeros_like(last.tries))
+    at_toggle = state._replace(event=event, search=bracket, h=xp.where(event == _LANDS, rest, end))
+    at_toggle = at_toggle._replace(X=xp.where(event == _LANDS, at, state.X), tau=xp.where(event == _LANDS, tangent, state.tau))
+    at_toggle = at_toggle._replace(points=_choose(event == Reached.beyond_limit, beyond, points, xp))
+    at_value = state._replace(X=at, tau=tangent, h=rest, event=xp.full_like(state.event, _LANDS))
+    return _choose(ended, _choose(for_value, at_value, at_toggle, xp), narrowed, xp)
+
+
+def _at_seldom(curve: AbstractCurve, function: Callable[..., T], *given: Array) -> T:
+    """Return function(curve, *given), which a program hardly ever reaches."""
+    return function(curve, *given) if curve.by.xp is np else call_seldom(function, curve, *given)
+
+
+def _record(curve: AbstractCurve, state: _State) -> _State:
+    """Store the point of the curve that is the next value's, where it is one, unless it is that of the start.
+
+    Near where branches meet, it and its derivatives are those of the branch's points on both sides.
+    """
+    by, xp = curve.by, curve.by.xp
+    X, tau, k, points, lands = state.X, state.tau, state.k, state.points, state.event == _LANDS
+    stores = lands & (state.trials > 0)
+    clearance = curve.clearance(X)
+    dq, ddq, rank = curve.derivatives(X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
+    current = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
+
+    def beside() -> tuple[Crossing, Array]:
+        other, is_known = _at_seldom(curve, find_crossing, X, tau)
+        return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, current), is_known
+
+    found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (current, xp.asarray(False)))
+    X, tau, dq, ddq, dddq, spacing = found
+    deficient = rank < len(X) - 1
+    doubtful = ~is_known & (deficient | (clearance < LOST_RANK))
+    status = xp.where(doubtful, Reached.not_determined, xp.where(deficient, Reached.singular, Reached.closed))
+    dq, ddq = (xp.where(doubtful, xp.nan, x) for x in (dq, ddq))
+    new = {"q": X[:-1] * curve.units[:-1], "dq": dq, "ddq": ddq, "status": status, "dddq": dddq, "spacing": spacing}
+    old = points._asdict()
+    points = points._replace(**{name: by.put(old[name], k, xp.where(stores, x, old[name][k])) for name, x in new.items()})
+    event = xp.where(lands, Reached.closed, state.event)
+    return state._replace(X=X, tau=tau, k=k + stores, event=event, points=points)
+
+
+def no_points(count: int, n: int, xp: ArrayLibrary) -> Points:
+    """Return points of which none is known yet."""
+    q, dq, ddq, dddq = (xp.zeros((count, n)) for _ in range(4))
+    status = xp.full(count, int(Reached.lost))
+    return Points(q, dq, ddq, status, dddq, xp.zeros(count), xp.asarray(np.inf), xp.full(n, np.inf))

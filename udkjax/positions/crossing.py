@@ -1,0 +1,185 @@
+"""A point of a curve where branches meet, or close to it, from points of the same branch on both sides.
+
+There E has a second null vector: Newton's method leaves the root of rounding in q, and divides it by the distance in q', by the
+square of that in q''. A branch is smooth all the same. So it is followed to twelve values around the point, two to seven steps h
+away on either side, where E is of use, and q, q' and q'' are those of the polynomials through these, whose errors are as h^12.
+The difference from ten values bounds them; of several h the one where it is least counts, if it is small, and only if the
+position closes to rounding. Where branches merely come close to each other, the curve turns between them, and it does not.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.positions.curve import AbstractCurve
+
+# Singular values of E, relative to the largest. Rounding errors of q, 1e-16 over sigma, are over sigma once more in q' and over
+# its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK all.
+NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
+CLOSE_DISTANCE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
+# h, scaled values. Where the next singularity of q(s) is one unit away, the polynomials err by 3e-10, 3e-15 and less; rounding
+# leaves 2e-13, 2e-12 and 1e-11 in q'' if sigma grows by one in a unit, and with the smallest h the nearest point is at NEAR_LOSS.
+SPACINGS = (0.04, 0.015, 0.005)
+# Steps h from the point to the nearest and to the farthest of the others, twelve in all: they multiply errors by 13. With fewer
+# the polynomials err more, with more or nearer ones rounding does.
+NEAREST_NODE, FARTHEST_NODE = 2, 7
+# Bounds on how the polynomials through twelve and ten values differ in q, q' and q'', scaled: a hundred times their error.
+ACCEPTED_DIFFERENCES = (1e-9, 1e-7, 1e-5)
+ROOT_STEPS = 6  # of Newton's method to the extremum of a polynomial: it doubles the digits, from two on
+
+
+def weights(last: int) -> np.ndarray:
+    """Return Lagrange's weights at zero of the nodes -last..-NEAREST_NODE and NEAREST_NODE..last."""
+    steps = nodes(last)
+    return np.array([np.prod([-m / (k - m) for m in steps if m != k]) for k in steps])
+
+
+def _slope_weights() -> np.ndarray:
+    """Return the weights with which values at the nodes, a unit apart, make the derivative at zero."""
+    steps = nodes(FARTHEST_NODE)
+    return weights(FARTHEST_NODE) * np.array([sum(-1 / m for m in steps if m != k) for k in steps])
+
+
+def nodes(last: int) -> np.ndarray:
+    """Return the numbers of steps from the point to the others, up to the `last` one on either side."""
+    side = np.arange(NEAREST_NODE, last + 1)
+    return np.concatenate([-side[::-1], side])
+
+
+class Crossing(NamedTuple):
+    """A point of a branch where branches meet, as its points on both sides say."""
+
+    at: Float[Array, "n+1"]
+    slope: Float[Array, "n+1"]  # the tangent
+    dq: Float[Array, "n"]
+    ddq: Float[Array, "n"]
+    dddq: Float[Array, "n"]
+    spacing: Float[Array, ""]  # h
+
+
+def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
+    """Find a point, q', q'' and q''' from both sides of it.
+
+    Args:
+        curve: the curve.
+        X: the point as it is known so far, of the value that counts.
+        tau: the direction of the branch there, roughly.
+
+    Returns:
+        The crossing that was found, and whether it is to be relied on.
+    """
+
+    def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
+        return _interpolate(curve, X, tau, h)
+
+    by, xp = curve.by, curve.by.xp
+    spacings = xp.asarray(SPACINGS, X.dtype)
+    *found, doubt = by.map(tried, spacings)
+    at, dq, ddq, dddq, h, doubt = (x[xp.argmin(doubt)] for x in (*found, spacings, doubt))
+    slope = xp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
+    slope = slope / xp.linalg.norm(slope) * xp.where(slope @ tau < 0, -1.0, 1.0)
+    return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
+
+
+def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Bool[Array, ""]]:
+    """Find a toggle where branches meet: where the value along the branch has an extremum, from points on both sides.
+
+    They lie at known distances along tau, of which q and the value are polynomials, as of the value elsewhere.
+
+    Args:
+        curve: the curve.
+        X: a point close to the toggle.
+        tau: the direction of the branch there, roughly.
+
+    Returns:
+        The toggle, and whether it is to be relied on.
+    """
+    by, xp = curve.by, curve.by.xp
+    found, doubt = by.map(lambda h: _extremum(curve, X, tau, h), xp.asarray(SPACINGS, X.dtype))
+    best = xp.argmin(doubt)
+    return found[best], doubt[best] < 1.0
+
+
+def _extremum(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array]:
+    """Return the extremum of the value by points h apart, and how far it is from being accepted: below one it is."""
+    by, xp = curve.by, curve.by.xp
+    along = NEAREST_NODE * h * xp.array([-1.0, 1.0])[:, None] * tau
+
+    def outward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        before, last = state
+        ahead = xp.where(k == NEAREST_NODE, X + along, last + (last - before))
+        at, are_closed = by.map(curve.correct, ahead)
+        inner = at + (xp.mean(at, 0) - at) / NEAREST_NODE  # a step h before the nearest
+        return (xp.where(k == NEAREST_NODE, inner, last), at), (at, are_closed)
+
+    start = xp.stack([X, X])
+    _, (sides, closed) = by.scan(outward, (start, start), xp.arange(NEAREST_NODE, FARTHEST_NODE + 1.0))
+    points = xp.concatenate([sides[::-1, 0], sides[:, 1]])  # (12, n + 1)
+    places = (points - X) @ tau / (FARTHEST_NODE * h)
+    level, all_of, fewer = points, [points[0]], [points[1]]  # divided differences, from the first point and from the second on
+    for k in range(1, len(points)):
+        level = (level[1:] - level[:-1]) / (places[k:] - places[:-k])[:, None]
+        all_of.append(level[0])
+        fewer += [level[1]] if k < len(points) - 2 else []
+    root = xp.zeros((), X.dtype)
+    for _ in range(ROOT_STEPS):
+        _, slope, bend = _evaluate_at(root, all_of, places)
+        root = xp.clip(root - slope[-1] / bend[-1], -1.0, 1.0)
+    at = _evaluate_at(root, all_of, places)[0]
+    doubt = xp.max(xp.abs(at - _evaluate_at(root, fewer, places[1:])[0])) / ACCEPTED_DIFFERENCES[0]
+    at = at - curve.plus(curve.slopes(at), NEAR_LOSS) @ curve.residual(at)  # the part that E resolves well is closed to rounding
+    known = xp.all(closed) & curve.is_closed(at) & (xp.abs(root) < 1.0) & xp.isfinite(doubt)
+    return at, xp.where(known, doubt, xp.inf)
+
+
+def _evaluate_at(x: Array, coefficients: list[Array], places: Array) -> tuple[Array, Array, Array]:
+    """Return Newton's polynomial, its slope and its second derivative at x."""
+    value, slope, bend = coefficients[-1], 0.0 * coefficients[-1], 0.0 * coefficients[-1]
+    for k in range(len(coefficients) - 2, -1, -1):
+        ahead = x - places[k]
+        bend, slope, value = bend * ahead + 2 * slope, slope * ahead + value, value * ahead + coefficients[k]
+    return value, slope, bend
+
+
+def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
+    by, xp = curve.by, curve.by.xp
+    slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)
+    ways = xp.array([-1.0, 1.0])
+    along = NEAREST_NODE * h * ways[:, None] * slope
+
+    def outward(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        before, last = state
+        ahead = xp.where(k == NEAREST_NODE, X + along, last + (last - before))
+        value = xp.where(k == NEAREST_NODE, ahead[:, -1:], (X[-1] + ways * k * h)[:, None])
+        at, are_closed = by.map(lambda x: curve.correct(x, fixed=True), xp.concatenate([ahead[:, :-1], value], 1))
+        inner = at + (xp.mean(at, 0) - at) / NEAREST_NODE  # a step h before the nearest
+        return (xp.where(k == NEAREST_NODE, inner, last), at), (at, are_closed)
+
+    start = xp.stack([X, X])
+    _, (sides, closed) = by.scan(outward, (start, start), xp.arange(NEAREST_NODE, FARTHEST_NODE + 1.0))
+    down, up = sides[:, 0], sides[:, 1]
+    points = xp.concatenate([down[::-1], up])  # (12, n + 1)
+    units = curve.units
+
+    def at_point(x: Array) -> tuple[Array, Array]:
+        dq, ddq, _ = curve.derivatives(x[-1] * units[-1], x[:-1] * units[:-1])
+        return dq, ddq
+
+    slopes = by.map(at_point, points)
+    scaled = points[:, :-1], slopes[0] * units[-1] / units[:-1], slopes[1] * units[-1] ** 2 / units[:-1]
+    all_of, fewer = weights(FARTHEST_NODE), np.pad(weights(FARTHEST_NODE - 1), 1)
+    q, dq, ddq = (xp.asarray(all_of @ x) for x in scaled)
+    dddq = xp.asarray(_slope_weights() @ scaled[2]) / h
+    doubts = [
+        xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)
+    ]
+    at = xp.append(q, X[-1])
+    E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
+    at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # the part that E resolves well is closed to rounding
+    known = xp.all(closed) & curve.is_closed(at) & (tau[-1] != 0)
+    doubt = xp.where(known, xp.max(xp.stack(doubts)), xp.inf)
+    doubt = xp.where(xp.isfinite(doubt), doubt, xp.inf)
+    dq, ddq, dddq = (x * units[:-1] / units[-1] ** k for k, x in ((1, dq), (2, ddq), (3, dddq)))
+    return at, dq, ddq, dddq, doubt

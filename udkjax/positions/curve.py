@@ -1,0 +1,196 @@
+"""The positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value: X = (q, s)."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.equations.constraints import gamma, psi
+from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
+from udkjax.equations.position_closure import ROUNDING_UNITS
+from udkjax.equations.scale_program import RANK_TOL
+from udkjax.pinv import SVD, Plus
+from udkjax.pinv.svd import SVDFactors
+from udkjax.positions.drive import Driven
+from udkjax.scene.fields import library_for, number
+from udkjax.scene.mechanism import Mechanism
+
+NEWTON_STEPS = 8  # corrections; three are usual
+_Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
+
+
+class AbstractCurve(ABC):
+    """The positions of a driven mechanism, as a curve in scaled coordinates and value."""
+
+    weights: Any  # of the rows
+    units: Any  # of coordinates and value
+    rows: Any  # the scales of the rows
+    independent: tuple[int, ...]  # the rows that depend on no others
+
+    by: ClassVar[ControlFlow]
+
+    @abstractmethod
+    def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
+        """Return the weighted rows of Psi."""
+
+    @abstractmethod
+    def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
+        """Return E, the derivatives of the residual."""
+
+    @abstractmethod
+    def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Any:
+        """Return E^+, truncated where singular values are below `tol` of the largest."""
+
+    @abstractmethod
+    def inverse_singular_values(self, plus: Any) -> Float[Array, "k"]:
+        """Return 1/sigma of E^+ in the order of descending sigma, zero for what is truncated."""
+
+    @abstractmethod
+    def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
+        """Return gamma: Psi_q a = gamma holds Psi_dot at zero."""
+
+    def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
+        """Return True if the residual is what rounding leaves of it."""
+        xp = self.by.xp
+        return self.violation(X) <= ROUNDING_UNITS * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
+
+    def violation(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
+        """Return the largest row of Psi in units of its scale."""
+        xp = self.by.xp
+        return xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
+
+    def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
+        """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
+        xp = self.by.xp
+        if not len(self.rows):  # nothing binds the coordinates
+            return X, xp.asarray(True)
+
+        def body(state: _Correction) -> _Correction:
+            X, k, _ = state
+            E = self.slopes(X)
+            E = xp.where(fixed & (np.arange(len(X)) == len(X) - 1), 0.0, E)
+            return X - self.plus(E) @ self.residual(X), k + 1, self.is_closed(X)
+
+        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
+            _, k, closed = state
+            return (k < NEWTON_STEPS) & ~closed
+
+        X, _, closed = self.by.while_loop(is_unfinished, body, (X, xp.asarray(0), xp.asarray(False)))
+        return X, closed
+
+    def clearance(self, X: Float[Array, "n+1"]) -> Any:
+        """Return the distance of E from losing rank, as where branches meet: its n-th singular value over the largest."""
+        xp, E = self.by.xp, self.slopes(X)
+        if min(E.shape) < len(X) - 1:
+            return xp.zeros(())
+        if xp is np and not np.all(np.isfinite(E)):  # NumPy refuses to decompose it
+            return np.asarray(np.nan)
+        sigma = xp.linalg.svd(E, compute_uv=False)
+        return sigma[len(X) - 2] / xp.where(sigma[0] > 0, sigma[0], 1.0)
+
+    def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> tuple[Array, Array, Array]:
+        """Return the tangent that keeps the direction of one before, on which side of a meeting of branches it is, and clearance.
+
+        The side is the sign of det [E; tau] of independent rows, +-1: along a branch it changes where that meets another alone,
+        and not at toggles. It is 1 where it is not known which rows are independent. The clearance is `clearance(X)`, of the
+        same decomposition, or zero where E^+ is truncated.
+        """
+        xp, E = self.by.xp, self.slopes(X)
+        plus = self.plus(E)
+        tau = before - plus @ (E @ before)
+        inverse = self.inverse_singular_values(plus)
+        last = inverse[len(X) - 2] if min(E.shape) >= len(X) - 1 else xp.zeros(())
+        clearance = xp.where(last == 0, 0.0, inverse[0] / xp.where(last == 0, 1.0, last)) if len(inverse) else last
+        size = xp.linalg.norm(tau)
+        tau = tau / xp.where(size > 0, size, 1.0)
+        A = xp.concatenate([E[np.array(self.independent, int)], tau[None]])
+        return tau, xp.linalg.slogdet(A)[0] if A.shape[0] == A.shape[1] else xp.ones(()), clearance
+
+    def derivatives(self, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
+        """Return q' = dq/ds and q'' (n,) at a closed position, and the rank of Psi_q: Psi_q q' = -Psi_s, Psi_q q'' = gamma."""
+        W, w = self.units[:-1], self.weights
+        E = self.slopes(self.by.xp.append(q, s) / self.units)
+        inverse = self.plus(E[:, :-1])
+        dq = -W * (inverse @ (E[:, -1] / self.units[-1]))
+        return dq, W * (inverse @ (w * self.gamma(s, q, dq))), inverse.rank
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Curve(AbstractCurve):
+    """The positions of a mechanism whose numbers may be traced."""
+
+    mechanism: Mechanism
+    weights: Float[Array, "m"]
+    units: Float[Array, "n+1"]
+    rows: Float[Array, "m"]
+    independent: tuple[int, ...] = field(metadata={"static": True})
+
+    by: ClassVar[ControlFlow] = BY_JAX
+
+    @classmethod
+    def of(cls, driven: Driven) -> "Curve":
+        scales = driven.analysis.scales
+        scale = scales.coordinates(driven.analysis.coordinates)
+        units = library_for((scale, driven.unit)).append(scale, driven.unit)
+        independent = driven.analysis.independent_rows
+        return cls(driven.mechanism, scales.weights, number(units), scales.rows, independent)
+
+    def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
+        x = X * self.units
+        return self.weights * psi(self.mechanism, x[-1], x[:-1])
+
+    def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
+        return jax.jacfwd(self.residual)(X)
+
+    def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Plus:
+        return SVD(tol).plus(E)
+
+    def inverse_singular_values(self, plus: Plus) -> Float[Array, "k"]:
+        factors = plus.factors
+        assert isinstance(factors, SVDFactors)
+        return factors.inverse
+
+    def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
+        return gamma(self.mechanism, s, q, v)
+
+
+@dataclass(frozen=True)
+class KnownCurve(AbstractCurve):
+    """The positions of a mechanism of known numbers, by NumPy on the scene's programs: nothing is compiled for them."""
+
+    terms: DenseTerms
+    weights: Float[np.ndarray, "m"]
+    units: Float[np.ndarray, "n+1"]
+    rows: Float[np.ndarray, "m"]
+    independent: tuple[int, ...]
+
+    by: ClassVar[ControlFlow] = BY_NUMPY
+
+    @classmethod
+    def of(cls, driven: Driven) -> "KnownCurve":
+        scales = jax.tree.map(np.asarray, driven.analysis.scales)
+        units = np.append(np.tile([scales.length, scales.length, 1.0], driven.analysis.coordinates // 3), driven.unit)
+        independent = driven.analysis.independent_rows
+        return cls(DenseTerms(driven.mechanism), scales.weights, units, scales.rows, independent)
+
+    def residual(self, X: Any) -> Any:
+        x = X * self.units
+        return self.weights * self.terms.psi(x[-1], x[:-1])
+
+    def slopes(self, X: Any) -> Any:
+        x = X * self.units
+        return self.weights[:, None] * np.column_stack(self.terms.slopes(x[-1], x[:-1])) * self.units
+
+    def plus(self, E: Any, tol: float = RANK_TOL) -> TruncatedPseudoinverse:
+        return TruncatedPseudoinverse.of(E, tol)
+
+    def inverse_singular_values(self, plus: TruncatedPseudoinverse) -> np.ndarray:
+        return plus.inverse
+
+    def gamma(self, s: Any, q: Any, v: Any) -> Any:
+        return self.terms.gamma(s, q, v)

@@ -1,0 +1,349 @@
+"""Coordinate that drives a mechanism through its positions: its value takes the place of time.
+
+A mechanism whose driver prescribes `coordinate = t` has the coordinate's value s for its time: Psi(s, q) = 0 are its positions,
+Psi_dot = 0 gives dq/ds, and Psi_q a = gamma gives d2q/ds2, by the equations that serve every other mechanism.
+"""
+
+from collections.abc import Callable, Container, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Literal, NamedTuple, cast, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, PyTree
+
+from udkjax.annotations import Scalar
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.constraints import psi
+from udkjax.equations.dense_rows import DenseTerms, KinematicRows
+from udkjax.equations.redundancy import kinematic_rows, ordinary_position, owners_of_row
+from udkjax.pinv.row_spaces import null_space
+from udkjax.positions.channels import channel_of, point_of_pin
+from udkjax.printing import PrintsLine
+from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
+from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.drivers import Driver, Motion, Polynomial
+from udkjax.scene.fields import Numbers, is_traced, names, number, number_called
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.mechanism import Mechanism, Origin
+from udkjax.scene.wording import join_names
+
+CoordinateName = Literal["angle", "x", "y", "distance"]
+DRIVEN = get_args(CoordinateName)
+MOVES = 1e-6  # of the longest direction that is free, in the metric of the links' arms and radians: less is rounding
+
+
+class Coordinate(PrintsLine):
+    """A coordinate of body 2 relative to body 1 that may be driven, as those of a `Driver`.
+
+    `angle`: theta2 - theta1 (rad), which counts turns; `x`, `y`: point 2 from point 1 in body 1's frame (m); `distance` (m).
+
+    Args:
+        bodies: the names of two bodies, or "ground".
+        coordinate: "angle", "x", "y" or "distance".
+        points: each in its own body's frame (m); by default the origins.
+        axis: for x and y: the direction of x in body 1's frame (rad); by default its own.
+    """
+
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
+    coordinate: CoordinateName = eqx.field(static=True, default="angle")
+    points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
+    axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
+
+    @classmethod
+    def of(cls, driver: Driver) -> "Coordinate":
+        """Return the coordinate that a driver prescribes."""
+        return cls(driver.bodies, driver.coordinate, driver.points, driver.axis)
+
+    def driver(self, motion: Motion) -> Driver:
+        """Return the driver that prescribes this coordinate."""
+        return Driver(self.bodies, self.coordinate, motion, self.points, self.axis)
+
+    @property
+    def effort_unit(self) -> str:
+        """The unit of what acts along it."""
+        return self.driver(_constant(0.0)).effort_unit
+
+
+Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
+
+
+class ValueMotion(Motion):
+    """The value of a coordinate, in place of time, from an `origin` on (rad, m)."""
+
+    origin: Float[Array, ""] = eqx.field(converter=number_called("origin"), default=0.0)
+
+    def __call__(self, t: Scalar) -> Float[Array, ""]:
+        return self.origin + t
+
+
+class Driven(NamedTuple):
+    """A mechanism that is driven by a value s in place of time."""
+
+    mechanism: Mechanism
+    analysis: Analysis
+    name: str  # of the driver; empty where s is time itself
+    row: int  # of the driver in Psi; -1 where s is time itself
+    unit: Float[Array, ""]  # the unit of s: one radian, the scale of a length, the mechanism's own time
+
+    @property
+    def is_angle(self) -> bool:
+        """True if s is an angle."""
+        return bool(self.name) and self.mechanism.drivers[self.name].coordinate == "angle"
+
+    @property
+    def value_unit(self) -> str:
+        """The unit of s."""
+        return "rad" if self.is_angle else "m" if self.name else "s"
+
+    def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
+        """Return the value of the coordinate (rad, m) in a position: of NumPy, where all is known."""
+        if is_traced((self.mechanism, q)):
+            return psi(self.mechanism, 0.0, q)[self.row]
+        return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
+
+
+def drive(mechanism: Mechanism, driver: Drive, t: Scalar = 0.0, held: Mapping[str, Scalar] | None = None) -> Driven:
+    """Return the mechanism driven by one coordinate; other drivers hold the value that they have at time t (s).
+
+    `held` gives other values, of drivers or of further coordinates, by their names. Raises `SceneError` where there is no such
+    driver or coordinate, or where positions do not follow from its value.
+    """
+    given = mechanism, driver, t, held
+    with _at_once(given):
+        return _drive(*given)
+
+
+def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Scalar] | None) -> Driven:
+    if driver is None:
+        if held:
+            problem = "held is given with driver=None, where all drivers go along time: name the one that drives"
+            raise SceneError([problem], mechanism.name)
+        analysis = analyse(mechanism)
+        if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # nor where that is not known, of traced numbers
+            problem = "driver is None, and the scene has no driver: name a coordinate that drives it, such as"
+            raise SceneError([f"{problem} {suggested_coordinate(mechanism)}"], mechanism.name)
+        _require_determinate(mechanism, analysis, "all drivers")
+        rate = analysis.scales.rate
+        return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
+    names: dict[str, str] = {}  # of what is held, by the drivers that hold it
+    for key, value in (held or {}).items():
+        try:
+            holder, element = _element(mechanism, key)
+        except SceneError as error:
+            raise SceneError([f"held: {problem}" for problem in error.problems], mechanism.name) from None
+        names[holder] = f"{quote(key)}, which `held` gives"
+        mechanism = _with_driver(mechanism, holder, element, _constant(value))
+    name, element = _element(mechanism, driver)
+    found = _add_driver(mechanism, name, element, t)
+    known = _from_guess(found, name)
+    analysis = analyse(known)
+    called = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
+    if known.is_concrete and analysis.redundant_rows != ():
+        with jax.ensure_compile_time_eval():  # while something else is traced, too
+            require_free(known, with_drivers(known, {}), name, called, names)
+    _require_determinate(found, analysis, called)
+    row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
+    rows = analysis.scales.rows
+    unit = rows[row] if isinstance(rows, Tracer) else number(np.asarray(rows)[row])
+    return Driven(found.without_origin, analysis, name, row, unit)
+
+
+def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
+    """Return the function that gives the value (rad, m) of a driver's coordinate, or of another, of q (bodies, 3)."""
+    element = element_of(mechanism, coordinate)
+    places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
+
+    def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
+        rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # of which JAX would compile a program to take a row
+        return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
+
+    return value
+
+
+def constant_speed(mechanism: Mechanism, driver: str) -> float:
+    """Return the speed (rad/s, m/s) of a driver that moves at a constant one; 0 of all other coordinates."""
+    motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
+    return float(np.asarray(motion.coefficients)[1]) if isinstance(motion, Polynomial) and len(motion.coefficients) == 2 else 0.0
+
+
+def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
+    """Return the mechanism that its drivers no longer hold, with these forces instead of its own if any are given."""
+    with jax.ensure_compile_time_eval():
+        origin = mechanism.origin and Origin(with_drivers(mechanism.origin.mechanism, {}))
+    return with_drivers(mechanism, {}, forces, origin)
+
+
+def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
+    """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
+    driver = element.driver(_constant(0.0)).complete()
+    if is_traced((driver, frames)):
+        return jnp.asarray(driver.residual(0.0, *frames)[0])
+    return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
+
+
+def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
+    """Return the coordinate of a driver, by the driver's name or its own. Raises `SceneError`."""
+    return _element(mechanism, driver)[1]
+
+
+def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
+    """Return the coordinate of a name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
+
+    These are names of channels, as measurements have them. Raises `SceneError`.
+    """
+    try:
+        channel = channel_of(mechanism, text)
+    except ValueError as problem:
+        drivers = ", ".join(map(quote, mechanism.driver_names)) or "none"
+        cure = suggestion(text, mechanism.driver_names) or f"; drivers: {drivers}; coordinates: body.NAME.angle, joint.NAME.angle"
+        raise SceneError([f"{quote(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
+    if channel.quantity not in DRIVEN:
+        raise SceneError([f"{quote(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
+    kind = cast(CoordinateName, channel.quantity)
+    with jax.ensure_compile_time_eval():
+        if len(channel.bodies) == 2 and (kind == "angle" or channel.points):
+            return Coordinate(channel.bodies, kind, channel.points or None)
+        if channel.owner:
+            body, point = point_of_pin(mechanism, channel.owner)
+            return Coordinate((GROUND, body), kind, [(0.0, 0.0), point])
+        return Coordinate((GROUND, *channel.bodies), kind, [(0.0, 0.0), *channel.points])
+
+
+def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coordinate]:
+    if isinstance(driver, str) and driver in mechanism.drivers:
+        return driver, Coordinate.of(mechanism.drivers[driver])
+    element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
+    return choose_name("value", mechanism.constraints), element
+
+
+def choose_name(name: str, taken: Container[str]) -> str:
+    """Return a name that is not taken."""
+    while name in taken:
+        name += "'"
+    return name
+
+
+def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar) -> Mechanism:
+    """Return the mechanism with a driver of this name that goes along its own value; all others hold theirs."""
+    known = mechanism.origin and mechanism.origin.mechanism
+    with jax.ensure_compile_time_eval():
+        origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
+    return with_drivers(mechanism, {**_halted(mechanism, t), name: element.driver(ValueMotion())}, origin=origin)
+
+
+def with_halted_drivers(mechanism: Mechanism, t: Scalar) -> Mechanism:
+    """Return the mechanism whose drivers stand still where they are at time t (s)."""
+    return with_drivers(mechanism, _halted(mechanism, t))
+
+
+def _halted(mechanism: Mechanism, t: Scalar) -> dict[str, Driver]:
+    return {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
+
+
+def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
+    """Return the mechanism with one more driver, or with another motion of one that is there."""
+    drivers = {**mechanism.drivers, name: element.driver(motion)}
+    known = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
+    found = with_drivers(mechanism, drivers)
+    if known is None or found.is_concrete:
+        return found
+    with jax.ensure_compile_time_eval():
+        element = _known_element(known, name, element)
+        motion = _constant(value_of(known, element)(known.q0))  # rows are counted as if the guess's value were held
+        of_origin = {**known.drivers, name: element.driver(motion)}
+        return with_drivers(mechanism, drivers, origin=Origin(with_drivers(known, of_origin)))
+
+
+def with_drivers(
+    mechanism: Mechanism,
+    drivers: Mapping[str, Driver],
+    forces: Mapping[str, ForceElement] | None = None,
+    origin: Origin | None = None,
+) -> Mechanism:
+    """Return the mechanism with these drivers, and with these forces instead of its own if any are given."""
+    forces = dict(mechanism.forces) if forces is None else forces
+    bodies, joints = dict(mechanism.bodies), dict(mechanism.joints)
+    return Mechanism(bodies, joints, drivers, forces, mechanism.gravity, mechanism.name, origin)
+
+
+def _known_element(known: Mechanism, name: str, element: Coordinate) -> Coordinate:
+    """Return the same coordinate, with points and an axis that are not traced."""
+    if name in known.drivers:
+        return Coordinate.of(known.drivers[name])
+    return jax.tree.map(lambda x: jnp.zeros(x.shape) if isinstance(x, Tracer) else x, element)
+
+
+def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
+    """Return the mechanism whose driver starts from its value in the initial guess: an analysis closes it at time zero."""
+    mechanism = mechanism if mechanism.origin is None else mechanism.origin.mechanism
+    with _at_once(mechanism):
+        value = jax.lax.stop_gradient(value_of(mechanism, name)(mechanism.q0))
+        return mechanism.with_parameters({f"driver.{name}.motion.origin": value})
+
+
+def _at_once(given: PyTree) -> AbstractContextManager:
+    """Compute with known numbers at once, also while something else is traced."""
+    traced = is_traced(given)
+    return nullcontext() if traced else jax.ensure_compile_time_eval()
+
+
+def _constant(value: Numbers) -> Polynomial:
+    return Polynomial(jnp.stack([value]) if isinstance(value, Tracer) else np.reshape(value, 1))
+
+
+def _value_or(x: Scalar, otherwise: float) -> Scalar:
+    return otherwise if isinstance(x, Tracer) else x
+
+
+def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) -> None:
+    free = analysis.degrees_of_freedom
+    if free:
+        problem = f"driven by {driven}, it keeps {free} degree{'s' * (free > 1)} of freedom: its positions do not follow"
+        loose = [body for body, moves in free_motion(mechanism).items() if moves.any()] if mechanism.is_concrete else []
+        those = f"what still moves, {join_names(loose)}," if 0 < len(loose) < len(mechanism.bodies) else "the others"
+        raise SceneError([f"{problem}; drive or hold {those} by drivers of the scene"], mechanism.name)
+
+
+def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
+    """Return which coordinates x, y, angle of each body may move at the initial guess of known numbers."""
+    rows = KinematicRows(mechanism)
+    free = null_space(rows.at(0.0, np.ravel(mechanism.q0))[2], MOVES)
+    moves = np.linalg.norm(free, axis=0).reshape(-1, 3) > MOVES
+    return dict(zip(mechanism.body_names, moves, strict=True))
+
+
+def suggested_coordinate(mechanism: Mechanism) -> str:
+    """Return the name of a coordinate that moves and may drive: an angle if there is one; any, of numbers that are not known."""
+    moves = free_motion(mechanism) if mechanism.is_concrete else {}
+    free = [f"body.{body}.{name}" for k, name in ((2, "angle"), (0, "x"), (1, "y")) for body in moves if moves[body][k]]
+    return (free or [f"body.{mechanism.body_names[0]}.angle"])[0]
+
+
+def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:
+    """Refuse a driver whose coordinate the joints and the other drivers hold; numbers are known.
+
+    It is held where its row of Psi_q depends on theirs in an ordinary position.
+
+    Args:
+        driven: the mechanism with the driver.
+        bare: the same without any driver.
+        name: of the driver in the mechanism.
+        driver: its name in the message.
+        names: names of other drivers in the message, if not their own.
+
+    Raises:
+        SceneError: it names the drivers that hold the coordinate.
+    """
+    q = ordinary_position(bare)
+    involved = None if q is None else owners_of_row(kinematic_rows(driven), 0.0, q, name)
+    if involved is None:
+        return
+    holding = [names.get(other, f"driver {quote(other)}") for other in driven.driver_names if other in involved]
+    if not holding:
+        raise SceneError([f"{driver} cannot be driven: the joints leave it no motion"], driven.name)
+    cure = "drive that, or take it out of the scene" if len(holding) == 1 else "drive one of them, or take one out of the scene"
+    raise SceneError([f"{driver} is held by {join_names(holding)}: {cure}"], driven.name)

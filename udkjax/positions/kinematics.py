@@ -1,0 +1,322 @@
+"""Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
+
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from udkjax.annotations import Scalar
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.control_flow import BY_JAX, ControlFlow, solve
+from udkjax.positions.assembly import State, assemble
+from udkjax.positions.branches import SAME_POSITION
+from udkjax.positions.carried_bodies import carried_bodies
+from udkjax.positions.continuation import Points, Reached, follow, no_points
+from udkjax.positions.curve import AbstractCurve, Curve, KnownCurve
+from udkjax.positions.drive import Drive, Driven, drive, element_of
+from udkjax.positions.march import MarchResult, can_march, march, march_at_once
+from udkjax.positions.position_derivatives import with_derivative, with_derivatives
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
+from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import Frame, frame_over_time
+from udkjax.scene.checks import SceneError
+from udkjax.scene.description import format_pose, size_of
+from udkjax.scene.fields import Numbers, library_for, number, stored
+from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
+
+UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
+FULL_TURN = 2.0 * np.pi  # rad
+
+Rows: TypeAlias = Float[Array, "T n"]
+
+
+class Kinematics(PrintsTable):
+    """Positions over the values of a driver, and velocities and accelerations there; not a number where it does not get.
+
+    `status` is a `Reached` for each value; where velocities do not follow from the driver's (`not_determined`), they are not
+    numbers. `limit` is the value at the toggle that ended it, and `limit_q` the position there, which has no derivative; both are
+    infinite where none did.
+
+    Attributes:
+        q: x, y (m) and angle (rad) of each body.
+        v: their rates (m/s, rad/s).
+        a: the rates of these (m/s^2, rad/s^2).
+        status: the number of a `Reached` for each value.
+        limit: the value at the toggle that ended it; infinite where none did.
+        limit_q: the position at that toggle.
+        bodies: the names of the bodies, in the order of q.
+    """
+
+    values: Float[Array, "T"]  # of the driver (rad, m), or of time (s)
+    q: Float[Array, "T bodies 3"]
+    v: Float[Array, "T bodies 3"]
+    a: Float[Array, "T bodies 3"]
+    rate: Float[Array, "T"]  # of the driver (1/s)
+    status: Int[Array, "T"]
+    limit: Float[Array, ""]
+    limit_q: Float[Array, "bodies 3"]
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    unit: str = eqx.field(static=True, default="")  # of the values
+
+    _units = units(q="m, m, rad", v="m/s, m/s, rad/s", a="m/s², m/s², rad/s²", limit_q="m, m, rad")
+
+    def _table(self) -> PrintedTable:
+        status, counts = np.unique(np.asarray(self.status), return_counts=True)
+        became = ", ".join(f"{n} {Reached(int(code))}" for code, n in zip(status, counts, strict=True))
+        if np.ndim(self.status) > 1:
+            return fields_table(self, self._units, f"kinematics of {len(self.status)} members: {became}")
+        rows = [("values", format_numbers(self.values, self.unit)), ("became", became)]
+        if np.isfinite(np.asarray(self.limit)):
+            rows.append(("toggle at", format_numbers(self.limit, self.unit)))
+        q, good = np.asarray(self.q), np.flatnonzero(np.asarray(self.reached))
+        if good.size:
+            size, ends = size_of(q), zip(q[good[0]], q[good[-1]], strict=True)
+            poses = [f"from {format_pose(first, size)} to {format_pose(last, size)}" for first, last in ends]
+            rows += zip(self.bodies, poses, strict=True)
+        return PrintedTable("kinematics", rows)
+
+    @property
+    def reached(self) -> Bool[Array, "T"]:
+        """True for each value that was reached."""
+        return stored(Reached.has_position(library_for(self.status).asarray(self.status)))
+
+    @property
+    def ts(self) -> Float[Array, "T"]:
+        """The values in the place of time: a kinematic motion may stand where a `Solution` does, if its values are times."""
+        return self.values
+
+    def frame(self, body: str) -> Frame:
+        """Return the frame of a body, each of its numbers (T,)."""
+        return frame_over_time(self.bodies, self.q, self.v, body)
+
+    def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
+        """Return the path (m) of a point given in the body's own frame (m): a coupler curve. `udkjax.path` knows pins, too."""
+        return jnp.stack(self.frame(body).point(number(point)), -1)
+
+
+class Travel(PrintsTable):
+    """Values (rad, m) between which a coordinate can be driven; infinite where nothing ends it.
+
+    `lower_q` and `upper_q` are the positions at the toggles; infinite as well where there is none.
+
+    Attributes:
+        lower: the lower end (rad, m); -inf where nothing ends it.
+        upper: the upper end (rad, m); inf where nothing ends it.
+        lower_q: the position at the lower toggle.
+        upper_q: the position at the upper toggle.
+        unit: of the coordinate.
+    """
+
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    lower_q: Float[Array, "bodies 3"]
+    upper_q: Float[Array, "bodies 3"]
+    status: Int[Array, "2"]  # a `Reached` of each: `beyond_limit` where a toggle was found
+    unit: str = eqx.field(static=True, default="")
+
+    _units = units(lower_q="m, m, rad", upper_q="m, m, rad")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.lower):
+            given = {"lower": self.unit, "upper": self.unit, **self._units}
+            return fields_table(self, given, f"travel of {np.size(self.lower)} members")
+        rows = []
+        for name, value, code in zip(("lower", "upper"), (self.lower, self.upper), np.asarray(self.status), strict=True):
+            at = format_numbers(value, self.unit)
+            rows.append(
+                (
+                    name,
+                    f"{at}, a toggle"
+                    if np.isfinite(value)
+                    else "no limit"
+                    if code == Reached.closed
+                    else f"{Reached(int(code))}",
+                )
+            )
+        return PrintedTable("travel", rows)
+
+
+@checked
+def kinematics(
+    mechanism: Mechanism,
+    driver: Drive,
+    values: Float[ArrayLike, "T"] | Sequence[float],
+    state: State | None = None,
+    rate: Float[ArrayLike, "*T"] = 1.0,
+    acceleration: Float[ArrayLike, "*T"] = 0.0,
+    held: Mapping[str, Scalar] | None = None,
+) -> Kinematics:
+    """Return the positions Psi(s, q) = 0 of a mechanism over the values s of a driver, one after another on one branch.
+
+    With Psi_q q' = -Psi_s and Psi_q q'' = gamma, velocities are q' s_dot and accelerations q'' s_dot^2 + q' s_ddot.
+
+    The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
+    followed, the motion ends, with a `status` that says why. Branches closer than some 0.003 rad of transmission angle are taken
+    for branches that meet. Toggles, where the driver can get no farther, are found to rounding.
+    Redundant constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any
+    order by every number of the mechanism and by the values. Where branches meet (`Reached.singular`) they have first
+    derivatives, but none, not a number, by what parts the branches, as a length does that one of two equal cranks alone has;
+    where velocities do not follow (`not_determined`) they have none by what moves the position.
+
+    Args:
+        mechanism: a mechanism of one degree of freedom once its drivers hold.
+        driver: a driver of the scene, a coordinate by its name (`body.crank.angle`, `joint.B.angle`, `body.slider.x`), or a
+            `Coordinate`; None: all drivers, along the times `values`.
+        values: values of the driver (rad, m), or times (s), in the order in which they are reached.
+        state: a position on the branch; by default the initial guess, assembled.
+        rate: s_dot, for all values or each (rad/s, m/s; 1 for times).
+        acceleration: s_ddot (rad/s^2, m/s^2).
+        held: values that other drivers or coordinates hold, by name; drivers hold the one that they have at time 0.
+
+    Returns:
+        A `Kinematics`: q, v, a (T, bodies, 3) and a status for each value.
+
+    Raises:
+        SceneError: no such driver or coordinate, or positions do not follow from it.
+    """
+    values, rate, acceleration = number(values), number(rate), number(acceleration)
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"values must be a list of at least one number, not of the shape {values.shape}; batch it by jax.vmap")
+    for name, given in (("rate", rate), ("acceleration", acceleration)):
+        if given.shape not in ((), values.shape):
+            raise ValueError(
+                f"{name} must be one number, or one for each of the {len(values)} values; its shape is {given.shape}"
+            )
+    first = values[0] if isinstance(values, Tracer) else np.asarray(values)[0]
+    driven, q = _start(mechanism, driver, first, state, held)
+    return solve(_kinematics, driven, q, values, rate, acceleration, mechanism.body_names)
+
+
+@checked
+def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, Scalar] | None = None) -> Travel:
+    """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
+
+    Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. Bodies that hang on a single other
+    one, as a free wheel or a pendulum, limit nothing: at the toggles they are as they were to it. `lower` and `upper` have exact
+    derivatives by every number of the mechanism.
+    """
+    if driver is None:
+        raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
+    carried = carried_bodies(mechanism, driver, held)
+    if not carried.carrier:
+        driven, q = _start(mechanism, driver, 0.0, state, held)
+        return solve(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
+    is_driver = isinstance(driver, str) and driver in mechanism.drivers
+    coordinate = driver if is_driver else element_of(mechanism, driver)  # a pin may be of what is left out
+    start = assemble(mechanism, 0.0, state, throw=False).q
+    rest = start[carried.kept(len(start))]
+    found = travel(carried.without(mechanism), coordinate, State(rest, jnp.zeros_like(rest)), held)
+    lower_q, upper_q = (carried.carry(start, jax.lax.stop_gradient(q)) for q in (found.lower_q, found.upper_q))
+    return eqx.tree_at(lambda x: (x.lower_q, x.upper_q), found, (lower_q, upper_q))
+
+
+def _kinematics(
+    driven: Driven,
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    rate: Float[Array, "*T"],
+    acceleration: Float[Array, "*T"],
+    bodies: tuple[str, ...],
+    by: ControlFlow,
+) -> Kinematics:
+    xp = by.xp
+    points = _solve(driven, driven.value(q) if driven.name else values[0], q, values, by)
+    rate, acceleration = (xp.broadcast_to(x, values.shape) for x in (rate, acceleration))
+    v = points.dq * rate[:, None]
+    a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
+    q, v, a = (xp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
+    limit_q, unit = points.limit_q.reshape(-1, 3), driven.value_unit
+    return Kinematics(values, q, v, a, rate, points.status, points.limit, limit_q, bodies, unit)
+
+
+def _travel(driven: Driven, q: Float[Array, "n"], far: Scalar, by: ControlFlow) -> Travel:
+    xp, s = by.xp, driven.value(q)
+    ways = xp.array([-1.0, 1.0])
+    down_up = by.vmap(lambda way: _solve(driven, s, q, stop_gradients(xp.asarray(s + way * far)[None]), by, False))(ways)
+    down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
+    lower, upper = (xp.where(p.status[0] == Reached.beyond_limit, p.limit, way * np.inf) for p, way in ((down, -1), (up, 1)))
+    lower_q, upper_q = (p.limit_q.reshape(-1, 3) for p in (down, up))
+    return Travel(lower, upper, lower_q, upper_q, xp.stack([down.status[0], up.status[0]]), driven.value_unit)
+
+
+def _start(
+    mechanism: Mechanism, driver: Drive, start: Scalar, state: State | None, held: Mapping[str, Scalar] | None
+) -> tuple[Driven, Float[Array, "n"]]:
+    """Return the mechanism driven, and the closed position that it starts from; at time `start`, if that drives it."""
+    driven = drive(mechanism, driver, 0.0, held)
+    if driver is None:
+        return driven, _assemble(driven.mechanism, start, state, driven.analysis)
+    q = _assemble(mechanism, 0.0, state, analyse(mechanism))
+    if held:
+        at_rest = State(q.reshape(-1, 3), jnp.zeros((len(q) // 3, 3)))
+        q = _assemble(driven.mechanism, driven.value(q), at_rest, driven.analysis)
+    return driven, q
+
+
+def _assemble(mechanism: Mechanism, t: Scalar, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
+    q = assemble(mechanism, t, state, throw=False, analysis=analysis).q
+    return library_for(q).ravel(q)
+
+
+def _solve(
+    driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], by: ControlFlow, fast: bool = True
+) -> Points:
+    """Solve by machine code as far as its steps are to be relied on (if `fast`), and by continuation from there on."""
+    xp, is_traced = by.xp, by is BY_JAX
+    curve = (Curve if is_traced else KnownCurve).of(driven)
+    points, first = no_points(len(values), len(q), xp), xp.asarray(0)
+    given = driven.mechanism, driven.analysis, driven.unit, s, q, values
+    if fast and can_march(driven.mechanism, driven.analysis):
+        found = march(*stop_gradients(given)) if is_traced else march_at_once(*given)
+        first = _count_on_branch(curve, s, q, values, found)
+        last = xp.maximum(first - 1, 0)
+        some = first > 0
+        s, q = xp.where(some, values[last], s), xp.where(some, found.q[last], q)
+        points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=xp.zeros_like(points.status))
+    if not is_traced:
+        points = follow(curve, s, q, values, points, first)
+        has_position = Reached.has_position(points.status)[:, None]
+        return points._replace(**{name: np.where(has_position, getattr(points, name), np.nan) for name in ("q", "dq", "ddq")})
+    assert isinstance(curve, Curve)  # as it is of traced numbers
+    points = follow(*stop_gradients((curve, s, q, values)), points, first)
+    return _with_derivatives(curve, q, values, points)
+
+
+def _count_on_branch(
+    curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], found: MarchResult
+) -> Int[Array, ""] | int:
+    """Return the number of trusted positions on the branch that they started on.
+
+    Where a branch meets another its side changes, and so it does where machine code went over to one that comes close. Which it
+    was, continuation tells, with shorter steps: of known numbers from the value before, of others from there on.
+    """
+    if isinstance(curve, Curve):
+        same = found.side == found.first_side
+        return jnp.sum(jnp.cumprod(same & (np.arange(len(values)) < found.trusted)))
+    trusted = int(found.trusted)
+    before = np.append(found.first_side, found.side[:-1])
+    for k in np.flatnonzero(found.side[:trusted] != before[:trusted]).tolist():
+        s, q = (values[k - 1], found.q[k - 1]) if k else (s, q)
+        reached = follow(curve, s, q, values[k : k + 1], no_points(1, len(q), np), 0)
+        distance = np.abs(reached.q[0] - found.q[k]) / curve.units[:-1]
+        if not (Reached.has_position(reached.status[0]) and np.max(distance) <= SAME_POSITION):
+            return k
+    return trusted
+
+
+def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "T"], points: Points) -> Points:
+    has_position = Reached.has_position(points.status)
+    safe = jnp.where(has_position[:, None], points.q, jax.lax.stop_gradient(q))
+    regular = ~has_position | (points.status == Reached.closed)
+    found = with_derivatives(curve, values, points._replace(q=safe), regular)
+    q, dq, ddq = (jnp.where(has_position[:, None], x, jnp.nan) for x in found)
+    limited = jnp.isfinite(points.limit)
+    X = jnp.where(limited, jnp.append(points.limit_q, points.limit), jax.lax.stop_gradient(jnp.append(safe[0], values[0])))
+    limit = jnp.where(limited, with_derivative(curve, X), jnp.inf)
+    return points._replace(q=q, dq=dq, ddq=ddq, limit=limit)

@@ -1,0 +1,99 @@
+"""Positions of a driven mechanism by machine code (native/marching.py), and how many of them are right."""
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.native.position_operations import March
+from udkjax.native.primitive import call_known, native_p, unsupported
+from udkjax.scene.held import row_size, with_row
+from udkjax.scene.mechanism import Mechanism
+
+Scalar = Float[ArrayLike, ""]
+Vector = Float[Array, "..."] | Float[np.ndarray, "..."]
+APPROACH = 16  # steps from where the mechanism is to the first value
+MOST_KNOTS = 100  # of motions by splines: their programs are whole, and take 10 ms to compile for each
+DEPENDENT = 1e-10  # of a row's square: the rest of a row that depends on others; march ends long before
+
+
+class MarchResult(NamedTuple):
+    """Positions and their derivatives by the value; the first `trusted` of them are closed, and on the course they began.
+
+    `side` is the sign of det Psi_q, or 1 where Psi_q is not square or nobody knows which rows are independent, and
+    `first_side` that of the start.
+    """
+
+    q: Float[Array, "T n"]
+    dq: Float[Array, "T n"]
+    ddq: Float[Array, "T n"]
+    side: Float[Array, "T"]
+    first_side: Float[Array, ""]
+    trusted: Int[Array, ""]
+
+
+def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
+    """Tell whether machine code can follow a mechanism."""
+    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
+        return False
+    knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")
+    return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis).code)
+
+
+def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
+    """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
+
+    The mechanism's driver has the value for its time; `unit` is what values are measured by.
+    """
+    inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
+    return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
+
+
+def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
+    """Follow the positions with known numbers, by NumPy: nothing is traced or compiled for it."""
+    operation = _operation(mechanism, analysis)
+    mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
+    inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
+    return _march(call_known(operation, inputs, APPROACH + len(values)), np)
+
+
+def _by_numpy(x: PyTree) -> PyTree:
+    return np.asarray(x) if eqx.is_array(x) else x
+
+
+def _march(found: Sequence, xp: ModuleType) -> MarchResult:
+    q, dq, ddq, side = (x[0, APPROACH:] for x in found[:4])
+    return MarchResult(q, dq, ddq, side, found[3][0, 0], xp.maximum(found[4][0, 0].astype(int) - APPROACH, 0))
+
+
+def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector, xp: ModuleType) -> list:
+    scales = analysis.scales
+    approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
+    ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
+    numbers = [*_of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers, DEPENDENT, 0.0]
+    at_rest = xp.zeros(analysis.coordinates)
+    return _operation(mechanism, analysis).pack(numbers, ts, q, at_rest, settings, scales.rows, xp=xp)
+
+
+def _without_loads(mechanism: Mechanism) -> Mechanism:
+    """Return a mechanism whose loads with samples are zero: positions do not depend on them."""
+    loads = {place: x for place, x in mechanism.samples.items() if place[0] == "_forces"}
+    return mechanism.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in loads.items()})
+
+
+def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mechanism:
+    """Return bodies of 1 kg and the characteristic length for radius of gyration: positions do not depend on masses."""
+    bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
+    one = xp.ones_like(length)
+    return eqx.tree_at(bodies, mechanism, [one, length**2] * len(mechanism.body_names))
+
+
+def _operation(mechanism: Mechanism, analysis: Analysis) -> March:
+    return March(scene_programs(_without_loads(mechanism), analysis.redundant_rows or (), in_pieces=False))

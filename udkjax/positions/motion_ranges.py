@@ -1,0 +1,96 @@
+"""Ranges of a motion: swing angles and strokes of the links on the ground, least and largest transmission angles."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.positions.channels import StateHistory
+from udkjax.positions.drive import Drive, element_of
+from udkjax.positions.transmission import transmission_angle
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, has_numbers
+from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import SceneError
+from udkjax.scene.joints import Prismatic, Revolute
+from udkjax.scene.mechanism import Mechanism
+
+FULL_TURN = 2 * np.pi * (1 - 1e-9)  # rad: a link that swings by more turns all the way round; the rest is rounding
+
+
+class MotionRanges(PrintsTable):
+    """The ranges of a motion, over the positions that it consists of: between these, links may go a little farther.
+
+    Attributes:
+        swings: by body, the angle (rad) between the ends of its motion, of those that a revolute holds on the ground.
+        strokes: by body, the same length (m), of those that a prismatic joint holds on the ground.
+        transmission_angles: by joint, the least and the largest angle (rad, 0 to pi) between the two links that a pin joins.
+    """
+
+    swings: dict[str, Float[Array, ""]]
+    strokes: dict[str, Float[Array, ""]]
+    transmission_angles: dict[str, Float[Array, "2"]]
+
+    def _table(self) -> PrintedTable:
+        if not has_numbers(self) or any(np.ndim(x) for x in (*self.swings.values(), *self.strokes.values())):
+            return fields_table(self, {}, "ranges of motions")
+        return PrintedTable("ranges of a motion", list(range_lines(self).items()))
+
+
+@checked
+def motion_ranges(mechanism: Mechanism, motion: StateHistory, driver: Drive = None) -> MotionRanges:
+    """Return the swing angles and strokes of the links on the ground along a motion, and the ranges of its transmission angles.
+
+    Positions that the motion does not get to, which are not numbers, do not count.
+
+    Args:
+        mechanism: the linkage.
+        motion: anything with q (T, bodies, 3), a `Kinematics` or a `Solution`.
+        driver: the driver or coordinate, as for `kinematics`: pins of the links that it drives have no transmission angle. None:
+            every pin counts that joins two moving links with one pin besides each.
+
+    Returns:
+        A `MotionRanges`; not a number where the motion has no position.
+
+    Raises:
+        SceneError: no such driver or coordinate.
+    """
+    q = jnp.asarray(motion.q)
+    driven = () if driver is None else element_of(mechanism, driver).bodies
+    found = MotionRanges({}, {}, {})
+    for name, joint in mechanism.joints.items():
+        if not isinstance(joint, Revolute | Prismatic):
+            continue
+        moving = [body for body in joint.bodies if body != GROUND]
+        if len(moving) == 1:
+            x, y, angle = jnp.moveaxis(_ends(q[:, mechanism.body_names.index(moving[0])]), -1, 0)
+            if isinstance(joint, Revolute):
+                found.swings[moving[0]] = angle[1] - angle[0]
+            else:
+                found.strokes[moving[0]] = jnp.hypot(x[1] - x[0], y[1] - y[0])
+        elif isinstance(joint, Revolute) and not set(moving) & set(driven):
+            try:
+                found.transmission_angles[name] = _ends(transmission_angle(mechanism, motion, name))
+            except SceneError:  # between links of more pins than two each there is none
+                continue
+    return found
+
+
+def _ends(x: Float[Array, "T *k"]) -> Float[Array, "2 *k"]:
+    """Return the least and the largest of the values that are numbers."""
+    return jnp.stack([jnp.nanmin(x, 0), jnp.nanmax(x, 0)])
+
+
+def range_lines(found: MotionRanges) -> dict[str, str]:
+    """Return ranges in words, by body or joint."""
+    swings, strokes, angles = (
+        {name: np.asarray(x) for name, x in ranges.items() if np.all(np.isfinite(x))}
+        for ranges in (found.swings, found.strokes, found.transmission_angles)
+    )
+    lines = {
+        name: "turns all the way round" if x > FULL_TURN else f"turns by {np.degrees(x):.4g} deg" for name, x in swings.items()
+    }
+    lines |= {name: f"slides by {x:.4g} m" for name, x in strokes.items()}
+    for name, (least, largest) in angles.items():
+        if largest > 0:  # else all pins of a link are in one place
+            lines[f"angle at {name}"] = f"{np.degrees(least):.4g} to {np.degrees(largest):.4g} deg between its links"
+    return lines

@@ -1,0 +1,85 @@
+"""Machine code that closes mechanisms (native/closing.py): which it serves, and how their numbers go in and come out."""
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from udkjax.equations.scales import Scales
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.structure import numbers_as_vector
+from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
+from udkjax.native.position_operations import Close, CloseCotangents, CloseSecondTangents, CloseTangents
+from udkjax.native.primitive import call_known, native_p, unsupported
+from udkjax.scene.mechanism import Mechanism
+
+# Results of closing: q, v, the residuals Psi and Psi_dot, and the rank of D.
+Closed = tuple[Array, Array, Array, Array, Array]
+
+
+def can_close(mechanism: Mechanism) -> bool:
+    """Return whether machine code can close a mechanism."""
+    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
+        return False
+    return not unsupported(_close(mechanism).code)
+
+
+def close(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
+    """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, at time t."""
+    return _unpack(native_p.bind(*_inputs(mechanism, scales, t, q, v), operation=_close(mechanism), times=2), len(q))
+
+
+def close_known(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
+    """Close with known numbers, without tracing anything."""
+    return _unpack(call_known(_close(mechanism), _inputs(mechanism, scales, t, q, v, np), 2), len(q))
+
+
+def _unpack(found: Sequence[Any], n: int) -> Closed:
+    state, residuals, rank = (x[0] for x in found)
+    m = len(residuals) // 2
+    return state[:n], state[n:], residuals[:m], residuals[m:], rank[0].astype(int)
+
+
+def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
+    """Return the changes of q and v along a `change` of what is active of (mechanism, scales, t, q, v)."""
+    operation = CloseTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
+    return _close_along(guess, operation, (active, change))
+
+
+def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
+    """Return the second derivatives of q and v along two changes, each of what is active in it."""
+    operation = CloseSecondTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
+    return _close_along(guess, operation, *changes)
+
+
+def _close_along(guess: Any, operation: CloseTangents, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
+    mechanism, n, along = guess[0], len(guess[-1]), []
+    for active, (numbers, dq, dv) in changes:
+        along.append(number_tangents(mechanism, active[0], numbers))
+        along += [np.zeros(n) if dx is None else dx for dx in (dq, dv)]
+    dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), operation=operation, times=2)[-1][0, 0]
+    return dstate[:n], dstate[n:]
+
+
+def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
+    """Return the cotangents of what is active, from those of q and v."""
+    mechanism = guess[0]
+    operation = CloseCotangents(_close(mechanism).code, active_numbers(mechanism, active[0]))
+    bars = jnp.concatenate([qbar, vbar])[None]
+    numbers, *states = (x[0] for x in native_p.bind(*_inputs(*guess), bars, operation=operation, times=2)[-3:])
+    found = cotangent_tree(numbers, mechanism, active[0])
+    return found, *(x if m is True else None for x, m in zip(states, active[-2:], strict=True))
+
+
+def _inputs(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any, xp: ModuleType = jnp) -> list[Any]:
+    settings, ts = {"length": scales.length, "fallback_tol": scales.rank_tol}, numbers_as_vector([t, t])
+    numbers = [*mechanism.numbers, scales.rank_tol**2, 0.0]
+    return _close(mechanism).pack(numbers, ts, q, v, settings, scales.rows, xp=xp)
+
+
+def _close(mechanism: Mechanism) -> Close:
+    return Close(scene_programs(mechanism).with_all_rows)

@@ -1,0 +1,227 @@
+"""Derivatives of the positions of a driven mechanism, q(s), q' and q'', by the values and by all numbers of the mechanism.
+
+At an ordinary position they are those of one step of Newton's method. Where branches meet, Psi_q has lost rank, and a change
+p of a number that moves the constraints changes q(s) near the value s* there by
+
+    dq/dp = R / (s - s*) + what is smooth.
+
+If the residue R is zero, the branch goes on, moved by the smooth part; if not, the branches part, by the root of the change, and
+no derivative exists. Both are found as the position is, from points of the branch on both sides (crossing.py). R is linear in the
+change: of numbers that part the branches one by one, some change together may not, such as two cranks of one length. In forward
+mode such a change has its derivative; in reverse mode, which asks for each number by itself, what has none is not a number.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.core
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from udkjax.equations.control_flow import sequential
+from udkjax.native.seldom import call_seldom
+from udkjax.pinv.linear_primitive import linear_primitive
+from udkjax.positions.continuation import Points
+from udkjax.positions.crossing import FARTHEST_NODE, nodes, weights
+from udkjax.positions.curve import Curve
+from udkjax.programs.varying_axes import result_type
+from udkjax.transforms.gradients import stop_gradients
+
+# Of the largest (s - s*) dq/dp beside it: a residue below that is of rounding, which E^+ multiplies by a hundred at most there.
+RESIDUE = 1e-6
+MOST_MEETINGS = 8  # values of a call where branches meet: at others, derivatives by what moves the constraints are not numbers
+
+Rows = Float[Array, "T n"]
+Three = tuple[Rows, Rows, Rows]  # of q, q' and q''
+
+
+def with_derivatives(curve: Curve, values: Float[Array, "T"], points: Points, regular: Bool[Array, "T"]) -> Three:
+    """Return closed positions, q' and q'', with their derivatives by the values and by the numbers of the mechanism.
+
+    Where branches meet (not `regular`), those of second order are not numbers.
+    """
+    return _with_derivatives(curve, values, *points[:3], points.dddq, points.spacing, regular)
+
+
+@eqx.filter_custom_jvp
+def _with_derivatives(curve, values, q, dq, ddq, dddq, spacing, regular) -> Three:
+    return q, dq, ddq
+
+
+@_with_derivatives.def_jvp
+def _(primals, tangents):
+    curve, values, *_, dddq, spacing, regular = primals
+    found = _with_derivatives(*primals)
+    moved, ds = tangents[:2]
+    moving = eqx.combine(tangents[:2], jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array)))
+
+    def positions(curve: Curve, values: Float[Array, "T"]) -> Three:
+        return jax.vmap(lambda s, q: _newton(curve, s, q))(values, found[0])
+
+    ordinary = eqx.filter_jvp(positions, (curve, values), moving)[1]
+    beside = _by_numbers(curve, values, found, spacing, regular, moved)
+    if ds is not None:
+        third = jnp.where(regular[:, None] | (spacing[:, None] > 0), dddq, jnp.nan)
+        along = found[1], found[2], third + _ends_here(jnp.where(regular, 0.0, jnp.nan), curve, values)[:, None]
+        beside = tuple(x + y * ds[:, None] for x, y in zip(beside, along, strict=True))
+    return found, tuple(jnp.where(regular[:, None], x, y) for x, y in zip(ordinary, beside, strict=True))
+
+
+def _by_numbers(
+    curve: Curve, values: Float[Array, "T"], found: Three, spacing: Float[Array, "T"], regular: Bool[Array, "T"], moved: Any
+) -> Three:
+    """Return the changes of q, q' and q'' where branches meet, with numbers of the constraints; others move no position."""
+    changes = jax.tree.leaves(_constraints(moved.mechanism))
+    zero = jnp.zeros_like(found[0])
+    if not changes:
+        return zero, zero, zero
+    active = jax.tree.map(lambda x: x is not None, _constraints(moved.mechanism), is_leaf=lambda x: x is None)
+    which = jnp.flatnonzero(~regular, size=min(MOST_MEETINGS, len(values)), fill_value=0)
+    given = curve, values[which], tuple(x[which] for x in found), spacing[which], ~regular[which]
+    operator = sequential(_matrices, *stop_gradients(given), active)
+    change = jnp.concatenate([jnp.ravel(x) for x in changes])
+    at_some = _bind(_Operator(*operator), change).reshape(len(which), 3, -1)
+    missed = jnp.where(regular, 0.0, jnp.nan).at[which].set(0.0)
+    rest = missed + _ends_here(jnp.where(regular, 0.0, jnp.nan), curve, values)
+    return tuple(zero.at[which].add(at_some[:, k]) + (rest * jnp.sum(change))[:, None] for k in range(3))
+
+
+def _constraints(mechanism: Any) -> list[Any]:
+    return [*mechanism.joints.values(), *mechanism.drivers.values()]
+
+
+def _matrices(
+    curve: Curve, values: Array, found: Three, spacing: Array, counts: Array, active: PyTree
+) -> tuple[Float[Array, "K 3 n P"], Float[Array, "K P n"]]:
+    """Return the changes of q, q' and q'' by P numbers where branches meet, and their residues, those of rounding as zero.
+
+    Args:
+        curve: the positions.
+        values: K of them where branches meet.
+        found: q, q' and q'' there.
+        spacing: of points of the branch beside them; zero where there are none.
+        counts: mask of the values of interest.
+        active: mask of the leaves of joints and drivers that are the P numbers.
+    """
+    chosen = jax.tree.leaves(eqx.filter(_constraints(curve.mechanism), active))
+    K, n, P = len(values), curve.units.size - 1, sum(x.size for x in chosen)
+    nothing = jnp.zeros((K, 3, n, P)), jnp.zeros((K, P, n))
+    given = curve, values, found, spacing, active
+    matrix, residue = jax.lax.cond(jnp.any(counts), lambda: call_seldom(_beside_meetings, *given), lambda: nothing)
+    return jnp.where(counts[:, None, None, None], matrix, 0.0), jnp.where(counts[:, None, None], residue, 0.0)
+
+
+def _beside_meetings(curve: Curve, values: Array, found: Three, spacing: Array, active: PyTree) -> tuple[Array, Array]:
+    """Return `_matrices` of values that all count; not a number where nothing beside them is known."""
+    W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
+    chosen, rest = eqx.partition(_constraints(curve.mechanism), active)
+    numbers, unravel = ravel_pytree(chosen)
+    offset = spacing[:, None] * steps  # scaled
+    s = values[:, None] + offset * unit
+
+    def closed(s: Array, ds: Array, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
+        return curve.correct(jnp.append(q + ds * dq + 0.5 * ds**2 * ddq, s) / curve.units, fixed=True)
+
+    X, is_closed = jax.vmap(jax.vmap(closed, (0, 0, None, None, None)))(s, offset * unit, *found)
+    q = X[..., :-1] * W
+
+    def moved(numbers: Array) -> list[Array]:
+        parts = eqx.combine(unravel(numbers), rest)
+        other = eqx.tree_at(lambda c: _constraints(c.mechanism), curve, parts)
+        three = jax.vmap(jax.vmap(lambda s, q: _newton(other, s, q)))(s, q)
+        return [x / W * unit**k for k, x in enumerate(three)]
+
+    changes = jax.jacfwd(moved)(numbers)  # (K, 12, n, P) each
+    ends = offset[:, :, None, None] * changes[0]
+    size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(FARTHEST_NODE), ends)
+    residue = jnp.where(jnp.abs(residue) > RESIDUE * size[..., None], residue, 0.0)
+    smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(FARTHEST_NODE), x) / unit**k for k, x in enumerate(changes)], 1)
+    known = jnp.all(is_closed, 1) & (spacing > 0)
+    return jnp.where(known[:, None, None, None], smooth * W[:, None], jnp.nan), residue
+
+
+class _Operator(eqx.Module):
+    """The effect of the numbers, as a linear map with its transpose."""
+
+    matrix: Float[Array, "K 3 n P"]
+    residue: Float[Array, "K P n"]
+    is_transposed: bool = eqx.field(static=True, default=False)
+
+
+def _apply(operator: _Operator, vector: Array) -> Array:
+    matrix, residue = operator.matrix, operator.residue
+    if operator.is_transposed:
+        out = vector.reshape(matrix.shape[:3])
+        wanted = jnp.any(out != 0, (1, 2))
+        parts = jnp.any(wanted[:, None] & jnp.any(residue != 0, 2), 0)
+        found = jnp.einsum("kinp,kin->p", jnp.where(wanted[:, None, None, None], matrix, 0.0), out)
+        return jnp.where(parts, jnp.nan, found)
+    moved = jnp.where(vector != 0, matrix, 0.0)
+    whole, terms = (jnp.einsum("kpn,p->kn", x, y) for x, y in ((residue, vector), (jnp.abs(residue), jnp.abs(vector))))
+    parts = jnp.any(jnp.abs(whole) > RESIDUE * jnp.max(terms, 1, keepdims=True), 1)
+    return jnp.where(parts[:, None, None], jnp.nan, jnp.einsum("kinp,p->kin", moved, vector)).ravel()
+
+
+@eqxi.filter_primitive_def
+def _shape(operator, vector):
+    K, three, n, P = operator.matrix.shape
+    return result_type((P if operator.is_transposed else K * three * n,), jax.tree.leaves((operator, vector)), vector.dtype)
+
+
+@eqxi.filter_primitive_jvp
+def _derivative(primals, tangents):
+    operator, vector = primals
+    change = jnp.zeros_like(vector) if tangents[1] is None else tangents[1]
+    return _bind(operator, vector), _bind(operator, change)
+
+
+@eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
+def _transpose(inputs, cotangent):
+    operator, _ = inputs
+    other = _Operator(operator.matrix, operator.residue, not operator.is_transposed)
+    return jax.tree.map(lambda _: None, operator), _bind(other, cotangent)
+
+
+_moving_p = linear_primitive("where_branches_meet", _apply, _shape, _derivative, _transpose)
+
+
+def _bind(operator: _Operator, vector: Array) -> Array:
+    return eqxi.filter_primitive_bind(_moving_p, operator, vector)
+
+
+@eqx.filter_custom_jvp
+def _ends_here(factor: Float[Array, "T"], curve: Curve, values: Float[Array, "T"]) -> Float[Array, "T"]:
+    """Return zeros, whose derivatives by the positions are the factor: zero, or not a number."""
+    return jnp.zeros_like(factor)
+
+
+@_ends_here.def_jvp
+def _(primals, tangents):
+    total = sum((jnp.sum(x) for x in jax.tree.leaves(tangents[1:])), jnp.zeros(()))
+    return jnp.zeros_like(primals[0]), primals[0] * total
+
+
+def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Array, Array, Array]:
+    X = jnp.append(q, s) / curve.units
+    E = curve.slopes(X)
+    q = ((X - curve.plus(E.at[:, -1].set(0.0)) @ curve.residual(X)) * curve.units)[:-1]
+    dq, ddq, _ = curve.derivatives(s, q)
+    return q, dq, ddq
+
+
+@eqx.filter_custom_jvp
+def with_derivative(curve: Curve, x: Float[Array, "n+1"]) -> Float[Array, ""]:
+    """Return the value at a toggle x = (q, s), which changes by as much as that of the nearest point of the curve."""
+    return x[-1]
+
+
+@with_derivative.def_jvp
+def _(primals, tangents):
+    curve, x = primals
+    moving = eqx.combine(tangents[0], jax.tree.map(jnp.zeros_like, eqx.filter(curve, eqx.is_inexact_array)))
+    X = x / jax.lax.stop_gradient(curve.units)
+    nearest = lambda curve: ((X - curve.plus(curve.slopes(X)) @ curve.residual(X)) * curve.units)[-1]  # noqa: E731
+    return with_derivative(*primals), eqx.filter_jvp(nearest, (curve,), (moving,))[1]

@@ -1,0 +1,282 @@
+"""Programs of JAX evaluated by NumPy, operation by operation: without the seconds that XLA takes to compile them.
+
+Loops and branches are those of Python. An operation that NumPy has no rule for is expanded into others where it can be, else JAX
+compiles it by itself.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import jax
+import numpy as np
+from jax.extend.core import Jaxpr, Literal, Primitive, jaxprs_in_params
+
+from udkjax.programs.numpy_rules import RULES
+
+Arrays = list[Any]
+Step = tuple[Callable[..., Any], list[int], Any]  # a function, the places of its arguments, and that or those of its results
+ENTRIES = 2_000  # of an array that NumPy takes as long for as for an operation by itself
+PLAIN = (np.dtype(float), np.dtype(int), np.dtype(bool))  # types that NumPy keeps in every operation
+
+_EXPANSIONS: dict[Primitive, Callable[..., Callable[..., Any]]] = {}
+_EVALUATIONS: dict[Primitive, Callable[..., Any]] = {}
+
+
+def expand_as(primitive: Primitive, function: Callable[..., Callable[..., Any]]) -> None:
+    """Let a primitive be the operations of `function(**parameters)`, a function of arrays that JAX can trace."""
+    _EXPANSIONS[primitive] = function
+
+
+def evaluate_as(primitive: Primitive, function: Callable[..., Any]) -> None:
+    """Let a primitive be a function of arrays of NumPy and of its parameters."""
+    _EVALUATIONS[primitive] = function
+
+
+class TooLongError(Exception):
+    """A program has taken more operations than it may."""
+
+
+class Meter:
+    """Counts operations, of many entries as several, and ends an evaluation that takes more than `limit`."""
+
+    def __init__(self, limit: float):
+        self.count, self.limit = 0, limit
+
+    def add(self, operations: int) -> None:
+        self.count += operations
+        if self.count > self.limit:
+            raise TooLongError
+
+
+class NumpyProgram:
+    """A program of JAX, as steps of NumPy."""
+
+    def __init__(self, jaxpr: Jaxpr, constants: Sequence[Any]):
+        self._places: dict[Any, int] = {}
+        self._memory: Arrays = []
+        self._inputs = [self._place(v) for v in jaxpr.invars]
+        for v, x in zip(jaxpr.constvars, constants, strict=True):
+            self._memory[self._place(v)] = np.asarray(x)
+        self._steps: list[Step] = []
+        for equation in jaxpr.eqns:
+            inputs = [self._place(v) for v in equation.invars]
+            outputs = [self._place(v) for v in equation.outvars]
+            function = _step_of(equation)
+            self._steps.append((function, inputs, outputs if equation.primitive.multiple_results else outputs[0]))
+        self._outputs = [self._place(v) for v in jaxpr.outvars]
+        self._cost = sum(1 + sum(_type(v).size for v in e.outvars) // ENTRIES for e in jaxpr.eqns)
+
+    def _place(self, v: Any) -> int:
+        if isinstance(v, Literal):
+            self._memory.append(np.asarray(v.val, _type(v).dtype)[()])
+            return len(self._memory) - 1
+        if v not in self._places:
+            self._places[v] = len(self._memory)
+            self._memory.append(None)
+        return self._places[v]
+
+    def __call__(self, meter: Meter, inputs: Sequence[Any]) -> Arrays:
+        """Return the results for some inputs, arrays of NumPy."""
+        meter.add(self._cost)
+        memory = self._memory.copy()
+        for place, x in zip(self._inputs, inputs, strict=True):
+            memory[place] = x
+        for function, places, results in self._steps:
+            found = function(meter, *[memory[k] for k in places])
+            if type(results) is int:
+                memory[results] = found
+            else:
+                for k, x in zip(results, found, strict=True):
+                    memory[k] = x
+        return [memory[k] for k in self._outputs]
+
+
+def _type(v: Any) -> Any:
+    return v.aval
+
+
+def count_operations(jaxpr: Any) -> int:
+    """Return the number of operations of a program, with those of its loops and branches once each."""
+    inner = (x for e in jaxpr.eqns for x in jaxprs_in_params(e.params))
+    return len(jaxpr.eqns) + sum(map(count_operations, inner))
+
+
+def has_rules(jaxpr: Any) -> bool:
+    """Return True if NumPy knows all operations of a program: for others JAX is called."""
+
+    def is_known(equation: Any) -> bool:
+        primitive = equation.primitive
+        if primitive in _EVALUATIONS or primitive.name in _CONTROL or primitive.name in RULES:
+            return all(map(has_rules, jaxprs_in_params(equation.params)))
+        expanded = _Expanded(equation).trace()
+        return expanded is not None and has_rules(expanded)
+
+    return all(map(is_known, jaxpr.eqns))
+
+
+_PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()
+
+
+def numpy_program(jaxpr: Any) -> NumpyProgram:
+    """Return a program of JAX as one of NumPy, with its constants where it is a closed one; the same for the same."""
+    found = _PROGRAMS.get(jaxpr)
+    if found is None:
+        parts = (jaxpr.jaxpr, jaxpr.consts) if hasattr(jaxpr, "consts") else (jaxpr, ())
+        found = _PROGRAMS[jaxpr] = NumpyProgram(*parts)
+    return found
+
+
+# --- steps
+
+
+def _step_of(equation: Any) -> Callable[..., Any]:
+    """Return a function of a meter and of arrays for an operation of a program."""
+    primitive, parameters = equation.primitive, equation.params
+    if primitive in _EVALUATIONS:
+        return lambda _, *xs: _EVALUATIONS[primitive](*xs, **parameters)
+    if primitive.name in _CONTROL:
+        return _CONTROL[primitive.name](**parameters)
+    rule = RULES.get(primitive.name)
+    if rule is not None and not (primitive.name in ("reduce_or", "reduce_and") and equation.invars[0].aval.dtype != bool):
+        return _by_rule(equation, rule)
+    return _Expanded(equation)
+
+
+def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
+    primitive, parameters = equation.primitive, equation.params
+    dtypes = [v.aval.dtype for v in equation.outvars]
+    exact = all(d in PLAIN for d in dtypes)
+
+    def step(_: Meter, *xs: Any) -> Any:
+        try:
+            found = rule(*xs, **parameters)
+        except np.linalg.LinAlgError:  # of singular matrices, for which XLA finds infinity
+            found = NotImplemented
+        if found is NotImplemented:
+            return _by_jax(primitive, parameters, xs)
+        if exact:
+            return found
+        if primitive.multiple_results:
+            return [np.asarray(x, d) for x, d in zip(found, dtypes, strict=True)]
+        return np.asarray(found, dtypes[0])
+
+    return step
+
+
+def _by_jax(primitive: Primitive, parameters: dict[str, Any], xs: Sequence[Any]) -> Any:
+    found = primitive.bind(*(jax.device_put(np.asarray(x)) for x in xs), **parameters)
+    return [np.asarray(x) for x in found] if primitive.multiple_results else np.asarray(found)
+
+
+class _Expanded:
+    """An operation that is made of others, traced when it is first evaluated; or JAX's own, where it is not."""
+
+    def __init__(self, equation: Any):
+        self._primitive, self._parameters = equation.primitive, equation.params
+        self._inputs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
+        self._program: Any = None
+
+    def __call__(self, meter: Meter, *xs: Any) -> Any:
+        if self._program is None:
+            traced = self.trace()
+            self._program = False if traced is None else numpy_program(traced)
+        if self._program is False:
+            return _by_jax(self._primitive, self._parameters, xs)
+        found = self._program(meter, xs)
+        return found if self._primitive.multiple_results else found[0]
+
+    def trace(self) -> Any:
+        """Return the program of the others that it is made of, or None."""
+        function = self._function()
+        return None if function is None else jax.make_jaxpr(function)(*self._inputs)
+
+    def _function(self) -> Callable[..., Any] | None:
+        primitive, parameters = self._primitive, self._parameters
+        if primitive in _EXPANSIONS:
+            return _EXPANSIONS[primitive](**parameters)
+        if "_prim" in parameters:  # an operation of JAX that is defined by others
+            return parameters["_prim"].expand
+        impl = primitive.impl
+        if isinstance(impl, partial) or impl.__module__.startswith(("jax.", "jaxlib")):
+            return None
+        return lambda *xs: impl(*xs, **parameters)
+
+
+def _call(jaxpr: Any) -> Callable[..., Any]:
+    program = numpy_program(jaxpr)
+    return lambda meter, *xs: program(meter, xs)
+
+
+def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int, **_: Any) -> Callable[..., Any]:
+    condition, body = numpy_program(cond_jaxpr), numpy_program(body_jaxpr)
+
+    def step(meter: Meter, *xs: Any) -> Arrays:
+        of_condition, of_body = xs[:cond_nconsts], xs[cond_nconsts : cond_nconsts + body_nconsts]
+        state = list(xs[cond_nconsts + body_nconsts :])
+        while np.any(goes_on := condition(meter, [*of_condition, *state])[0]):
+            found = body(meter, [*of_body, *state])
+            state = list(found) if np.ndim(goes_on) == 0 else [_where(goes_on, x, y) for x, y in zip(found, state, strict=True)]
+        return state
+
+    return step
+
+
+def _where(condition: np.ndarray, a: Any, b: Any) -> np.ndarray:
+    """Return a where the condition holds, else b: of a batch of loops, of which some have ended."""
+    return np.where(condition.reshape(condition.shape + (1,) * (np.ndim(a) - condition.ndim)), a, b)
+
+
+def _cond(branches: Sequence[Any], **_: Any) -> Callable[..., Any]:
+    programs = [numpy_program(branch) for branch in branches]
+
+    def step(meter: Meter, index: Any, *xs: Any) -> Arrays:
+        return programs[min(max(int(index), 0), len(programs) - 1)](meter, xs)
+
+    return step
+
+
+def _scan(jaxpr: Any, length: int, reverse: bool, **parameters: Any) -> Callable[..., Any]:
+    program = numpy_program(jaxpr)
+    if "ft_in" in parameters:
+        constants, carry, _ = (len(part) for part in parameters["ft_in"].unpack())
+    else:
+        constants, carry = parameters["num_consts"], parameters["num_carry"]
+    avals = jaxpr.out_avals[carry:]
+
+    def step(meter: Meter, *xs: Any) -> Arrays:
+        fixed, state, rows = xs[:constants], list(xs[constants : constants + carry]), xs[constants + carry :]
+        outputs = [np.zeros((length, *a.shape), a.dtype) for a in avals]
+        for k in range(length - 1, -1, -1) if reverse else range(length):
+            found = program(meter, [*fixed, *state, *(x[k] for x in rows)])
+            state = found[:carry]
+            for output, y in zip(outputs, found[carry:], strict=True):
+                output[k] = y
+        return [*state, *outputs]
+
+    return step
+
+
+def _linear_solve(const_lengths: Any, jaxprs: Any, **_: Any) -> Callable[..., Any]:
+    program, before = numpy_program(jaxprs.solve), const_lengths.matvec + const_lengths.vecmat
+    after = before + const_lengths.solve
+    given = after + const_lengths.transpose_solve
+
+    return lambda meter, *xs: program(meter, [*xs[before:after], *xs[given:]])
+
+
+_CONTROL: dict[str, Callable[..., Callable[..., Any]]] = {
+    "jit": lambda jaxpr, **_: _call(jaxpr),
+    "closed_call": lambda call_jaxpr, **_: _call(call_jaxpr),
+    "custom_jvp_call": lambda call_jaxpr, **_: _call(call_jaxpr),
+    "custom_vjp_call": lambda call_jaxpr, **_: _call(call_jaxpr),
+    "eval_jaxpr": lambda call_jaxpr, **_: _call(call_jaxpr),
+    "deferred_program": lambda call_jaxpr, **_: _call(call_jaxpr),
+    "custom_vmap_call": lambda call, **_: _call(call),
+    "remat2": lambda jaxpr, **_: _call(jaxpr),
+    "while": _while,
+    "cond": _cond,
+    "scan": _scan,
+    "custom_linear_solve": _linear_solve,
+}

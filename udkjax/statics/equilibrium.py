@@ -1,0 +1,281 @@
+"""Static equilibria: positions where the loads and the constraints' forces balance, F = Psi_q^T lambda, stable or not."""
+
+import math
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.annotations import Scalar
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
+from udkjax.equations.load_scale import LoadScale, load_scale
+from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
+from udkjax.positions.assembly import State, close
+from udkjax.positions.branches import distinct_positions, random_positions
+from udkjax.positions.curve import AbstractCurve, Curve, KnownCurve
+from udkjax.positions.drive import Driven
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
+from udkjax.scene.arguments import checked
+from udkjax.scene.checks import SceneError
+from udkjax.scene.description import format_pose, size_of
+from udkjax.scene.fields import library_for, number, stored
+from udkjax.scene.mechanism import Mechanism
+from udkjax.statics.linearization import Linearization, linearize, with_unit_mass
+from udkjax.transforms.gradients import stop_gradients
+
+MOST_NEWTON_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
+FORCE_TOL = 1e-9  # of the scale of forces: tolerance of the loads along free directions; rounding leaves 1e-15
+FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: the rest is rounding, which no step reduces
+NEUTRAL_STIFFNESS = 1e-10  # of the largest stiffness: one below it resists nothing
+SMALLEST_STIFFNESS = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
+
+# The share of a step, how many were tried, whether it is better, q and the linearization there.
+Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
+Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization there, steps, whether the last was better
+
+
+class Equilibrium(PrintsTable):
+    """A position of rest. `balanced` says whether it is one; `omega2` tells whether it is stable.
+
+    Attributes:
+        q: x, y (m) and angle (rad) of each body.
+        balanced: whether loads and constraint forces cancel.
+        bodies: the names of the bodies, in the order of q.
+    """
+
+    q: Float[Array, "bodies 3"]
+    multipliers: Float[Array, "m"]  # lambda of F = Psi_q^T lambda (N, N m), of least norm; rows as in `analyse`
+    omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
+    residual: Float[Array, ""]  # remaining loads along free directions, relative to the scale of forces
+    balanced: Bool[Array, ""]
+    neutral: Float[Array, ""]  # (rad/s)^2: an omega2 of no more is rounding
+    bodies: tuple[str, ...] = eqx.field(static=True, default=())
+
+    _units = units(q="m, m, rad", multipliers="N or N m", omega2="(rad/s)²")
+
+    def _table(self) -> PrintedTable:
+        if np.ndim(self.balanced):
+            title = f"{np.size(self.balanced)} positions, of which {int(np.sum(self.stable))} are stable"
+            return fields_table(self, self._units, title)
+        frequencies = ", ".join(_format_rate(float(x)) for x in np.asarray(self.omega2))
+        rows = [
+            ("omega²", format_numbers(self.omega2, "(rad/s)²")),
+            ("frequency", frequencies or "no degree of freedom is left"),
+            ("unbalanced loads", f"{format_number(self.residual, scale=1.0)} of the scale of forces"),
+        ]
+        poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
+        rows += zip(self.bodies or map(str, range(len(poses))), poses, strict=True)
+        return PrintedTable(f"position of rest, {self.kind}", rows)
+
+    @property
+    def state(self) -> State:
+        """At rest there."""
+        return State(self.q, np.zeros(np.shape(self.q)))
+
+    @property
+    def stable(self) -> Bool[Array, ""]:
+        """True if the potential energy has a minimum there, as all stiffnesses are positive."""
+        xp = library_for(self)
+        neutral = xp.asarray(self.neutral)[..., None]
+        return stored(xp.asarray(self.balanced) & xp.all(xp.asarray(self.omega2) > neutral, axis=-1))
+
+    @property
+    def indifferent(self) -> Bool[Array, ""]:
+        """True if nothing moves it away, though not all stiffnesses are positive: some vanish."""
+        xp = library_for(self)
+        least = xp.min(xp.asarray(self.omega2), axis=-1, initial=np.inf)
+        return stored(xp.asarray(self.balanced) & (xp.abs(least) <= xp.asarray(self.neutral)))
+
+    @property
+    def kind(self) -> str:
+        """Kind of one position: "stable", "indifferent" or "unstable", or that it is none of rest."""
+        if not self.balanced:
+            return "not at rest: loads are not balanced"
+        return "stable" if self.stable else "indifferent" if self.indifferent else "unstable"
+
+
+def _format_rate(omega2: float) -> str:
+    omega = math.sqrt(abs(omega2))
+    return f"{omega:.6g} rad/s ({omega / (2 * math.pi):.6g} Hz)" if omega2 >= 0 else f"exp({omega:.6g} t)"
+
+
+@checked
+def equilibrium(
+    mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, stable: bool = False, analysis: Analysis | None = None
+) -> Equilibrium:
+    """Return a position of rest, N^T F = 0 on Psi = 0, near a given one: N spans the directions that constraints leave free.
+
+    Newton's method with K = -F_q + (lambda^T Psi)_qq, its steps limited in length and halved until less is left of the loads.
+    Pure, jittable and batched by `vmap` (whether a member rests is in `balanced`); differentiable by every number of the
+    mechanism, where the stiffness is not singular.
+
+    Args:
+        mechanism: its drivers hold the values of time t.
+        state: state to search from; by default the initial guess.
+        t: time (s) of drivers and loads.
+        stable: go downhill only, and so to a stable equilibrium; otherwise to any that is near.
+        analysis: the mechanism's `Analysis`; needed where all numbers are traced.
+
+    Returns:
+        An `Equilibrium`.
+
+    Raises:
+        ValueError: the number of degrees of freedom is not known, as all numbers are traced.
+    """
+    analysis = analyse(mechanism) if analysis is None else analysis
+    free = degrees_of_freedom(analysis)
+    t = number(t)
+    q = close(mechanism, t, state, analysis=analysis).state.q
+    return solve(_equilibrium, mechanism.without_origin, analysis, t, number(library_for(q).ravel(q)), free, stable)
+
+
+@checked
+def equilibria(
+    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: Scalar = 0.0, state: State | None = None
+) -> list[Equilibrium]:
+    """Return the different equilibria found from `starts` positions: the given one and random ones of the same mechanism.
+
+    Random positions turn every body by a random angle and close it again, so that all branches are tried. Not exhaustive; the
+    lowest stiffness last: the most stable first. Args as for `equilibrium`; numbers must be known.
+    """
+    analysis = analyse(mechanism)
+    guesses = random_positions(mechanism, starts, seed, state)
+    found = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
+    different = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct_positions(found.q, found.balanced, analysis.scales)]
+    return sorted(different, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
+
+
+def degrees_of_freedom(analysis: Analysis) -> int:
+    """Return the number of degrees of freedom; raise `SceneError` where it is not known."""
+    free = analysis.degrees_of_freedom
+    if free is None:
+        raise SceneError(
+            [
+                "how many degrees of freedom there are is not known: the initial guess cannot be closed, or not moved as the "
+                "drivers ask (udkjax check tells); or all numbers are traced: give analysis=udkjax.analyse(mechanism)"
+            ]
+        )
+    return free
+
+
+def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> AbstractCurve:
+    """Return the positions of the mechanism as a curve, with time in place of a driver's value."""
+    return (Curve if by is BY_JAX else KnownCurve).of(Driven(mechanism, analysis, "", -1, number(1.0)))
+
+
+def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:
+    """Return omega^2 of the undamped linearization, (rad/s)^2, ascending."""
+    xp, (_, K) = by.xp, with_unit_mass(at, by)
+    return xp.linalg.eigvalsh(0.5 * (K + K.T)) if len(K) else xp.zeros(0)
+
+
+def _equilibrium(
+    mechanism: Mechanism, analysis: Analysis, t: Any, start: Any, free: int, stable: bool, by: ControlFlow
+) -> Equilibrium:
+    curve = _rest_curve(mechanism, analysis, by)
+    scale = by.call(load_scale, mechanism, analysis.scales, t, start)
+    if by is BY_NUMPY:
+        q = _settle(curve, mechanism, analysis, scale, t, start, free, stable)
+    else:
+        q = sequential(_settle, *stop_gradients((curve, mechanism, analysis, scale, t, start)), free, stable)
+        assert isinstance(curve, Curve)
+        q = _rest_position(curve, analysis, t, q, free)
+    xp, scale = by.xp, by.call(load_scale, mechanism, analysis.scales, t, q)
+    at = by.call(linearize, mechanism, analysis, free, t, q)
+    left = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
+    balanced = curve.is_closed(xp.append(q, t) / curve.units) & (left <= FORCE_TOL)
+    neutral, bodies = SMALLEST_STIFFNESS * scale.stiffness, mechanism.body_names
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, _omega2(at, by), left, balanced, neutral, bodies)
+
+
+def _settle(
+    curve: AbstractCurve,
+    mechanism: Mechanism,
+    analysis: Analysis,
+    scale: LoadScale,
+    t: Float[Array, ""],
+    q: Float[Array, "n"],
+    free: int,
+    stable: bool,
+) -> Float[Array, "n"]:
+    """Take Newton steps until nothing gets better."""
+    if not free:
+        return q
+    by, xp = curve.by, curve.by.xp
+
+    def at(q: Float[Array, "n"]) -> Linearization:
+        return by.call(linearize, mechanism, analysis, free, t, q)
+
+    def is_unsettled(state: Settling) -> Bool[Array, ""]:
+        _, here, k, better = state
+        return better & (k < MOST_NEWTON_STEPS) & (xp.linalg.norm(here.force) > FORCE_ROUNDING * scale.force)
+
+    def body(state: Settling) -> Settling:
+        q, here, k, _ = state
+        step = here.directions @ _towards_rest(here, scale, stable, curve)
+        longest = xp.max(xp.abs(step / curve.units[:-1]))
+        step = step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
+        size = xp.linalg.norm(here.force)
+
+        def trial(state: Trial) -> Trial:
+            share, j, *_ = state
+            X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
+            new = (X * curve.units)[:-1]
+            trial = at(new)
+            # Work done on the way, by the trapezoidal rule, or what is left of the loads along free directions.
+            work = 0.5 * (here.loads + trial.loads) @ (new - q)
+            better = (work > 0 if stable else False) | (xp.linalg.norm(trial.force) < size)
+            return 0.5 * share, j + 1, closed & better, new, trial
+
+        def worse(state: Trial) -> Bool[Array, ""]:
+            return (state[1] < STEP_HALVINGS) & ~state[2]
+
+        first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, here
+        _, _, better, new, there = by.while_loop(worse, trial, first)
+        new, there = jax.tree.map(lambda x, y: xp.where(better, x, y), (new, there), (q, here))
+        return new, there, k + 1, better
+
+    start = q, at(q), xp.asarray(0), xp.asarray(True)
+    return by.while_loop(is_unsettled, body, start)[0]
+
+
+def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
+    """Return the step eta of the linearization; only downhill, where the equilibrium is to be stable."""
+    xp, rounding = curve.by.xp, SMALLEST_STIFFNESS * scale.stiffness
+    if not stable:
+        resists = xp.max(xp.abs(here.stiffness)) > rounding
+        return curve.plus(xp.where(resists, here.stiffness, 0.0), NEUTRAL_STIFFNESS) @ here.force
+    values, vectors = xp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
+    values = xp.abs(values)
+    values = xp.maximum(values, xp.maximum(NEUTRAL_STIFFNESS * xp.max(values), rounding))
+    return vectors @ (vectors.T @ here.force / xp.where(values > 0, values, 1.0))
+
+
+@eqx.filter_custom_jvp
+def _rest_position(curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Float[Array, "n"]:
+    """Return a position of rest, with the derivatives of one Newton step there."""
+    return q
+
+
+@_rest_position.def_jvp
+def _(primals, tangents):
+    curve, analysis, t, _, free = primals
+    q = _rest_position(*primals)
+
+    def newton(curve: Curve, t: Float[Array, ""]) -> Float[Array, "n"]:
+        X = jnp.append(q, t) / curve.units
+        E = curve.slopes(X).at[:, -1].set(0.0)
+        closed = ((X - curve.plus(E) @ curve.residual(X)) * curve.units)[:-1]
+        if not free:
+            return closed
+        linear, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)
+        return closed + linear.directions @ _towards_rest(linear, scale, False, curve)
+
+    given = (curve, t)
+    none = jax.tree.map(jnp.zeros_like, eqx.filter(given, eqx.is_inexact_array))
+    moving = eqx.combine((tangents[0], tangents[2]), none)
+    return q, eqx.filter_jvp(newton, given, moving)[1]

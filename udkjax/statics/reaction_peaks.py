@@ -1,0 +1,199 @@
+"""Peaks and mean squares of reactions over a run, and their envelopes over load cases.
+
+A peak between two outputs is that of the parabola through the largest of |F| and its neighbours,
+
+    |F|_max = y_1 - (y_2 - y_0)^2 / (8 (y_2 - 2 y_1 + y_0)),
+
+which is right to the third order of the distance of the outputs, and whose derivative is that of the motion at the instant of
+the peak. All of it is pure: differentiated through `simulate`, and mapped over mechanisms and runs by `jax.vmap`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from udkjax.equations.reactions import reactions, unique_reactions
+from udkjax.positions.channels import StateHistory, has_point
+from udkjax.printing import prints_table, units
+from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Cam, Revolute
+from udkjax.scene.mechanism import Mechanism
+
+UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_time="s", torque_time="s")
+
+
+@prints_table
+class Peak(NamedTuple):
+    """Largest force and torque of one joint on one body over a run, their times, and the roots of mean squares."""
+
+    force: Float[Array, ""]  # N, of |(fx, fy)|
+    force_time: Float[Array, ""]  # s
+    torque: Float[Array, ""]  # N m, of its absolute value
+    torque_time: Float[Array, ""]  # s
+    rms_force: Float[Array, ""]  # N
+    rms_torque: Float[Array, ""]  # N m
+
+    _units = UNITS
+
+
+@prints_table
+class Envelope(NamedTuple):
+    """Largest peaks of one joint on one body over load cases, and the case in which each occurs."""
+
+    force: Float[Array, ""]  # N
+    force_case: Int[Array, ""]
+    force_time: Float[Array, ""]  # s
+    torque: Float[Array, ""]  # N m
+    torque_case: Int[Array, ""]
+    torque_time: Float[Array, ""]  # s
+
+    _units = UNITS
+
+
+Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
+
+
+class RestingPositions(NamedTuple):
+    """Positions over time, at rest: q and v (T, bodies, 3)."""
+
+    ts: Any
+    q: Any
+    v: Any
+
+
+@checked
+def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> Peaks:
+    """Return the peaks and root mean squares of all reactions over a run.
+
+    Args:
+        mechanism: the mechanism.
+        solution: ts (T,), q and v (T, bodies, 3), T of at least 3.
+        **choices: those of `reactions`: frame, about, compliances, method, stabilization. The torque of a peak is that about the
+            point which `about` chooses: here by default the "joint".
+
+    Returns:
+        A `Peak` for each joint and body, `reaction_peaks(mech, sol)["A"]["link1"].force`; of a run that failed, not a number.
+    """
+    ts = jnp.asarray(solution.ts)
+    if len(ts) < 3:
+        raise ValueError(f"a peak needs at least 3 output times, not {len(ts)}")
+    found = reactions(mechanism, solution, **{"about": "joint", **choices})
+    return {name: {body: _peak(ts, load) for body, load in loads.items()} for name, loads in found.items()}
+
+
+@checked
+def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+    """Return the load at each pin on each body that meets there, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
+
+    Where k bodies share a pin there are k - 1 joints, such as B, B-2: their loads on one body are added up.
+
+    Args:
+        mechanism: the mechanism.
+        solution: ts (T,), q and v (T, bodies, 3).
+        **choices: those of `reactions`: method, stabilization, compliances.
+
+    Returns:
+        Force x, force y (N), and the torque (N m) about the pin (T, 3), by pin and body. Joints without a point have no pin.
+    """
+    found: dict[str, dict[str, Array]] = {}
+    loads = reactions(mechanism, solution, **{"about": "joint", **choices})
+    for name, joint in mechanism.joints.items():
+        if has_point(joint):
+            at = found.setdefault(_pin_of(mechanism, name), {})
+            for body, load in loads[name].items():
+                at[body] = at[body] + load if body in at else load
+    return found
+
+
+def unique_pin_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, dict[str, bool]]:
+    """Decide, by pin and body, whether equilibrium alone determines the force at each time: see `unique_reactions`."""
+    found: dict[str, dict[str, bool]] = {}
+    unique, alive = unique_reactions(mechanism, solution), np.isfinite(np.asarray(solution.q)).all((1, 2))
+    for name, joint in mechanism.joints.items():
+        if has_point(joint):
+            at = found.setdefault(_pin_of(mechanism, name), {})
+            for body, known in unique[name].items():
+                at[body] = at.get(body, True) and bool(np.asarray(known)[alive, :2].all())
+    return found
+
+
+def cam_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, Float[np.ndarray, "T"]]:
+    """Return the force (N) with which each cam presses on its follower, along the normal of the profile.
+
+    A `Cam` holds both ways. Where the force is below zero it pulls, and a real follower without a groove leaves the profile.
+    """
+    found, q = {}, np.asarray(solution.q)
+    cams = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Cam)}
+    loads = reactions(mechanism, solution) if cams else {}
+
+    def place(body: str, point: Array) -> np.ndarray:
+        x, y, angle = (0.0, 0.0, 0.0) if body == GROUND else q[:, mechanism.body_names.index(body)].T
+        along = np.exp(1j * angle) * complex(*point) + x + 1j * y
+        return np.broadcast_to(along, len(q))
+
+    for name, cam in cams.items():
+        centre, follower = (place(body, point) for body, point in zip(cam.bodies, np.asarray(cam.points), strict=True))
+        on, sign = (cam.bodies[1], 1.0) if cam.bodies[1] != GROUND else (cam.bodies[0], -1.0)
+        fx, fy = np.asarray(loads[name][on])[:, :2].T
+        outwards = ((fx + 1j * fy) * np.conj(follower - centre)).real
+        found[name] = sign * np.copysign(np.hypot(fx, fy), outwards)
+    return found
+
+
+def _pin_of(mechanism: Mechanism, joint: str) -> str:
+    """Return the first joint at the pin of a revolute: that without the number behind it, which drawings add."""
+    base, _, number = joint.rpartition("-")
+    pair = [mechanism.joints.get(name) for name in (base, joint)]
+    return base if number.isdigit() and all(isinstance(one, Revolute) for one in pair) else joint
+
+
+@checked
+def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
+    """Return the largest peaks over load cases; cases that failed are left out.
+
+    `cases` are the peaks of each, or of a batch, as `jax.vmap(reaction_peaks)` returns them, with the cases as the first axis.
+    """
+    batch: Peaks = cases if isinstance(cases, Mapping) else jax.tree.map(lambda *xs: jnp.stack(xs), *cases)
+    return {name: {body: _envelope(peak) for body, peak in loads.items()} for name, loads in batch.items()}
+
+
+def _peak(ts: Array, load: Float[Array, "T 3"]) -> Peak:
+    square = load[:, 0] ** 2 + load[:, 1] ** 2
+    force = jnp.where(square == 0.0, 0.0, jnp.sqrt(jnp.where(square == 0.0, 1.0, square)))  # with a finite derivative at zero
+    torque = jnp.abs(load[:, 2])
+    return Peak(*_largest(ts, force), *_largest(ts, torque), *(_root_mean_square(ts, x) for x in (square, load[:, 2] ** 2)))
+
+
+def _largest(ts: Array, y: Float[Array, "T"]) -> tuple[Array, Array]:
+    """Return the peak of the parabola through the largest sample and its neighbours, and when; at an end of a run, the sample."""
+    top = jnp.argmax(y)
+    middle = jnp.clip(top, 1, len(y) - 2)
+    before, at, after = y[middle - 1], y[middle], y[middle + 1]
+    left, right = ts[middle] - ts[middle - 1], ts[middle + 1] - ts[middle]
+    # y = at + slope s + bend s^2, s from the middle
+    bend = ((after - at) / right - (at - before) / left) / (left + right)
+    slope = (at - before) / left + bend * left
+    inside = (top == middle) & (bend < 0)
+    shift = jnp.where(inside, -slope / (2 * jnp.where(inside, bend, -1.0)), 0.0)
+    return jnp.where(inside, at + slope * shift / 2, y[top]), jnp.where(inside, ts[middle] + shift, ts[top])
+
+
+def _root_mean_square(ts: Array, square: Float[Array, "T"]) -> Array:
+    """Return the root of the mean over time, by trapezoids."""
+    mean = jnp.sum((square[1:] + square[:-1]) * jnp.diff(ts)) / (2 * (ts[-1] - ts[0]))
+    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0 * mean)
+
+
+def _envelope(peak: Peak) -> Envelope:
+    def top(values: Array, times: Array) -> tuple[Array, Array, Array]:
+        if np.ndim(values) != 1:
+            raise ValueError(f"an envelope is over cases, the one axis of each peak; the shape of this one is {np.shape(values)}")
+        case = jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values))
+        return values[case], case, times[case]
+
+    return Envelope(*top(peak.force, peak.force_time), *top(peak.torque, peak.torque_time))

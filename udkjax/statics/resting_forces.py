@@ -1,0 +1,44 @@
+"""The forces that hold a mechanism in a position of rest: efforts of its drivers, and forces at its pins."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.annotations import Scalar
+from udkjax.equations import efforts
+from udkjax.positions.drive import with_halted_drivers
+from udkjax.printing import align_columns, format_number
+from udkjax.scene.mechanism import Mechanism
+from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
+
+
+class RestingForces(NamedTuple):
+    """Efforts of drivers (N, N m), and forces x and y (N) and a torque (N m) at pins on bodies, that hold a mechanism at rest."""
+
+    efforts: dict[str, float]
+    forces: dict[str, dict[str, list[float]]]
+    unique: dict[str, dict[str, bool]]  # whether equilibrium alone determines the force
+
+
+def resting_forces(mechanism: Mechanism, q: ArrayLike, t: Scalar) -> RestingForces:
+    """Return the forces in a position of rest (bodies, 3), where drivers stand still as they are at time t (s)."""
+    still, q = with_halted_drivers(mechanism, t), np.asarray(q)
+    rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))
+    at_pins = pin_reactions(still, rest)
+    forces = {pin: {body: np.asarray(load)[0].tolist() for body, load in on.items()} for pin, on in at_pins.items()}
+    held = {name: float(effort[0]) for name, effort in efforts(still, rest).items()}
+    return RestingForces(held, forces, unique_pin_forces(still, rest))
+
+
+def force_lines(mechanism: Mechanism, held: RestingForces) -> str:
+    """Describe the forces: a line for each driver, and one for each pin and body."""
+    loads = [load[:2] for on in held.forces.values() for load in on.values()]
+    scale = float(np.max(np.abs(loads), initial=0.0))
+    rows = [(f"{name} holds by", format_number(x, mechanism.drivers[name].effort_unit)) for name, x in held.efforts.items()]
+    for pin, on in held.forces.items():
+        for body, (fx, fy, _) in on.items():
+            components = ", ".join(format_number(x, scale=scale) for x in (fx, fy))
+            known = "" if held.unique[pin][body] else ", not unique: of least norm"
+            rows.append((f"at {pin} on {body}", f"{format_number(np.hypot(fx, fy), 'N', scale)}: ({components}) N{known}"))
+    return "\n".join(align_columns(rows)) if rows else "  no forces: nothing holds it"

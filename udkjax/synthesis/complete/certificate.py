@@ -1,0 +1,145 @@
+"""Certificates of real solutions: a proof, in floating-point numbers, that a system has one near an approximate one.
+
+Krawczyk's theorem: F has continuous derivatives, m is a point, U the box of all u with |u - m| <= r, Y any matrix. If
+
+    |Y F(m)| + |1 - Y F'(U)| r < r      in every component,
+
+F has exactly one zero in U, and F' is regular all over it. Both terms are bounded from above with all their roundings
+(balls.py).
+
+Source: R. Krawczyk, Newton-Algorithmen zur Bestimmung von Nullstellen mit Fehlerschranken, Computing 4 (1969); R. E. Moore, A
+test for existence of solutions to nonlinear systems, SIAM J. Numer. Anal. 14 (1977).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.synthesis.complete.balls import INFLATE, LONG, ROUNDING, SMALLEST, Ball
+
+# A box is so many times as large as the Newton step in it; of components beside the largest one, at least so much.
+WIDTHS = (2.0, 16.0)
+LEAST_SHARE = 1e-3
+NEWTON_STEPS, EXACT_STEPS = 10, 4  # at most: they double the digits
+FARTHEST = 1e8  # units: beyond, Newton's method has left for infinity
+SURE = 1e-3  # relative: a Newton step, rounding included, beyond which more digits do not help either
+EPS = float(np.finfo(float).eps)
+
+System = Callable[[Ball], tuple[Ball, Ball]]
+
+
+class Certificate(NamedTuple):
+    """Boxes of M approximate solutions of N equations.
+
+    Attributes:
+        middle: (N, M), improved by Newton's method, in the longest floating-point type.
+        radius: (N, M), of the box.
+        is_proven: whether the box has exactly one solution (M,).
+    """
+
+    middle: np.ndarray
+    radius: np.ndarray
+    is_proven: np.ndarray
+
+    def take(self, which: np.ndarray) -> "Certificate":
+        """Return some of them."""
+        return Certificate(*(a[..., which] for a in self))
+
+    @property
+    def balls(self) -> Ball:
+        """The boxes."""
+        return Ball(self.middle, self.radius)
+
+
+def certify(system: System, u: np.ndarray, exact: System | None = None) -> Certificate:
+    """Improve approximate solutions and prove that they are some.
+
+    Args:
+        system: from unknowns (N, M) to F (N, M) and F' (N, N, M), for balls.
+        u: approximate solutions (N, M).
+        exact: the same system for fractions, if its data are some: for solutions that need more digits than there are.
+
+    Returns:
+        Their boxes; nothing is proven of a solution at which F' is singular, or so nearly that rounding hides the difference.
+    """
+    m, inverse = _improved(system, np.asarray(u, LONG))
+    F, _ = system(Ball.of(m))
+    found = _prove(system, m, inverse, F)
+    step = np.max(_product(inverse, F) / np.maximum(np.abs(m).astype(float), 1.0), axis=0)
+    uncertain = np.flatnonzero(~found.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
+    if exact is None or not len(uncertain):
+        return found
+    m, inverse = m[:, uncertain], inverse[uncertain]
+    for _ in range(EXACT_STEPS):
+        m = m - np.einsum("mij,jm->im", inverse, _evaluate(exact, m).mid)
+    second = _prove(system, m, inverse, _evaluate(exact, m))
+    for old, new in zip(found, second, strict=True):
+        old[..., uncertain] = new
+    return found
+
+
+def _evaluate(exact: System, m: np.ndarray) -> Ball:
+    """Return F at points, computed in fractions, and rounded."""
+    F = exact(Ball.fractions(m))[0].mid.astype(float)
+    return Ball.of(F, EPS * np.abs(F) + SMALLEST)
+
+
+def _prove(system: System, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
+    """Return boxes about points with F there; those that satisfy Krawczyk's condition are proven."""
+    proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
+    step = _product(inverse, F)
+    size = np.maximum(np.abs(m).astype(float), 1.0)
+    for width in WIDTHS:
+        r = width * np.maximum(step, LEAST_SHARE * size * np.max(step / size, axis=0))
+        _, slopes = system(Ball.of(m, r))
+        with np.errstate(invalid="ignore", over="ignore"):
+            reach = (step + _contraction(inverse, slopes, r)) * INFLATE
+            now = np.all(reach < r, axis=0) & ~proven
+        radius[:, now], proven = r[:, now], proven | now
+    return Certificate(m, radius, proven)
+
+
+def _improved(system: System, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points improved by Newton's method, F in long numbers, and inverses of F' (M, N, N) there."""
+    for k in range(NEWTON_STEPS + 1):
+        F, slopes = system(Ball.of(m))
+        inverse = _inverses(np.moveaxis(slopes.mid, -1, 0).astype(float))
+        if k == NEWTON_STEPS:
+            break
+        step = (inverse @ F.mid.T[..., None].astype(float))[..., 0].T
+        m = m - np.where(np.isfinite(step), step, 0.0)
+    return m, inverse
+
+
+def _inverses(A: np.ndarray) -> np.ndarray:
+    """Return inverses; of singular matrices, what is not a number."""
+    with np.errstate(all="ignore"):
+        rows = np.max(np.abs(A), axis=2, keepdims=True)
+        rows = np.where((rows > 0) & np.isfinite(rows), rows, 1.0)
+        A = np.where(np.isfinite(A), A / rows, 0.0)
+        columns = np.maximum(np.max(np.abs(A), axis=1, keepdims=True), 1e-300)
+        A = A / columns
+        singular = np.linalg.slogdet(A)[0] == 0
+        A = np.where(singular[:, None, None], np.eye(A.shape[1]), A)
+        found = np.linalg.inv(A) / np.moveaxis(columns, 1, 2) / np.moveaxis(rows, 1, 2)
+    return np.where(singular[:, None, None], np.nan, found)
+
+
+def _product(Y: np.ndarray, F: Ball) -> np.ndarray:
+    """Return bounds (N, M) of |Y F|."""
+    n = len(F.mid)
+    mid = np.abs(np.einsum("mij,jm->im", Y.astype(LONG), F.mid)).astype(float)
+    with np.errstate(invalid="ignore"):
+        rounded = np.einsum("mij,jm->im", np.abs(Y), F.rad + (n + 2) * ROUNDING * np.abs(F.mid).astype(float))
+        return (mid + rounded) * INFLATE
+
+
+def _contraction(Y: np.ndarray, slopes: Ball, r: np.ndarray) -> np.ndarray:
+    """Return bounds (N, M) of |1 - Y F'(U)| r."""
+    n = len(r)
+    A = np.moveaxis(slopes.mid, -1, 0).astype(float)
+    rad = np.moveaxis(slopes.rad, -1, 0) + EPS * np.abs(A)  # of the rounding to float64 above
+    rest = np.abs(np.eye(n) - Y @ A) * (1.0 + EPS)
+    rest = rest + np.abs(Y) @ (rad + (n + 2) * EPS * np.abs(A)) * INFLATE + EPS
+    return (rest @ r.T[..., None])[..., 0].T * INFLATE

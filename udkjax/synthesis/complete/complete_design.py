@@ -1,0 +1,217 @@
+"""All four-bars that meet a goal exactly: nine places of a point, or five poses of a link."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from udkjax.positions.drive import Drive
+from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.scene.arguments import checked
+from udkjax.scene.checks import SceneError
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import require_number
+from udkjax.synthesis.complete.balls import ComplexBall
+from udkjax.synthesis.complete.complete_designs import CompleteDesigns, OtherSolution
+from udkjax.synthesis.complete.drawn_four_bar import DrawnFourBar, read_four_bar
+from udkjax.synthesis.complete.five_poses import DYADS, find_real_dyads
+from udkjax.synthesis.complete.four_bars import (
+    DEFECTS,
+    KINDS,
+    FourBarBoxes,
+    FourBars,
+    classify,
+    cognate_joints,
+    radius_of,
+    stack_four_bars,
+)
+from udkjax.synthesis.complete.motion_check import check_motions
+from udkjax.synthesis.complete.nine_points import find_real_classes
+from udkjax.synthesis.design import only_driver
+from udkjax.synthesis.goals import PathGoal, PoseGoal
+from udkjax.synthesis.limits import LengthLimits, Range, read_bounds
+
+
+class _Solutions(NamedTuple):
+    """Four-bars with what was proven of each: radius (m), class and cognate; and of all together.
+
+    `others` has for each other solution its kind, and by the letters of its joints their places from the first place of the goal,
+    as x + i y and x - i y.
+    """
+
+    bars: FourBars
+    radius: np.ndarray
+    numbers: np.ndarray
+    cognates: np.ndarray
+    classes: int
+    others: list[tuple[str, dict[str, np.ndarray]]]
+    paths: dict[str, int]
+
+
+@checked
+def design_all(
+    drawing: Drawing | Mechanism,
+    goal: PathGoal | PoseGoal,
+    driver: Drive = None,
+    bounds: Mapping[str, Any] | None = None,
+    lengths: Mapping[tuple[str, str], Range] | None = None,
+    areas: Mapping[str, Any] | None = None,
+    transmission: float = 0.0,
+    rotation: bool = False,
+) -> CompleteDesigns:
+    """Find all four-bars whose coupler point goes through nine places, or whose coupler goes through five poses.
+
+    Nine places have 1,442 classes of solutions in complex numbers, of which a homotopy follows each; five poses have four dyads,
+    the eigenvectors of a matrix. Each real one is proven: Krawczyk's theorem, with all roundings bounded, says that within
+    `radius` of its pins there is exactly one four-bar that meets the goal as its numbers stand. That no others exist is not
+    proven; `paths` tells what became of all solutions. Positions are then assigned to circuits and branches, mechanisms moved.
+
+    Args:
+        drawing: a four-bar: a crank and a rocker of two pins each, and a coupler with a third pin. Its own pins do not matter.
+        goal: a `PathGoal` of nine targets for the coupler's pin, or a `PoseGoal` of five for the coupler by that pin (`pin`);
+            without values of the driver. Angles count from the first pose.
+        driver: the motor, or another driver or coordinate that is the angle of a link at the ground; by default the only driver.
+        bounds: (low, high) by the names of pins, such as `pin.O` (m): of the first position. Designs beyond limits are left out.
+        lengths: (least, most) distances (m) by two pins.
+        areas: circles and polygons by pins, as for `design`: of the first position.
+        transmission: the least angle (rad) by which the transmission angle stays away from 0 and pi in all positions.
+        rotation: whether the driver has to make a whole turn.
+
+    Returns:
+        `CompleteDesigns`, those without defects first.
+
+    Raises:
+        SceneError: the drawing is no four-bar, its driver no crank, or a limit is none.
+        ValueError: the goal has other numbers of positions, or positions for which solutions are not isolated.
+    """
+    mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
+    if goal.values is not None:
+        raise ValueError("values of the driver are given: with them no four-bar meets so many positions; leave them out")
+    point = goal.point if isinstance(goal, PathGoal) else goal.pin
+    if point is None:
+        raise ValueError("pin: name the pin of the coupler that goes through the places")
+    drawn = read_four_bar(mechanism, point, only_driver(mechanism) if driver is None else driver)
+    if isinstance(goal, PoseGoal) and goal.body != drawn.coupler:
+        raise SceneError([f"goal: the body is not the coupler, {drawn.coupler}"], mechanism.name)
+    keeps = _Limits(mechanism, drawn, bounds or {}, lengths or {}, areas or {}, transmission, rotation)
+    solutions = _through_points(goal.targets) if isinstance(goal, PathGoal) else _through_poses(goal.targets)
+    bars, both = solutions.bars, np.tile(np.arange(len(solutions.radius)), 2)
+    bars = stack_four_bars([bars, bars.swapped()])
+    found = classify(bars)
+    confirmed = check_motions(bars, found)
+    least = np.min(np.abs(bars.transmission), axis=1)
+    doubtful = (found.defect == 0) & ~confirmed.all(axis=1)
+    places = drawn.places(bars, np.arange(len(bars.O)), np.zeros(len(bars.O), int))
+    best = np.lexsort((-least, ~found.turns, doubtful, found.defect))
+    best = best[keeps(places, least, found.turns)[best]]
+    return CompleteDesigns(
+        {name: place[best] for name, place in places.items()},
+        drawn.values(bars, found.values)[best],
+        tuple(KINDS[k] for k in found.kind[best]),
+        found.turns[best],
+        tuple(DEFECTS[k] for k in found.defect[best]),
+        found.circuits[best],
+        found.branches[best],
+        found.order[best],
+        least[best],
+        confirmed[best],
+        solutions.radius[both][best],
+        solutions.numbers[both][best],
+        solutions.cognates[both][best],
+        solutions.classes,
+        tuple(OtherSolution(kind, drawn.coordinates(joints, goal.targets[0])) for kind, joints in solutions.others),
+        len(least) - len(best),
+        solutions.paths,
+        mechanism,
+        drawn.coupler,
+        drawn.driver,
+    )
+
+
+class _Limits:
+    """Limits of designs that are known: bounds, lengths and areas of pins, transmission and rotation."""
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        drawn: DrawnFourBar,
+        bounds: Mapping[str, Any],
+        lengths: Mapping[tuple[str, str], Range],
+        areas: Mapping[str, Any],
+        transmission: float,
+        rotation: bool,
+    ):
+        require_number("transmission", transmission, "not negative")
+        self.numbers = FreeNumbers(mechanism, [f"pin.{name}" for name in drawn.pins.values()])
+        self.lengths = LengthLimits(self.numbers, lengths, areas)
+        self.bounds = read_bounds(self.numbers, bounds, np.asarray(mechanism.q0)[:, :2], mechanism.name)
+        self.least, self.rotation = np.sin(transmission), rotation
+
+    def __call__(self, places: Mapping[str, np.ndarray], transmission: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """Return which four-bars are within them (M,), of pins (M, 2) by name."""
+        if not len(turns):
+            return turns
+        x = self.numbers.join(places)
+        inside = np.all((x >= self.bounds.low) & (x <= self.bounds.high), axis=1) & np.all(self.lengths(x)[0] <= 0.0, axis=1)
+        return inside & (transmission >= self.least) & (turns | (not self.rotation))
+
+
+class CompleteSearch(NamedTuple):
+    """A call of `design_all` that has not been made yet, such as one from a file."""
+
+    mechanism: Mechanism
+    goal: PathGoal | PoseGoal
+    driver: Drive
+    limits: Mapping[str, Any]
+
+    def __call__(self) -> CompleteDesigns:
+        """Make it."""
+        return design_all(self.mechanism, self.goal, self.driver, **self.limits)
+
+
+def _through_points(targets: np.ndarray) -> _Solutions:
+    found = find_real_classes(targets)
+    J, u, R = len(targets), found.boxes.middle.astype(float), found.boxes.middle.shape[1]
+    P = targets[:, 0] + 1j * targets[:, 1]
+    x, r, y, s = found.scale * (u[0:8:2] + 1j * u[1:8:2])
+    turns = np.concatenate([np.ones((1, R)), 1.0 + u[8 : 7 + J] + 1j * u[7 + J :]]).T
+    bars = FourBars(P[0] + x - r, P[0] + y - s, P + turns * x[:, None], P + turns * y[:, None], P)
+    cognates = bars.cognates()
+    joints = cognate_joints(found.boxes)
+    radii = [radius_of(joint, bar, P[0], found.scale) for joint, bar in zip(joints, cognates, strict=True)]
+    counts = {k: v for k, v in found.paths._asdict().items() if v or k in ("tracked", "regular")}
+    numbers, z = np.tile(np.arange(R), 3), found.scale * found.ends.joints.reshape(4, 2, -1)
+    joints = {"O": z[0] - z[1], "C": z[2] - z[3], "A": z[0], "B": z[2]}
+    return _Solutions(
+        stack_four_bars(list(cognates)),
+        np.concatenate(radii),
+        numbers,
+        np.repeat(np.arange(3), R),
+        R,
+        [(kind, {name: place[:, k] for name, place in joints.items()}) for k, kind in enumerate(found.ends.kinds)],
+        counts,
+    )
+
+
+def _through_poses(targets: np.ndarray) -> _Solutions:
+    found = find_real_dyads(targets)
+    u, P = found.scale * found.boxes.middle.astype(float), targets[:, 0] + 1j * targets[:, 1]
+    pairs = np.array(list(combinations(range(u.shape[1]), 2)), int).reshape(-1, 2)
+    joint, crank = u[0] + 1j * u[1], u[2] + 1j * u[3]
+    pivots, joints = P[0] + joint - crank, P + found.turns * joint[:, None]
+    one, two = pairs.T
+    bars = FourBars(pivots[one], pivots[two], joints[one], joints[two], P)
+    joint, crank = (ComplexBall(found.boxes.balls.part(k), found.boxes.balls.part(k + 1)) for k in (0, 2))
+    pivot = joint - crank
+    boxes = FourBarBoxes(pivot.part(one), pivot.part(two), joint.part(one), joint.part(two))
+    radii = radius_of(boxes, bars, P[0], found.scale)
+    counts = {"dyads": DYADS, "infinite": found.infinite}
+    numbers, dyads = np.arange(len(pairs)), found.scale * found.unproven.T
+    others = [("unproven", {"A": _isotropic(*v[:2]), "O": _isotropic(*(v[:2] - v[2:]))}) for v in dyads]
+    return _Solutions(bars, radii, numbers, np.zeros(len(pairs), int), u.shape[1], others, counts)
+
+
+def _isotropic(x: float, y: float) -> np.ndarray:
+    return np.array([x + 1j * y, x - 1j * y])

@@ -1,0 +1,88 @@
+"""A drawing of a four-bar read by what its pins are, and batches of it in given positions."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.positions.drive import Drive, element_of
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.mechanism import Mechanism
+from udkjax.synthesis.complete.four_bars import FourBars
+
+OTHERS = ("slide", "slot", "gear", "cam", "body", "joint")
+
+
+class DrawnFourBar(NamedTuple):
+    """Names of a four-bar's pins and links, and how its driver counts.
+
+    Attributes:
+        mechanism: the mechanism that is drawn.
+        driver: driver of the crank.
+        pins: the pins by what they are: O, A, B, C, P.
+        coupler: the link with the traced point.
+        sign: 1.0 where the driver counts the crank's angle, -1.0 where it counts against it.
+        is_reversed: whether the crank's own axis leads from A to O.
+    """
+
+    mechanism: Mechanism
+    driver: Drive
+    pins: Mapping[str, str]
+    coupler: str
+    sign: float
+    is_reversed: bool
+
+    def places(self, bars: FourBars, which: np.ndarray, position: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the pins (M, 2) of some four-bars (M,), each drawn in a position (M,)."""
+        joints = {"O": bars.O[which], "C": bars.C[which], "P": bars.P[position]}
+        joints |= {"A": bars.A[which, position], "B": bars.B[which, position]}
+        return {f"pin.{self.pins[key]}": np.stack([np.real(z), np.imag(z)], 1) for key, z in joints.items()}
+
+    def coordinates(self, joints: Mapping[str, np.ndarray], start: np.ndarray) -> dict[str, np.ndarray]:
+        """Return x, y (2,) by the names of pins, complex, of joints given by x + i y and x - i y from a place (2,)."""
+        return {f"pin.{self.pins[key]}": start + np.array([z + w, (z - w) / 1j]) / 2 for key, (z, w) in joints.items()}
+
+    def values(self, bars: FourBars, angles: np.ndarray) -> np.ndarray:
+        """Return the driver's values (M, J) (rad) at angles of the crank, counted as the mechanism does where it is drawn."""
+        own = bars.crank_angles[:, :1] + np.pi * self.is_reversed
+        own = own - 2 * np.pi * np.ceil((own - np.pi) / (2 * np.pi))
+        return self.sign * (own + angles - angles[:, :1])
+
+
+def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourBar:
+    """Return the roles of a drawing's pins; raise `SceneError` where it is no four-bar with `point` on its coupler."""
+    if mechanism.drawing is None:
+        raise SceneError(["drawing: all solutions are found of four-bars that are drawn: give a Drawing"], mechanism.name)
+    groups = mechanism.drawing.groups
+    ground: tuple[str, ...] = getattr(mechanism.drawing, "ground")  # noqa: B009  # of a drawing, whose class is above
+    links = {name: list(getattr(link, "pins")) for name, link in groups["link"].items()}  # noqa: B009
+    point = point.removeprefix("pin.")
+    held = {name: pins for name, pins in links.items() if set(pins) & set(ground)}
+    free = [name for name in links if name not in held]
+    problems = [f"{section}s are no part of a four-bar" for section in OTHERS if groups.get(section)]
+    if len(links) != 3 or len(free) != 1 or any(len(pins) != 2 or len(set(pins) & set(ground)) != 1 for pins in held.values()):
+        problems.append("a four-bar has three links: two with two pins, one of which is ground, and one that joins them")
+    if problems:
+        raise SceneError([f"drawing: {p}" for p in problems], mechanism.name)
+    (coupler,), pins = free, links[free[0]]
+    element = element_of(mechanism, driver) if driver is not None else None
+    turned = [] if element is None else [body for body in element.bodies if body in held]
+    if element is None or element.coordinate != "angle" or GROUND not in element.bodies or not turned:
+        cure = f"drive the angle of {' or '.join(map(quote, held))} against the ground"
+        raise SceneError([f"driver: all solutions are classified for a crank: {cure}"], mechanism.name)
+    crank, (other,) = turned[0], [name for name in held if name != turned[0]]
+    found = {"P": point}
+    for name, (fixed, moving) in ((crank, "OA"), (other, "CB")):
+        found[fixed] = next(p for p in held[name] if p in ground)
+        found[moving] = next(p for p in held[name] if p not in ground)
+    if {*pins} != {found["A"], found["B"], point} or len(pins) != 3:
+        raise SceneError(
+            [
+                f"goal: the coupler {quote(coupler)} must have the pins {quote(found['A'])}, {quote(found['B'])} and the point "
+                f"of the goal, {quote(point)}; it has {', '.join(map(quote, pins))}"
+            ],
+            mechanism.name,
+        )
+    sign = 1.0 if element.bodies[0] == GROUND else -1.0
+    return DrawnFourBar(mechanism, driver, found, coupler, sign, held[crank][0] != found["O"])

@@ -1,0 +1,168 @@
+"""The equations of dyads and four-bars: in real coordinates, for numbers and balls; in isotropic ones, as a program for paths.
+
+A dyad has its moving joint at x from the traced point, and its crank leads there from the fixed joint by r, both in the first
+position. Where the point has moved by d and the link has turned by the angle of cosine 1 + p and sine s, the joint has moved by
+e, and the crank is as long as before:
+
+    g(x, r) = e . e / 2 + e . r = 0,      e = d + [[p, -s], [s, p]] x.
+
+In isotropic coordinates a point p = (px, py) is the pair of complex numbers z = px + i py and Z = px - i py; both are
+unknowns of their own, so that complex solutions count, too. With a turn by the angle of 1 + f, |1 + f| = 1,
+
+    g(x, X, r, R, f; d, D) = e E + e R + E r = 0,      e = d + f x,      E = D + F X,      F = 1 / (1 + f) - 1.
+
+Of a four-bar, two dyads (x, r) and (y, s) share f. Nine points give eight displacements: sixteen equations for x, X, r, R, y,
+Y, s, S and f_1 to f_8. Each f_j is in two of them, and is eliminated first. Written in this way nothing is lost where links are
+long: their turns f are small then, and no large terms cancel.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from udkjax.expressions import Graph, ScalarProgram
+from udkjax.expressions.complex_scalars import ComplexScalar, solve_complex
+from udkjax.expressions.selection import absolute
+from udkjax.synthesis.complete.balls import LONG, Ball
+
+Numbers = Any  # arrays or balls
+
+
+class Displacements(NamedTuple):
+    """Ways of the traced point from its first position (J, 1), and cosines less one and sines of turns, where known."""
+
+    x: Numbers
+    y: Numbers
+    p: Numbers = None
+    s: Numbers = None
+
+
+class DyadEquations(NamedTuple):
+    """g at all displacements (J, M), and its derivatives by x (two), r (two), p and s, (6, J, M)."""
+
+    g: Numbers
+    slopes: tuple[Numbers, ...]
+
+
+def dyad_equations(x: Numbers, y: Numbers, a: Numbers, b: Numbers, d: Displacements) -> DyadEquations:
+    """Return the equations of a moving joint (x, y) and a crank (a, b)."""
+    p, s = d.p, d.s
+    ex, ey = d.x + (p * x - s * y), d.y + (s * x + p * y)
+    wx, wy = ex + a, ey + b
+    g = (ex * ex + ey * ey) * 0.5 + (ex * a + ey * b)
+    return DyadEquations(g, (p * wx + s * wy, p * wy - s * wx, ex, ey, wx * x + wy * y, wy * x - wx * y))
+
+
+def dyad_system(d: Displacements):
+    """Return the system of one dyad whose link's angles are given: four equations for the joint and the crank."""
+
+    def system(u: Ball) -> tuple[Ball, Ball]:
+        x, y, a, b = (u.part(k) for k in range(4))
+        found = dyad_equations(x, y, a, b, d)
+        slopes = found.slopes[:4]
+        mid, rad = (np.stack([_full(getattr(s, part), found.g.mid.shape) for s in slopes], 1) for part in Ball._fields)
+        return found.g, Ball(mid, rad)
+
+    return system
+
+
+def four_bar_system(d: Displacements):
+    """Return the system of a four-bar through points: for two dyads and the J turns of their link.
+
+    The unknowns are joint and crank of the first dyad, of the second one, J cosines less one, J sines; the equations g of both,
+    and (p^2 + s^2) / 2 + p = 0.
+    """
+
+    def system(u: Ball) -> tuple[Ball, Ball]:
+        J = len(d.x.mid)
+        p, s = u.part(slice(8, 8 + J)), u.part(slice(8 + J, 8 + 2 * J))
+        turned, places = d._replace(p=p, s=s), np.arange(J)
+        x, y, a, b, *others = [u.part(k) for k in range(8)]
+        parts = [dyad_equations(x, y, a, b, turned), dyad_equations(*others, d=turned)]
+        unit = (p * p + s * s) * 0.5 + p
+        values = [*(part.g for part in parts), unit]
+        F = Ball(*(np.concatenate([getattr(v, name) for v in values]) for name in Ball._fields))
+        shape, M = (3 * J, 8 + 2 * J), u.mid.shape[1]
+        mid, rad = np.zeros((*shape, M), LONG), np.zeros((*shape, M))
+        for k, part in enumerate(parts):
+            rows = k * J + places
+            columns = [*range(4 * k, 4 * k + 4), 8 + places, 8 + J + places]
+            for column, slope in zip(columns, part.slopes, strict=True):
+                mid[rows, column], rad[rows, column] = slope.mid, slope.rad
+        for column, slope in ((8, p + 1.0), (8 + J, s)):
+            mid[2 * J + places, column + places], rad[2 * J + places, column + places] = slope.mid, slope.rad
+        return F, Ball(mid, rad)
+
+    return system
+
+
+def _full(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return np.broadcast_to(x, shape)
+
+
+# --- in isotropic coordinates
+
+JOINTS = 8  # unknowns besides the turns: x, X, r, R, y, Y, s, S
+POINTS = 8  # displacements from the first of nine points
+UNKNOWNS = JOINTS + POINTS
+LEAST = 1e-3  # unit: least scale of a joint, so that pivots are chosen by their effect
+
+
+def newton_and_tangent() -> ScalarProgram:
+    """Return the program: from unknowns, s and displacements at s = 0 and their rates to the Newton step and the rate dz/ds.
+
+    Inputs: real parts, then imaginary parts of the 16 unknowns; of s; of the displacements d_1 to d_8, D_1 to D_8 at s = 0; of
+    their derivatives by s. Outputs: real and imaginary parts of the step; of the rate.
+    """
+    graph, inputs = Graph(), []
+
+    def numbers(name: str, count: int) -> list[ComplexScalar]:
+        parts = [[graph.input(f"{name}{part}{k}", name) for k in range(count)] for part in ("re", "im")]
+        inputs.extend([*parts[0], *parts[1]])
+        return [ComplexScalar(*pair) for pair in zip(*parts, strict=True)]
+
+    unknowns, (s,) = numbers("z", UNKNOWNS), numbers("s", 1)
+    start, rates = numbers("p", 2 * POINTS), numbers("v", 2 * POINTS)
+    one = graph.constant(1.0)
+    matrix, right, turns = [], [], []
+    sizes = [absolute(z.re) + absolute(z.im) + LEAST for z in unknowns[:JOINTS]]
+    for j, f in enumerate(unknowns[JOINTS:]):
+        d, D = (start[k] + s * rates[k] for k in (j, j + POINTS))
+        moves = rates[j], rates[j + POINTS]
+        dyads = [_dyad(unknowns[k : k + 4], f, d, D, moves) for k in (0, 4)]
+        (u, row, r), (v, other, q) = dyads
+        size = one / (u.squared_modulus + v.squared_modulus)
+        scale = graph.sqrt(size)
+        left, cross = v.scaled(scale), -u.scaled(scale)
+        entries = [*(left * x for x in row), *(cross * x for x in other)]
+        entries = [x.scaled(size) for x, size in zip(entries, sizes, strict=True)]
+        weight = one / sum((absolute(x.re) + absolute(x.im) for x in entries), graph.constant(0.0))
+        matrix.append([x.scaled(weight) for x in entries])
+        right.append([(left * a + cross * b).scaled(weight) for a, b in zip(r, q, strict=True)])
+        turns.append((u.conjugate.scaled(size), v.conjugate.scaled(size), dyads))
+    found = [[x.scaled(size) for x in row] for row, size in zip(solve_complex(matrix, right), sizes, strict=True)]
+    for u, v, ((_, row, r), (_, other, q)) in turns:
+        rest = [_minus(r, row, found[:4]), _minus(q, other, found[4:JOINTS])]
+        found.append([u * a + v * b for a, b in zip(*rest, strict=True)])
+    outputs = [getattr(row[k], part) for k in (0, 1) for part in ("re", "im") for row in found]
+    return ScalarProgram(graph, inputs, outputs)
+
+
+def _dyad(
+    joints: list[ComplexScalar], f: ComplexScalar, d: ComplexScalar, D: ComplexScalar, moves: tuple[ComplexScalar, ComplexScalar]
+) -> tuple[ComplexScalar, list[ComplexScalar], list[ComplexScalar]]:
+    """Return the derivative of g by f, those by x, X, r, R, and minus g and minus its derivative by s."""
+    x, X, r, R = joints
+    inverse = ComplexScalar(f.re + 1.0, f.im).inverse()
+    F = -(f * inverse)
+    e, E = d + f * x, D + F * X
+    by_e, by_E = E + R, e + r
+    g = e * by_e + E * r
+    by_f = x * by_e - inverse * inverse * (X * by_E)
+    return by_f, [f * by_e, F * by_E, E, e], [-g, -(by_e * moves[0] + by_E * moves[1])]
+
+
+def _minus(right: list[ComplexScalar], row: list[ComplexScalar], found: list[list[ComplexScalar]]) -> list[ComplexScalar]:
+    for a, x in zip(row, found, strict=True):
+        right = [r - a * y for r, y in zip(right, x, strict=True)]
+    return right

@@ -1,0 +1,214 @@
+"""Four-bars in their positions: joints as complex numbers, cognates, kinds by Grashof, circuits, branches and order.
+
+A four-bar turns in positions that form circuits: on one of them it moves without being taken apart. A driver moves it along a
+branch of a circuit, from one dead point to the next, or all around.
+"""
+
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.synthesis.complete.balls import Ball, ComplexBall
+from udkjax.synthesis.complete.certificate import Certificate
+
+KINDS = ("double crank", "crank-rocker", "double rocker", "rocker-crank", "triple rocker")  # by the shortest link; without one
+IN_ORDER, CIRCUIT, BRANCH, ORDER = 0, 1, 2, 3  # defects of a motion through all positions: none, or of circuit, branch or order
+DEFECTS = ("none", "circuit", "branch", "order")
+
+
+class FourBars(NamedTuple):
+    """M four-bars in J positions.
+
+    Attributes:
+        O: the fixed joint of the crank, which drives (M,).
+        C: ground pivot of the rocker (M,).
+        A: the moving joint of the crank (M, J).
+        B: coupler joint of the rocker (M, J).
+        P: the traced point (J,).
+    """
+
+    O: np.ndarray  # noqa: E741  # as it is drawn
+    C: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    P: np.ndarray
+
+    def take(self, which: np.ndarray) -> "FourBars":
+        """Return some of them."""
+        return FourBars(self.O[which], self.C[which], self.A[which], self.B[which], self.P)
+
+    def swapped(self) -> "FourBars":
+        """Return the same four-bars, driven from the other side."""
+        return FourBars(self.C, self.O, self.B, self.A, self.P)
+
+    def cognates(self) -> "tuple[FourBars, FourBars, FourBars]":
+        """Return Roberts's three four-bars of each: the point traces the same curve in all of them."""
+        return self, self._other(), self.swapped()._other()
+
+    def _other(self) -> "FourBars":
+        """Return the cognate on the crank's pivot and the third one: the crank and the coupler change their places.
+
+        From c - a = k (b - a), k = AP / AB, and b - a = (A - a) + (B - A) + (b - B) follows
+        c - a = (P - A) + k (A - a) + k (b - B): the links of the cognate, one after the other.
+        """
+        k = ((self.P[:1] - self.A[:, 0]) / (self.B[:, 0] - self.A[:, 0]))[:, None]
+        A = self.O[:, None] + self.P - self.A
+        return FourBars(self.O, self.O + k[:, 0] * (self.C - self.O), A, A + k * (self.A - self.O[:, None]), self.P)
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Frame, crank, coupler, rocker (4, M)."""
+        ends = (self.O - self.C, self.A[:, 0] - self.O, self.B[:, 0] - self.A[:, 0], self.B[:, 0] - self.C)
+        return np.abs(np.stack(ends))
+
+    @property
+    def crank_angles(self) -> np.ndarray:
+        """Angles of the crank (rad), from -pi to pi (M, J)."""
+        return np.angle(self.A - self.O[:, None])
+
+    @property
+    def transmission(self) -> np.ndarray:
+        """The sine of the angle between coupler and rocker, with its sign (M, J): zero where the crank is at a dead point."""
+        coupler, rocker = self.B - self.A, self.C[:, None] - self.B
+        return np.imag(coupler.conj() * rocker) / (np.abs(coupler) * np.abs(rocker))
+
+
+def stack_four_bars(parts: list[FourBars]) -> FourBars:
+    """Return several batches as one, member by member: all of the first one, then all of the second one."""
+    O, C, A, B = (np.concatenate([getattr(part, name) for part in parts]) for name in FourBars._fields[:-1])  # noqa: E741
+    return FourBars(O, C, A, B, parts[0].P)
+
+
+class Classification(NamedTuple):
+    """Kinds of M four-bars, and where on their motion the J positions are.
+
+    Attributes:
+        kind: numbers in KINDS (M,).
+        turns: whether the crank turns fully (M,).
+        circuits: of each position (M, J), counted from that of the first one, which is 0.
+        branches: likewise.
+        order: the positions as a motion along the circuit of the first one passes them (M, J), then -1.
+        defect: a number in DEFECTS (M,).
+        values: angles of the crank (rad), without jumps from one position to the next where there is no defect (M, J).
+    """
+
+    kind: np.ndarray
+    turns: np.ndarray
+    circuits: np.ndarray
+    branches: np.ndarray
+    order: np.ndarray
+    defect: np.ndarray
+    values: np.ndarray
+
+
+def classify(bars: FourBars) -> Classification:
+    """Classify four-bars by lengths and angles."""
+    lengths = bars.lengths
+    total, longest, shortest = lengths.sum(axis=0), lengths.max(axis=0), lengths.min(axis=0)
+    is_grashof = 2.0 * (shortest + longest) < total
+    kind = np.where(is_grashof, np.argmin(lengths, axis=0), len(KINDS) - 1)
+    turns = is_grashof & (kind <= 1)
+    side = np.sign(bars.transmission)
+    angle = _relative_angles(bars, lengths)
+    circuit = np.where(turns[:, None], side, np.where(is_grashof[:, None], np.sign(angle), 0.0))
+    branch = np.where(turns[:, None], circuit, 4.0 * circuit + side)
+    circuits, branches = _counted(circuit), _counted(branch)
+    # Along a circuit that has dead points the crank goes up on one branch and down on the other one; a turn is a circle.
+    along = np.where(turns[:, None], np.mod(angle, 2 * np.pi), np.where(side > 0, angle, 4 * np.pi - angle))
+    order = _order(along, circuits == 0)
+    values = _values(angle, turns)
+    defect = np.where(
+        (circuits > 0).any(axis=1),
+        CIRCUIT,
+        np.where(_goes_round(order), np.where((branches > 0).any(axis=1), BRANCH, IN_ORDER), ORDER),
+    )
+    steps = np.diff(values, axis=1)
+    one_way = (steps > 0).all(axis=1) | (steps < 0).all(axis=1)
+    defect = np.where((defect == IN_ORDER) & ~turns & ~one_way, ORDER, defect)
+    first = bars.crank_angles[:, :1]
+    return Classification(kind, turns, circuits, branches, order, defect, first + values - values[:, :1])
+
+
+def _relative_angles(bars: FourBars, lengths: np.ndarray) -> np.ndarray:
+    """Return angles between crank and frame, without a jump where the crank of a triple rocker passes the frame's line."""
+    angle = np.angle((bars.A - bars.O[:, None]) / (bars.C - bars.O)[:, None])
+    frame, crank, coupler, rocker = lengths
+    inward = (np.abs(frame - crank) >= np.abs(coupler - rocker)) & (np.abs(frame - crank) <= coupler + rocker)
+    outward = (frame + crank <= coupler + rocker) & ~inward
+    return np.where(outward[:, None], np.mod(angle, 2 * np.pi), angle)
+
+
+def _counted(labels: np.ndarray) -> np.ndarray:
+    """Return labels (M, J) as numbers in the order in which they come, from 0 on."""
+    found = np.zeros(labels.shape, int)
+    for j in range(1, labels.shape[1]):
+        same = labels[:, :j] == labels[:, j : j + 1]
+        known = np.argmax(same, axis=1)
+        found[:, j] = np.where(same.any(axis=1), np.take_along_axis(found, known[:, None], 1)[:, 0], found[:, :j].max(axis=1) + 1)
+    return found
+
+
+def _order(along: np.ndarray, is_there: np.ndarray) -> np.ndarray:
+    """Return the places of positions as they come along a circle from the first one on (M, J); then -1."""
+    away = np.where(is_there, along, np.inf)
+    away = np.where(away < along[:, :1], away + 1e3, away)
+    order = np.argsort(away, axis=1, kind="stable")
+    return np.where(np.take_along_axis(is_there, order, 1), order, -1)
+
+
+def _goes_round(order: np.ndarray) -> np.ndarray:
+    """Return whether positions come in their order, one way round or the other (M,)."""
+    J = order.shape[1]
+    return (order == np.arange(J)).all(axis=1) | (order == -np.arange(J) % J).all(axis=1)
+
+
+def _values(angle: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Return angles (M, J) as a motion passes them: of a crank that turns, all one way, the shorter one."""
+    ahead, back = (np.cumsum(np.mod(way * np.diff(angle, axis=1, prepend=angle[:, :1]), 2 * np.pi), axis=1) for way in (1, -1))
+    shorter = np.where((ahead[:, -1] <= back[:, -1])[:, None], ahead, -back)
+    return np.where(turns[:, None], angle[:, :1] + shorter, angle)
+
+
+# --- boxes that hold exact solutions
+
+
+class FourBarBoxes(NamedTuple):
+    """Fixed joints O, C and moving joints A, B of four-bars (M,) in the first position, from the first place."""
+
+    O: ComplexBall  # noqa: E741  # as it is drawn
+    C: ComplexBall
+    A: ComplexBall
+    B: ComplexBall
+
+
+def cognate_joints(boxes: Certificate) -> tuple[FourBarBoxes, FourBarBoxes, FourBarBoxes]:
+    """Return the joints of all three cognates, as `FourBars.cognates` has them."""
+    u = boxes.balls
+    x, r, y, s = (ComplexBall(u.part(k), u.part(k + 1)) for k in (0, 2, 4, 6))
+    a, b = x - r, y - s
+    return FourBarBoxes(a, b, x, y), _other(a, b, x, y), _other(b, a, y, x)
+
+
+def _other(a: ComplexBall, b: ComplexBall, x: ComplexBall, y: ComplexBall) -> FourBarBoxes:
+    k = x / (x - y)
+    joint = a - x
+    return FourBarBoxes(a, a + k * (b - a), joint, joint + k * (x - a))
+
+
+def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float) -> np.ndarray:
+    """Return the largest distance of four-bars' pins, as floating-point numbers, from the exact ones (M,) (m)."""
+    start = ComplexBall(Ball.of(np.real(origin)), Ball.of(np.imag(origin)))
+    size = ComplexBall(Ball.of(scale), Ball.of(0.0))
+    pins = (bars.O, bars.C, bars.A[:, 0], bars.B[:, 0])
+    return np.max([(start + size * box).distance(pin) for box, pin in zip(boxes, pins, strict=True)], axis=0, initial=0.0)
+
+
+def certainly_different(boxes: Certificate) -> np.ndarray:
+    """Return the places of boxes that hold different classes: their three pivots are proven to be others, in whatever order."""
+    first, second, _ = cognate_joints(boxes)
+    pivots, count = (first.O, first.C, second.C), boxes.middle.shape[1]
+    rows, columns = np.arange(count)[:, None], np.arange(count)[None, :]
+    meet = np.array([[p.part(rows).overlaps(q.part(columns)) for q in pivots] for p in pivots])
+    same = np.any([meet[0, i] & meet[1, j] & meet[2, k] for i, j, k in permutations(range(3))], axis=0)
+    return np.flatnonzero(~np.tril(same, -1).any(axis=1))

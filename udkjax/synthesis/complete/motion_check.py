@@ -1,0 +1,77 @@
+"""Motions of four-bars that were found: which of their positions does each driver reach from another one of the same branch."""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.positions.position_batch import PositionBatch
+from udkjax.scene.drawing import Drawing
+from udkjax.synthesis.complete.four_bars import Classification, FourBars
+
+REACHED_TOL = 1e-6  # of the extent of the places: how near to its place the traced point comes
+
+
+class _BranchMotion(NamedTuple):
+    """One motion: the four-bar, the position it is drawn in, and the positions it is to pass, at values of the driver."""
+
+    member: int
+    first: int
+    positions: list[int]
+    values: list[float]
+
+
+def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
+    """Return which positions (M, J) motions confirm: each branch's are passed from the first one of them on.
+
+    A four-bar, drawn in that position, is driven by its crank and closed again at each value; the traced point, which moves with
+    the coupler, has to come to its place at the value that the classification says, without leaving its branch.
+    """
+    M, J = found.values.shape
+    confirmed = np.zeros((M, J), bool)
+    motions = [motion for m in range(M) for motion in _motions_of(m, found)]
+    if not motions:
+        return confirmed
+    longest = max(len(motion.values) for motion in motions)
+    members, first = (np.array([getattr(motion, name) for motion in motions]) for name in ("member", "first"))
+    ends = np.array([motion.values + motion.values[-1:] * (longest - len(motion.values)) for motion in motions])
+    start = bars.crank_angles[members, first]
+    joints = {"O": bars.O[members], "C": bars.C[members], "A": bars.A[members, first], "B": bars.B[members, first]}
+    pins = {f"pin.{name}": np.stack([np.real(z), np.imag(z)], 1) for name, z in joints.items()}
+    moved = skeleton()(pins, start[:, None] + ends - ends[:, :1])
+    body = moved.bodies.index("coupler")
+    place = moved.q[:, :, body, 0] + 1j * moved.q[:, :, body, 1]
+    turn = np.exp(1j * (moved.q[:, :, body, 2] - moved.q[:, :1, body, 2]))
+    traced = place + turn * (bars.P[first] - place[:, 0])[:, None]
+    tol = REACHED_TOL * np.max(np.abs(bars.P - bars.P.mean()))
+    for k, motion in enumerate(motions):
+        for n, j in enumerate(motion.positions):
+            confirmed[motion.member, j] |= bool(moved.reached[k, n] and np.abs(traced[k, n] - bars.P[j]) <= tol)
+    return confirmed
+
+
+@cache
+def skeleton() -> PositionBatch:
+    """Return positions of four-bars of bars, compiled: which point is traced, and what links weigh, matters not."""
+    pins = {"O": (0.0, 0.0), "A": (3.0, 4.0), "B": (12.0, 9.0), "C": (10.0, 0.0)}
+    links = {name: {"pins": list(ends), "mass": 1.0} for name, ends in (("crank", "OA"), ("coupler", "AB"), ("rocker", "CB"))}
+    mechanism = Drawing(pins, links, ground=["O", "C"]).mechanism()
+    return PositionBatch(mechanism, "body.crank.angle", [f"pin.{name}" for name in pins])
+
+
+def _motions_of(m: int, found: Classification) -> list[_BranchMotion]:
+    """Return motions along each branch: of a crank that turns one turn, else from the first position one way, and the other."""
+    motions = []
+    for branch in range(found.branches[m].max() + 1):
+        places = np.flatnonzero(found.branches[m] == branch)
+        first, values = int(places[0]), found.values[m]
+        away = values[places] - values[first]
+        if found.turns[m]:
+            away = np.mod(away, 2 * np.pi)
+        for way in (1, -1):
+            of_way = places[(away * way >= 0)]
+            order = of_way[np.argsort(np.abs(away[away * way >= 0]), kind="stable")]
+            if way > 0 or len(order) > 1:
+                steps = [float(away[np.flatnonzero(places == j)[0]]) for j in order]
+                motions.append(_BranchMotion(m, first, [int(j) for j in order], steps))
+    return motions

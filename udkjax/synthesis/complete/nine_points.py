@@ -1,0 +1,307 @@
+"""All four-bars through nine points: a parameter homotopy from 1,442 known classes of solutions, then certificates of the real
+ones.
+
+Generic nine points have 8,652 solutions in complex numbers, 1,442 classes of six: Roberts's three cognates, each with its
+dyads in either order. One of each class, at displacements that are complex numbers drawn at random, is in a file beside this
+module (made by experiments/nine_points.py); each is followed to the displacements that are asked for.
+
+Source: C. W. Wampler, A. P. Morgan, A. J. Sommese, Complete solution of the nine-point path synthesis problem for four-bar
+linkages, J. Mech. Des. 114 (1992).
+"""
+
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from udkjax.positions.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
+from udkjax.synthesis.complete.balls import LONG, Ball
+from udkjax.synthesis.complete.certificate import Certificate, certify
+from udkjax.synthesis.complete.dyads import JOINTS, POINTS, UNKNOWNS, Displacements, four_bar_system, newton_and_tangent
+from udkjax.synthesis.complete.four_bars import certainly_different
+
+CLASSES = 1442
+STARTS = Path(__file__).with_name("nine_points.npz")
+FIRST = Precision(3e-3, 3e-2, 1e-5)
+CLOSE = Precision(3e-4, 3e-3, 1e-6)
+BENDS = (0.0, 0.6, -0.6)  # ways around the parameters at which solutions meet, tried in turn while classes are missing
+ALIKE = 1e-7  # relative: classes whose pivots differ by less are one; more, where there would be too many classes
+# Beside the largest unknown: coordinates whose conjugates agree so well may be a real four-bar, which the certificate decides.
+NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
+REFINED = 1e-8  # a Newton step with residuals in long numbers, beside the unknowns, that shows a regular solution
+REFINEMENTS = 8  # of Newton at most: it doubles the digits
+SAME = 1e-12  # of the extent: places or poses nearer than that are one
+# A coupler curve has degree six and passes three times through both isotropic points at infinity: a line meets it in six
+# points, a circle in 12 - 6 others, unless it is a part of the curve.
+MOST_ON_A_LINE = 6
+ON_IT = 1e-10  # of the extent: off a line or circle
+
+
+class Paths(NamedTuple):
+    """Counts of the ends of a homotopy's paths.
+
+    Attributes:
+        tracked: number of paths: one for each class of generic data.
+        regular: distinct classes that were found.
+        infinite: paths to four-bars with a joint at infinity.
+        singular: paths to solutions at which others meet, or which are no isolated ones.
+        lost: paths that could not be followed to their end.
+    """
+
+    tracked: int
+    regular: int
+    infinite: int
+    singular: int
+    lost: int
+
+
+class OtherEnds(NamedTuple):
+    """Ends of paths beside the classes that were found: joints x, X, r, R, y, Y, s, S (8, K), and a word for each."""
+
+    joints: np.ndarray
+    kinds: tuple[str, ...]
+
+
+class RealClasses(NamedTuple):
+    """Four-bars of real classes, one each, in units of `scale` from the first place.
+
+    Attributes:
+        boxes: proven to hold one solution each: joint and crank of both dyads, then cosines less one and sines of turns.
+        paths: outcome of all paths.
+        ends: ends of the other paths, and of those that appear to be real, but could not be proven.
+        scale: m, a power of two.
+    """
+
+    boxes: Certificate
+    paths: Paths
+    ends: OtherEnds
+    scale: float
+
+    @property
+    def unproven(self) -> int:
+        """The number of further classes that appear to be real."""
+        return self.ends.kinds.count("unproven")
+
+
+def require_nine_points(points: np.ndarray) -> None:
+    """Raise `ValueError` unless four-bars through nine points may be isolated solutions."""
+    if len(points) != 9:
+        cure = "leave out the last one of a closed curve" if len(points) == 10 else "use `design` for fewer or more"
+        raise ValueError(f"goal: finitely many four-bars go through nine places; there are {len(points)}: {cure}")
+    extent = float(np.max(np.ptp(points, axis=0)))
+    for i, j in combinations(range(9), 2):
+        if np.max(np.abs(points[i] - points[j])) <= SAME * extent:
+            raise ValueError(f"goal: targets {i} and {j} are the same place: eight places leave infinitely many four-bars")
+    z = (points - points.mean(axis=0)) / extent
+    rows = np.column_stack([np.sum(z**2, axis=1), z, np.ones(9)])
+    for columns, what in ((slice(1, 4), "line"), (slice(0, 4), "circle")):
+        size = 2 if what == "line" else 3
+        for chosen in combinations(range(9), size):
+            normal = np.linalg.svd(rows[list(chosen), columns])[2][-1]
+            on_it = np.abs(rows[:, columns] @ normal) <= ON_IT
+            if np.count_nonzero(on_it) > MOST_ON_A_LINE:
+                raise ValueError(
+                    f"goal: {np.count_nonzero(on_it)} of the targets are on one {what}: a four-bar's curve meets a {what} in at "
+                    f"most {MOST_ON_A_LINE} places, or it is a part of the curve, as of infinitely many: use `design`"
+                )
+
+
+def find_real_classes(points: np.ndarray) -> RealClasses:
+    """Return the real classes of four-bars through nine points (9, 2); raise `ValueError` where they may not be isolated."""
+    require_nine_points(points)
+    scale = power_of_two_near(points)
+    places = np.asarray(points, LONG) / scale
+    d = places[1:] - places[0]
+    z, paths, ends = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
+    x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
+    turn = 1.0 + z[JOINTS:]
+    unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex where joints are not
+    reality = np.maximum(np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0)), unreal)
+    near = reality < NEARLY_REAL
+    joints, turns = 0.5 * (x + conjugates)[:, near], turn[:, near] / np.abs(turn[:, near]) - 1.0
+    u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
+    exact = Displacements(*(Ball.fractions(places[1:, k : k + 1]) - Ball.fractions(places[:1, k : k + 1]) for k in (0, 1)))
+    with np.errstate(over="ignore", invalid="ignore"):  # of ends at which Newton's method leaves for infinity: not proven then
+        found = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
+    keep = np.flatnonzero(found.is_proven)
+    keep = keep[distinct(isotropic(found.middle[:, keep]))]
+    proven = keep[certainly_different(found.take(keep))]
+    unproven = [*np.flatnonzero(~found.is_proven & (reality[near] < SURELY_REAL)), *np.setdiff1d(keep, proven)]
+    ends = OtherEnds(np.concatenate([ends.joints, isotropic(u[:, unproven])], 1), (*ends.kinds, *["unproven"] * len(unproven)))
+    return RealClasses(found.take(proven), paths, ends, scale)
+
+
+def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
+    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of a size of one, and the rest."""
+    target = np.concatenate([d, d.conj()])
+    start, parameters = start_solutions()
+    follow = tracker()
+
+    def take(which: np.ndarray, precision: Precision, bend: float) -> tuple[np.ndarray, np.ndarray]:
+        ends = follow(start[:, which], parameters, target, precision, bend)
+        return _refined(ends.z, ends.status, target)
+
+    every = np.arange(start.shape[1])
+    z, status = take(every, FIRST, BENDS[0])
+    unsettled = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
+    if len(unsettled):
+        z[:, unsettled], status[unsettled] = take(unsettled, CLOSE, BENDS[0])
+    known = _merged(z[:, status == ACCEPTED])
+    for bend in BENDS[1:]:
+        if known.shape[1] == CLASSES or not len(unsettled):
+            break
+        more, found = take(every, CLOSE, bend)
+        before, known = known.shape[1], _merged(known, more[:, found == ACCEPTED])
+        if known.shape[1] == before:
+            break
+    missing, ends = CLASSES - known.shape[1], {}
+    for code, name in ((INFINITE, "infinite"), (SINGULAR, "singular"), (LOST, "lost")):
+        ends[name] = np.flatnonzero(status == code)[: missing - sum(map(len, ends.values()))]
+    infinite, singular = len(ends["infinite"]), len(ends["singular"])
+    paths = Paths(CLASSES, known.shape[1], infinite, singular, missing - infinite - singular)
+    which = np.concatenate(list(ends.values()))
+    return known, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, of in ends.items() for _ in of))
+
+
+@cache
+def tracker() -> PathTracker:
+    """Return the tracker of four-bars through nine points, compiled."""
+    return PathTracker(newton_and_tangent(), UNKNOWNS)
+
+
+@cache
+def start_solutions() -> tuple[np.ndarray, np.ndarray]:
+    """Return the stored solutions (16, 1442) and their displacements (16,)."""
+    with np.load(STARTS) as file:
+        joints, parameters = file["joints"], file["displacements"]
+    z, converged = tracker().polish(np.concatenate([joints, turns_of(joints, parameters)]), parameters)
+    if not converged.all():
+        raise RuntimeError(f"{STARTS} is damaged: {np.count_nonzero(~converged)} of its solutions are none")
+    return z, parameters
+
+
+def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Return f (8, M) of four-bars whose joints are known: both dyads' equations are linear in 1 + f and 1 / (1 + f)."""
+    d, D = parameters[:POINTS, None], parameters[POINTS:, None]
+    rows = []
+    for x, X, r, R in (joints[:4], joints[4:]):
+        a, A = x - r, X - R
+        rows.append((x * (D - A), X * (d - a), a * D + A * d - d * D - x * A - X * a))
+    (u, v, w), (p, q, s) = rows
+    return (w * q - v * s) / (u * q - v * p) - 1.0
+
+
+def displacements(places: np.ndarray) -> Displacements:
+    """Return displacements from the first of some places (J + 1, 2), as balls: places are exact, differences rounded."""
+    moved = Ball.of(places[1:]) - Ball.of(places[:1])
+    return Displacements(moved.part(np.s_[:, :1]), moved.part(np.s_[:, 1:]))
+
+
+def power_of_two_near(points: np.ndarray) -> float:
+    """Return the power of two next to the size of some points: dividing by it rounds nothing."""
+    spread = points - points.mean(axis=0)
+    return 2.0 ** np.round(np.log2(np.sqrt(np.mean(np.sum(spread**2, axis=1)))))
+
+
+def isotropic(u: np.ndarray) -> np.ndarray:
+    """Return x, X, r, R, y, Y, s, S (8, M) of real coordinates."""
+    z = (u[0:JOINTS:2] + 1j * u[1:JOINTS:2]).astype(complex)
+    return np.stack([z, z.conj()], 1).reshape(JOINTS, -1)
+
+
+# --- which of them are of one class
+
+
+def class_keys(z: np.ndarray) -> np.ndarray:
+    """Return numbers (4, M) that all six of a class share: symmetric functions of the pivots a, b, c of all cognates."""
+    x, X, r, R, y, Y, s, S = z[:JOINTS]
+    a, A, b, B = x - r, X - R, y - s, Y - S
+    with np.errstate(all="ignore"):  # of ends that are no solutions
+        c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
+        return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
+
+
+def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """Return a mask of the solutions (M,) that are in a class with others."""
+    found, places = np.zeros(z.shape[1], bool), np.flatnonzero(of)
+    found[places[np.unique(_pairs(z[:, places]))]] = True
+    return found
+
+
+def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
+    """Return the places of the first solutions of each class: at most so many, those of generic points."""
+    alike = ALIKE
+    while True:
+        keep = np.ones(z.shape[1], bool)
+        for i, j in _pairs(z, alike):
+            keep[j] &= not keep[i]
+        if np.count_nonzero(keep) <= most:
+            return np.flatnonzero(keep)
+        alike *= 10.0
+
+
+def _pairs(z: np.ndarray, alike: float = ALIKE) -> np.ndarray:
+    """Return pairs i < j of solutions of one class, sorted."""
+    if not z.shape[1]:
+        return np.zeros((0, 2), int)
+    keys = class_keys(z)
+    with np.errstate(all="ignore"):
+        size = np.maximum(np.abs(keys), 1e-300)
+        keys = keys / size * np.log1p(size)  # near differences become relative ones
+    table = np.concatenate([np.real(keys), np.imag(keys)]).T
+    pairs = KDTree(np.where(np.isfinite(table), table, 0.0)).query_pairs(alike, output_type="ndarray")
+    return pairs[np.lexsort(pairs.T[::-1])]
+
+
+def _merged(*sets: np.ndarray) -> np.ndarray:
+    z = np.concatenate(sets, axis=1)
+    return z[:, distinct(z)]
+
+
+# --- ends of paths
+
+
+def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ends (16, M) and their status: paths that have not converged are tried with longer numbers."""
+    status, z = status.copy(), z.copy()
+    open_ends = np.flatnonzero((status != ACCEPTED) & np.isfinite(z).all(axis=0))
+    if not len(open_ends):
+        return z, status
+    w, p = z[:, open_ends].astype(np.clongdouble), target.astype(np.clongdouble)
+    size = np.full(len(open_ends), np.inf)
+    for _ in range(REFINEMENTS):
+        columns = np.maximum(np.abs(w), 1e-3).astype(float)
+        slopes = _jacobian(w.astype(complex), target) * columns.T[:, None, :]
+        singular = ~(np.linalg.slogdet(np.where(np.isfinite(slopes), slopes, 0.0))[1] > -np.inf)
+        slopes[singular] = np.eye(UNKNOWNS)
+        step = np.linalg.solve(slopes, _residuals(w, p).T.astype(complex)[..., None])[..., 0].T
+        size = np.where(singular, np.inf, np.max(np.abs(step), axis=0))
+        w = w - np.where(np.isfinite(step), step, 0.0) * columns
+    good = size < REFINED
+    z[:, open_ends[good]], status[open_ends[good]] = w[:, good], ACCEPTED
+    return z, status
+
+
+def _residuals(z: np.ndarray, p: np.ndarray) -> np.ndarray:
+    f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    F, found = -f / (1 + f), []
+    for x, X, r, R in (z[:4], z[4:JOINTS]):
+        e, E = d + f * x, D + F * X
+        found.append(e * (E + R) + E * r)
+    return np.concatenate(found)
+
+
+def _jacobian(z: np.ndarray, p: np.ndarray) -> np.ndarray:
+    f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    F, places = -f / (1 + f), np.arange(POINTS)
+    found = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex)
+    for k, first in ((0, 0), (4, POINTS)):
+        x, X, r, R = z[k : k + 4]
+        e, E = d + f * x, D + F * X
+        for column, slope in enumerate((f * (E + R), F * (e + r), E, e)):
+            found[:, first : first + POINTS, k + column] = slope.T
+        found[:, first + places, JOINTS + places] = (x * (E + R) - X * (e + r) / (1 + f) ** 2).T
+    return found

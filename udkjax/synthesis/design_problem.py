@@ -1,0 +1,317 @@
+"""A design as a least-squares problem, evaluated for batches of trials by machine code in lanes."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_programs import trace_model
+from udkjax.expressions import Graph, ScalarProgram, trace
+from udkjax.positions.drive import Drive, drive
+from udkjax.positions.free_numbers import FreeNumbers, position_model
+from udkjax.positions.kinematics import FULL_TURN
+from udkjax.positions.native_positions import compile_programs, position_code
+from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.mechanism import Mechanism
+from udkjax.synthesis.goals import Goal, goal_scale, place_of
+from udkjax.synthesis.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
+from udkjax.synthesis.motion_goals import MotionTerm
+from udkjax.synthesis.motion_terms import CompiledTerm
+from udkjax.synthesis.trials import TrialResiduals, Trials, Turn
+
+TURN_VALUES = 72  # of a turn from which searches start
+FINE_VALUES = 720  # of a turn that is to be made, in the end
+MARGIN_WEIGHT = 10.0  # of limits of transmission beside those of lengths: beyond them there is no mechanism
+CHECK_VALUES = 24  # of a turn at which transmission is looked at in a search; between them the worst is interpolated
+
+
+class DesignProblem:
+    """A goal for a mechanism: what is unknown, and programs that evaluate trials.
+
+    The unknowns x are the free numbers; the value from which values of the driver count, where that is free; and further ones of
+    the goal. Limits are those of lengths, of the transmission at all positions, and over the whole turn where there is one.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        goal: Goal,
+        free: FreeNumbers,
+        driver: Drive,
+        bounds: Bounds,
+        lengths: LengthLimits,
+        transmission: float,
+        rotation: bool | None,
+        terms: Sequence[MotionTerm] = (),
+    ):
+        self.mechanism, self.goal, self.free, self.driver, self.lengths = mechanism, goal, free, driver, lengths
+        self.driven, self.least = drive(mechanism, driver), max(transmission, LEAST_TRANSMISSION)
+        self.rotation = self.driven.is_angle if rotation is None else rotation
+        if self.rotation and not self.driven.is_angle:
+            raise SceneError(["rotation: the driver is no angle, and makes no turn"], mechanism.name)
+        self.shifted = goal.start == "free" and goal.values is not None
+        self.unknowns = free.count + self.shifted + goal.extras
+        self.coordinates = 3 * len(mechanism.body_names)
+        self.scale = goal_scale(goal, mechanism)
+        self._unit = np.tile(
+            [self.scale if goal.has_place else float(self.driven.analysis.scales.length)] * 2 + [1.0], self.coordinates // 3
+        )
+        wide = np.full(self.unknowns - free.count, np.inf)
+        self.low, self.high = np.append(bounds.low, -wide), np.append(bounds.high, wide)
+        self.first, self.last = bounds.first, bounds.last
+        self.data, self.reach = goal.targets, float(np.max(bounds.last - bounds.first, initial=self.scale)) / 4
+        self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # of the free numbers
+        self.local = goal.values is None  # values are unknowns, too
+        self.terms = self._compile_terms(terms)
+        self._compile()
+        self._require_effects()
+
+    def _compile_terms(self, terms: Sequence[MotionTerm]) -> list[CompiledTerm]:
+        goal, span = self.goal, None
+        if terms and not self.rotation:
+            if goal.values is None:
+                problem = (
+                    "goal: a motion is measured over a whole turn, or over values: give the first goal values, or say rotation"
+                )
+                raise SceneError([problem], self.mechanism.name)
+            span = float(goal.values[0]), float(goal.values[-1])
+        where = self._unit, self.scale, span, self.unknowns, goal.origin, self.shifted
+        return [CompiledTerm(term, self.mechanism, self.free, self.driver, self.driven, *where) for term in terms]
+
+    def _compile(self):
+        goal, count = self.goal, self.free.count
+        extras = slice(count + self.shifted, None)
+
+        def measures(mechanism, x, q, data):
+            measured = goal.measure(mechanism, q)
+            return jnp.concatenate([jnp.stack(goal.residual(measured, data, x[extras], jnp)), measured])
+
+        D, rows = self.data.shape[1], np.asarray(self.driven.analysis.scales.rows)
+        model = position_model(self.free, self.driver, measures, goal.origin, self.shifted)
+        traced = trace_model(model, self.unknowns, self.coordinates, D)
+        G = len(goal.residual(np.zeros(self.data.shape), self.data, np.zeros((1, goal.extras)), np))
+
+        def made(chosen, derivatives):
+            choices = {"data": D, "derivatives": derivatives, "rows": rows, "chosen": chosen}
+            programs = compile_programs(self.mechanism, traced, self.unknowns, self.coordinates, **choices)
+            return programs, position_code(self.mechanism, programs)
+
+        self._made, self._residual_count = made, G
+        self._fit, self._fit_code = made(slice(G), True)
+        self._turn, self._turn_code = made(slice(G, None), False)
+
+    @cached_property
+    def _residual_code(self):
+        return self._made(slice(self._residual_count), False)[1]
+
+    @cached_property
+    def _margin(self):
+        """The programs of the transmission and its derivatives."""
+        return self._made(slice(0, 0), True)
+
+    def _require_effects(self):
+        """Raise `SceneError` where a free number cannot change what is measured, such as a mass."""
+        rows = [self._fit.measure.outputs[place.by_parameters] for place in self._fit.places[:-1]]
+        rows += [term.entries for term in self.terms]
+        idle = [name for k, name in enumerate(self.free.entries()) if all(row[k].is_zero for row in rows)]
+        if idle:
+            listed = ", ".join(map(quote, idle))
+            raise SceneError([f"free: {listed} cannot change what the goal measures: leave it out"], self.mechanism.name)
+
+    @cached_property
+    def _points(self) -> ScalarProgram:
+        """The program of the measures, then of the places of all pins, or without a drawing of q and the unknowns."""
+        names = [] if self.mechanism.drawing is None else list(self.mechanism.drawing.groups["pin"])  # pyright: ignore
+
+        def points(x: Array, q: Array) -> Array:
+            mechanism, bodies = self.free.moved(x[: self.free.count]), q.reshape(-1, 3)
+            measured = self.goal.measure(mechanism, bodies)
+            if not names:
+                return jnp.concatenate([measured, q, self.scale * x[: self.free.count] / self.sizes])
+            return jnp.concatenate([measured, *(jnp.stack(place_of(mechanism, f"pin.{name}", None, bodies)) for name in names)])
+
+        graph = Graph()
+        x, q = (
+            np.array([graph.input((n, k), n) for k in range(c)], object)
+            for n, c in (("x", self.unknowns), ("q", self.coordinates))
+        )
+        found = trace(points, jnp.zeros(self.unknowns), jnp.zeros(self.coordinates))(graph, x, q)[0]
+        return ScalarProgram(graph, [*x, *q], list(found.flat))
+
+    # --- single mechanisms
+
+    def drawn(self, mechanism: Mechanism) -> float:
+        """Return the value of the driver at which a mechanism is drawn."""
+        return float(drive(mechanism, self.driver).value(mechanism.q0))
+
+    @property
+    def has_outlines(self) -> bool:
+        """True if a link has an outline in world coordinates, which does not follow its pins."""
+        drawing = self.mechanism.drawing
+        links = {} if drawing is None else drawing.groups["link"]
+        return any(link.outline is not None or link.centre is not None for link in links.values())  # pyright: ignore
+
+    def signature(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return numbers that are the same of trials that are one mechanism, however drawn: points of links at a position."""
+        return self._at(x, q[None])[0, self._measured :]
+
+    def residuals(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return the residuals (J, G) of positions (J, n) of a motion."""
+        found, extras = self._at(x, q)[:, : self._measured], x[self.free.count + self.shifted :]
+        return np.stack(self.goal.residual(found, self.data, np.broadcast_to(extras, (len(q), len(extras))), np), 1)
+
+    @property
+    def _measured(self) -> int:
+        return len(self._turn.places) - 1
+
+    def _at(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+        given = [np.full(len(q), v) for v in x] + list(q.T)
+        return np.stack(self._points.by_numpy(given), 1)
+
+    def turns(self, x: np.ndarray) -> bool:
+        """Return whether the driver of a trial makes a whole turn, in fine steps."""
+        return self.driven.is_angle and bool(self.turn(x[None], FINE_VALUES).reached.all())
+
+    def transmission_at(self, x: np.ndarray, s: np.ndarray, q: np.ndarray) -> float:
+        """Return the least transmission over the positions of a trial."""
+        found = self._turn_code(x[None], s[None], self._unit, None, q[None])
+        return float(np.min(np.abs(found.out[0, :, -1])))
+
+    # --- values of the driver
+
+    def value_drawn(self, x: np.ndarray) -> np.ndarray:
+        """Return the values (M,) at which trials are drawn."""
+        return np.asarray(self._fit.drawn_value.by_numpy(list(x.T))[0])
+
+    def turn(self, x: np.ndarray, values: int = TURN_VALUES, threads: int | None = None) -> Turn:
+        """Turn the driver once from the drawn position."""
+        s = self.value_drawn(x)[:, None] + self.period * np.linspace(0.0, 1.0, values + 1)
+        found = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
+        return Turn(s, found.out[..., :-1], found.q, found.out[..., -1], np.isfinite(found.end))
+
+    @property
+    def is_closed(self) -> bool:
+        """True if the last target is the first one again."""
+        return len(self.data) > 1 and bool(np.all(self.data[0] == self.data[-1]))
+
+    @property
+    def period(self) -> float:
+        """The range of values that a search looks at: a turn, or of a length its scale."""
+        return FULL_TURN if self.driven.is_angle else self.scale
+
+    @property
+    def longest(self) -> float:
+        """The longest step of the driver's value."""
+        return LONGEST_STEP * float(self.driven.unit)
+
+    def march(self, x: np.ndarray, s: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Go from the drawn position to values (M, J) in order; return positions (M, J, n) and whether all were reached (M,)."""
+        found = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
+        return found.q, np.isfinite(found.end).all(1)
+
+    # --- the whole mechanism moved
+
+    @property
+    def can_move(self) -> str:
+        """Moves of the mechanism as a whole that may bring it to its targets: "anything", "no turn", or "nothing"."""
+        drawing = self.mechanism.drawing
+        names = [] if drawing is None else [f"pin.{name}" for name in drawing.groups["pin"]]  # pyright: ignore
+        if not self.goal.has_place or not names or not set(names) <= {*self.free.names}:
+            return "nothing"
+        counted_from_world = self.goal.values is not None and not self.shifted and not self.goal.line
+        return "no turn" if counted_from_world or not self.driven.is_angle else "anything"
+
+    def moved(self, x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return trials whose pins p have become a p + b, in complex numbers; within the bounds."""
+        x = x.copy()
+        if self.can_move != "nothing":
+            for name, start in zip(self.free.names, self.free.starts, strict=False):
+                if name.startswith("pin."):
+                    p = a * (x[:, start] + 1j * x[:, start + 1]) + b
+                    x[:, start], x[:, start + 1] = p.real, p.imag
+        return np.clip(x, self.low, self.high)
+
+    def turned_by(self, a: np.ndarray) -> np.ndarray:
+        """Return by how much values of the driver change where the mechanism is turned: angles in the world do."""
+        of_ground = self.driven.is_angle and "ground" in self.driven.mechanism.drivers[self.driven.name].bodies
+        return np.angle(a) if of_ground and not self.goal.line and self.can_move == "anything" else np.zeros(len(a))
+
+    # --- residuals
+
+    def evaluate(
+        self,
+        trials: Trials,
+        margin: np.ndarray,
+        threads: int | None = None,
+        worth: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    ) -> TrialResiduals:
+        """Evaluate residuals and limits of trials, each position closed from that of the trial.
+
+        `worth` tells by residuals and limits of lengths of which trials the turn is worth looking at; the others are not there.
+
+        The rows of limits are those of lengths, and then of transmission tau, margin (M,) - tau^2: where branches meet it is the
+        square that changes evenly with the lengths.
+        """
+        x, (members, J) = trials.x, trials.s.shape
+        found = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
+        G = len(self._fit.places) - 1
+        table = found.out.reshape(members, J, G + 1, 2 + self.unknowns)
+        r, by_value, by_unknowns = table[:, :, :G, 0], table[:, :, :G, 1], table[:, :, :G, 2:]
+        limits, slopes = self.lengths(x)
+        is_there, tau = np.isfinite(found.end).all(1), table[:, :, G, 0]
+        if self.rotation:
+            which = is_there if worth is None else is_there & worth(r, limits)
+            turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknowns))
+            more[which], more_slopes[which], turns[which] = self._turn_limit(x[which], margin[which], threads)
+            limits, slopes = np.concatenate([limits, more], 1), np.concatenate([slopes, more_slopes], 1)
+            is_there &= turns
+        else:
+            unit = MARGIN_WEIGHT * self.scale
+            limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
+            by_x = table[:, :, G, 2:]  # values that are unknowns are held: moving them is another residual's matter
+            slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
+        terms, by_terms = self._terms_of(x, is_there, threads)
+        return TrialResiduals(found.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, is_there)
+
+    def _terms_of(self, x: np.ndarray, is_there: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals of motion goals and their derivatives; trials without a motion are no longer there."""
+        count = sum(term.goal.samples for term in self.terms)
+        r, by_unknowns, place = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
+        for term in self.terms:
+            which, columns = np.flatnonzero(is_there), slice(place, place + term.goal.samples)
+            r[which, columns], by_unknowns[which, columns], is_there[which] = term(x[which], threads)
+            place = columns.stop
+        return r, by_unknowns
+
+    def residuals_at(self, trials: Trials, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return residuals (M, J, G) alone, rows of lengths, and whether all positions exist (M,)."""
+        found = self._residual_code(trials.x, trials.s, self._unit, self.data, trials.q, threads=threads)
+        return found.out[..., :-1], self.lengths(trials.x)[0], np.isfinite(found.end).all(1)
+
+    def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return by how much the least transmission of a turn falls short, its derivative, and whether it turns.
+
+        Near its least value tau^2 is a parabola: through three values of the turn, and then by its slope.
+        """
+        turn = self.turn(x, CHECK_VALUES, threads)
+        turns, all_of_them = turn.reached.all(1), np.arange(len(x))
+        square = np.where(turns[:, None], turn.transmission**2, 1.0)[:, :-1]
+        worst, step = square.argmin(1), self.period / CHECK_VALUES
+        before, at, after = (square[all_of_them, (worst + k) % CHECK_VALUES] for k in (-1, 0, 1))
+        bend = np.maximum(before - 2.0 * at + after, np.finfo(float).tiny)
+        (programs, code), centre = self._margin, turn.s[all_of_them, worst]
+        s = centre + step * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+        guess, place = np.where(turns[:, None], turn.q[all_of_them, worst], 0.0)[:, None], programs.places[-1]
+        for last in (False, True):
+            found = code(x, s[:, None], self._unit, None, guess, threads=threads)
+            value, slope = found.out[:, 0, place.value], found.out[:, 0, place.by_value]
+            if not last:
+                moved = s - np.where(np.isfinite(slope), value * slope, 0.0) * step**2 / bend
+                s, guess = np.clip(moved, centre - step, centre + step), np.where(np.isfinite(found.q), found.q, guess)
+        turns &= np.isfinite(found.end[:, 0])
+        unit, by_x = MARGIN_WEIGHT * self.scale, found.out[:, 0, place.by_parameters]
+        limit, slopes = unit * (margin - value**2)[:, None], -2.0 * unit * (value[:, None] * by_x)[:, None]
+        return np.where(turns[:, None], limit, 0.0), np.where(turns[:, None, None], slopes, 0.0), turns

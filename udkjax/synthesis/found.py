@@ -1,0 +1,157 @@
+"""Results of a design: mechanisms that meet the goal, verified by their own motion."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.positions.channels import locate
+from udkjax.positions.drive import Drive
+from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics
+from udkjax.printing import PrintedTable, PrintsTable, format_numbers
+from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.synthesis.design_problem import DesignProblem
+
+AGREEMENT = 1e-6  # relative difference, and of the squared scale, between the loss of a search and that of the motion
+
+
+class FoundDesign(PrintsTable):
+    """A mechanism that was found, drawn at the first position of the goal where its pins are free.
+
+    Attributes:
+        loss: the sum of the squares of the residuals (m^2; of a function rad^2 or m^2), of its motion.
+        mechanism: the mechanism, to be run, animated or saved.
+        values: of the driver at the positions of the goal (J,) (rad, m).
+        residuals: (J, G), of its motion, which `kinematics` follows over these values.
+        measures: of each goal about the motion, at its samples.
+        transmission: the least over the positions, from 0 to 1; of a four-bar the sine of the transmission angle.
+        turns: whether the driver makes a whole turn.
+        parameters: the numbers that were free, by name.
+        driver: its driver.
+    """
+
+    loss: float
+    mechanism: Mechanism
+    values: Float[np.ndarray, "J"]
+    residuals: Float[np.ndarray, "J G"]
+    measures: tuple[np.ndarray, ...]
+    transmission: float
+    turns: bool
+    parameters: dict[str, np.ndarray]
+    driver: Drive = eqx.field(static=True)
+
+    def motion(self, count: int = 361) -> Kinematics:
+        """Return a motion of it, by `kinematics`: a whole turn from the first position, or from there to the last one.
+
+        Args:
+            count: of values.
+        """
+        last = self.values[0] + FULL_TURN if self.turns else self.values[-1]
+        return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
+
+    @property
+    def pins(self) -> dict[str, Float[Array, "2"]]:
+        """The places of the pins of the drawing by name (m), none where there is no drawing."""
+        drawn = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
+        return {name: getattr(pin, "position") for name, pin in drawn.items()}  # noqa: B009  # of a drawing, whose class is above
+
+    @property
+    def drawing(self) -> AbstractDrawing | None:
+        """The drawing, where the design began with one."""
+        return self.mechanism.drawing
+
+    def _table(self) -> PrintedTable:
+        rows = [("loss", f"{self.loss:.6g}"), ("largest residual", f"{np.max(np.abs(self.residuals)):.3g}")]
+        rows += [("measures", ", ".join(f"{np.min(m):.4g} to {np.max(m):.4g}" for m in self.measures))] if self.measures else []
+        rows += [("transmission", f"{self.transmission:.3g}"), ("turns", "yes" if self.turns else "no")]
+        rows += [(f"pin.{name}", format_numbers(place, "m")) for name, place in self.pins.items()]
+        return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
+
+
+class Designs(PrintsTable):
+    """Different mechanisms that meet a goal, the best first: a sequence of `FoundDesign`.
+
+    Attributes:
+        found: the designs.
+        losses: of all trials within the limits, sorted; the more often the best was found, the less is left to find.
+        starts: number of mechanisms that the search began from.
+        reason: why nothing was found, and the cure; empty where something was.
+    """
+
+    found: tuple[FoundDesign, ...]
+    losses: Float[np.ndarray, "k"]
+    starts: int = eqx.field(static=True)
+    reason: str = eqx.field(static=True, default="")
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def __getitem__(self, k: int) -> FoundDesign:
+        return self.found[k]
+
+    def __iter__(self) -> Iterator[FoundDesign]:
+        return iter(self.found)
+
+    def _table(self) -> PrintedTable:
+        rows = [("starts", str(self.starts)), ("within the limits", str(len(self.losses)))]
+        rows += [("nothing was found", self.reason)] if self.reason else []
+        for k, one in enumerate(self.found):
+            turns = ", turns" if one.turns else ""
+            rows.append((str(k + 1), f"loss {one.loss:.6g}, transmission {one.transmission:.3g}{turns}"))
+        return PrintedTable(f"{len(self.found)} designs", rows)
+
+
+def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
+    """Return a trial as a design whose loss is that of its motion; None where its motion does not bear it out."""
+    turns = problem.turns(x)
+    if problem.rotation and not turns:
+        return None
+    mechanism = problem.free.moved(jnp.asarray(x[: problem.free.count]))
+    mechanism = redrawn(problem, mechanism, q[0].reshape(-1, 3))
+    values = s + float(problem.goal.origin(mechanism)) + (x[problem.free.count] if problem.shifted else 0.0)
+    drawn = float(problem.drawn(mechanism))
+    if problem.driven.is_angle:
+        values = values + FULL_TURN * np.round((drawn - values[0]) / FULL_TURN)
+    moved = follow(mechanism, problem.driver, values)
+    numbers = FreeNumbers(mechanism, problem.free.names)
+    unknowns = np.append(numbers.vector, x[problem.free.count :])
+    tried = [term.measure_motion(mechanism, unknowns, values[0] - s[0]) for term in problem.terms]
+    measures = [m for m in tried if m is not None]
+    if moved is None or len(measures) < len(tried):
+        return None
+    residuals = problem.residuals(unknowns, moved.reshape(len(s), -1))
+    of_terms = [term.residual(m) for term, m in zip(problem.terms, measures, strict=True)]
+    found = float(sum(np.sum(r**2) for r in (residuals, *of_terms)))
+    if not abs(found - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
+        return None
+    tau = problem.transmission_at(x, s, q)
+    parameters = dict(zip(numbers.names, numbers.values, strict=True))
+    return FoundDesign(found, mechanism, values, residuals, tuple(measures), tau, turns, parameters, problem.driver)
+
+
+def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:
+    """Return positions (J, bodies, 3) of a motion from the drawn position over values; None where it does not get there."""
+    motion = kinematics(mechanism, driver, values)
+    return np.asarray(motion.q) if np.all(motion.reached) else None
+
+
+def redrawn(problem: DesignProblem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:
+    """Return the mechanism drawn in a position, where all of its moving pins are free; else as it is."""
+    drawing = mechanism.drawing
+    if drawing is None:
+        return mechanism
+    pins = drawing.groups["pin"]
+    fixed = set(drawing.ground)  # pyright: ignore[reportAttributeAccessIssue]
+    moving = [name for name in pins if name not in fixed]
+    if not {f"pin.{name}" for name in moving} <= {*problem.free.names} or problem.has_outlines:
+        return mechanism
+    places = {}
+    for name in moving:
+        body, local = locate(mechanism, f"pin.{name}")
+        x, y, angle = q[mechanism.body_names.index(body)]
+        c, s = np.cos(angle), np.sin(angle)
+        places[f"pin.{name}"] = np.array([x + c * local[0] - s * local[1], y + s * local[0] + c * local[1]])
+    return mechanism.with_parameters(places)

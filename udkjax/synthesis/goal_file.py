@@ -1,0 +1,208 @@
+"""A design in a file: the mechanism, what is wanted of it, and what must hold, in units of the file."""
+
+import inspect
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from udkjax.scene.checks import SceneError, quote, unknown_key
+from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.files import load
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.mechanism_tables import parse_toml
+from udkjax.synthesis.complete.complete_design import CompleteSearch
+from udkjax.synthesis.design import DesignSearch
+from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
+from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
+
+Table = Mapping[str, Any]
+TOP = (
+    "mechanism",
+    "units",
+    "goal",
+    "motion",
+    "complete",
+    "free",
+    "driver",
+    "bounds",
+    "areas",
+    "length",
+    "transmission",
+    "rotation",
+)
+SEARCHED = ("free", "motion")  # settings that only a search respects
+LENGTH = ("pins", "least", "most")
+# The keys of each kind of goal, and the SI units of those that have some; "value" is that of what drives.
+GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
+    "path": (PathGoal, {"point": "", "targets": "m", "values": "value", "start": "", "line": "", "at": "m"}),
+    "poses": (
+        PoseGoal,
+        {"body": "", "targets": "pose", "arm": "m", "pin": "", "values": "value", "start": "", "line": ""},
+    ),
+    "function": (
+        FunctionGoal,
+        {"output": "", "values": "value", "targets": "output", "start": "", "output_start": "", "line": ""},
+    ),
+}
+# The kinds of goals about the motion, each with the unit of its measure, or that of what drives; and their further keys.
+MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
+    "torque": (TorqueGoal, "effort"),
+    "load": (LoadGoal, "N"),
+    "energy": (EnergyGoal, "J"),
+    "frequency": (FrequencyGoal, "1/s"),
+    "tolerance": (ToleranceGoal, "m"),
+}
+MOTION_KEYS = ("kind", "most", "least", "speed", "weight", "samples")
+OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances")}
+
+
+def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
+    """Return the search that a file describes; with `complete = true` that of all solutions.
+
+    Args:
+        path: the file; the mechanism's file is named relative to it.
+
+    Raises:
+        SceneError: the file is wrong; the error lists what is.
+        OSError: a file cannot be read.
+    """
+    name = os.fspath(path)
+    table = parse_toml(Path(path).read_text(encoding="utf-8"), name, SceneError)
+    problems = [f"{key}: {unknown_key(key, TOP)}" for key in table if key not in TOP]
+    problems += [f"{key} is missing" for key in ("mechanism", "goal") if key not in table]
+    units = Units(table.get("units"))
+    problems += units.problems
+    complete = table.get("complete", False)
+    if not isinstance(complete, bool):
+        problems.append("complete must be true or false")
+    elif complete:
+        problems += [
+            f"{key} is given with complete = true, which finds all solutions: leave it out" for key in SEARCHED if key in table
+        ]
+    if problems:
+        raise SceneError(problems, name)
+    mechanism = load(Path(path).parent / str(table["mechanism"]))
+    goal = _read_goal(mechanism, table["goal"], units, problems)
+    bounds = _read_bounds(mechanism, table.get("bounds", {}), units, problems)
+    lengths = _read_lengths(table.get("length", []), units, problems)
+    terms = [_read_motion(k, mechanism, one, units, problems) for k, one in enumerate(table.get("motion", []))]
+    areas = {pin: units.convert(f"areas.{pin}", area, "m", problems) for pin, area in dict(table.get("areas", {})).items()}
+    transmission = units.convert("transmission", table.get("transmission", 0.0), "rad", problems)
+    if problems:
+        raise SceneError(problems, name)
+    assert goal is not None and isinstance(transmission, float | int)
+    if complete:
+        if not isinstance(goal, PathGoal | PoseGoal):
+            raise SceneError(['goal.kind must be "path" or "poses" where complete = true'], name)
+        limits = {"bounds": bounds, "lengths": lengths, "areas": areas, "transmission": transmission}
+        return CompleteSearch(mechanism, goal, table.get("driver"), {**limits, "rotation": table.get("rotation", False)})
+    choices = {key: table[key] for key in ("free", "driver", "rotation") if key in table}
+    try:
+        goals = [goal, *(term for term in terms if term is not None)]
+        return DesignSearch(
+            mechanism, goals, bounds=bounds, lengths=lengths, areas=areas, transmission=float(transmission), **choices
+        )
+    except (TypeError, ValueError) as problem:
+        if isinstance(problem, SceneError):
+            raise
+        raise SceneError([str(problem)], name) from None
+
+
+def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> Goal | None:
+    kind = table.get("kind") if isinstance(table, Mapping) else None
+    if kind not in GOALS:
+        problems.append(f"goal.kind must be one of {', '.join(map(quote, GOALS))}, not {quote(str(kind))}")
+        return None
+    make, keys = GOALS[kind]
+    before = len(problems)
+    problems += [f"goal.{key}: {unknown_key(key, keys)}" for key in table if key not in (*keys, "kind")]
+    given = {key: value for key, value in table.items() if key in keys}
+    problems += _missing("goal", make, given)
+    for key, unit in keys.items():
+        if key in given and unit == "pose":
+            given[key] = [_pose(f"goal.{key}[{k}]", row, units, problems) for k, row in enumerate(given[key])]
+        elif key in given and unit:
+            si = "m" if unit == "m" else _unit_of(given.get("output", "")) if unit == "output" else _driven_unit(mechanism)
+            given[key] = units.convert(f"goal.{key}", given[key], si, problems)
+    if len(problems) > before:
+        return None
+    try:
+        return make(**given)
+    except (TypeError, ValueError) as problem:
+        problems.append(f"goal: {problem}")
+        return None
+
+
+def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> MotionTerm | None:
+    where, kind = f"motion[{k}]", table.get("kind") if isinstance(table, Mapping) else None
+    if kind not in MOTION:
+        problems.append(f"{where}.kind must be one of {', '.join(map(quote, MOTION))}, not {quote(str(kind))}")
+        return None
+    make, unit = MOTION[kind]
+    keys, before = (*MOTION_KEYS, *OWN_KEYS.get(kind, ())), len(problems)
+    problems += [f"{where}.{key}: {unknown_key(key, keys)}" for key in table if key not in keys]
+    given, driven = {key: value for key, value in table.items() if key != "kind"}, _driven_unit(mechanism)
+    problems += _missing(where, make, given)
+    unit = {"rad": "N m", "m": "N"}[driven] if unit == "effort" else unit
+    for key, si in (("most", unit), ("least", unit), ("speed", f"{driven}/s")):
+        if key in given:
+            given[key] = units.convert(f"{where}.{key}", given[key], si, problems)
+    if "tolerances" in given:
+        tolerances = dict(given["tolerances"])
+        given["tolerances"] = {n: units.convert(f"{where}.tolerances.{n}", x, "m", problems) for n, x in tolerances.items()}
+    if len(problems) > before:
+        return None
+    try:
+        return make(**given)
+    except (TypeError, ValueError) as problem:
+        problems.append(f"{where}: {problem}")
+        return None
+
+
+def _missing(where: str, make: Callable[..., Any], given: Table) -> list[str]:
+    """Return the mistakes of keys that a goal needs and that are not given."""
+    needed = [key for key, value in inspect.signature(make).parameters.items() if value.default is value.empty]
+    return [f"{where}.{key}: missing" for key in needed if key not in given]
+
+
+def _pose(path: str, row: Any, units: Units, problems: list[str]) -> list[Any]:
+    if not isinstance(row, list) or len(row) != 3:
+        problems.append(f"{path}: must be x, y and an angle")
+        return [0.0] * 3
+    return [
+        units.convert(f"{path}[{k}]", x, unit, problems) for k, (x, unit) in enumerate(zip(row, ("m", "m", "rad"), strict=True))
+    ]
+
+
+def _unit_of(coordinate: str) -> str:
+    return "rad" if str(coordinate).endswith("angle") else "m"
+
+
+def _driven_unit(mechanism: Mechanism) -> str:
+    angles = [driver.coordinate == "angle" for driver in mechanism.drivers.values()]
+    return "rad" if all(angles) else "m"
+
+
+def _read_bounds(mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> dict[str, Any]:
+    if not isinstance(table, Mapping):
+        problems.append('bounds must be a table, such as "pin.A" = [[0, 0], [50, 50]]')
+        return {}
+    return {
+        key: units.convert(f"bounds.{key}", ends, "m" if key.startswith("pin.") else "", problems) for key, ends in table.items()
+    }
+
+
+def _read_lengths(tables: Any, units: Units, problems: list[str]) -> dict[tuple[str, str], tuple[float, float]]:
+    found = {}
+    for k, table in enumerate(tables):
+        where = f"length[{k}]"
+        problems += [f"{where}.{key}: {unknown_key(key, LENGTH)}" for key in table if key not in LENGTH]
+        pins = table.get("pins")
+        if not isinstance(pins, list) or len(pins) != 2:
+            problems.append(f'{where}.pins: must name two pins, such as ["A", "B"]')
+            continue
+        least = units.convert(f"{where}.least", table.get("least", 0.0), "m", problems)
+        most = units.convert(f"{where}.most", table.get("most", float("inf")), "m", problems)
+        found[tuple(pins)] = (least, most)
+    return found

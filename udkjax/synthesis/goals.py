@@ -1,0 +1,266 @@
+"""Goals of a design: what is wanted of the motion, at some positions along it.
+
+A goal measures a position by a few numbers (`measure`, in JAX), and says by how much these differ from what is wanted there
+(`residual`). The loss of a design is the sum of the squares of all residuals.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.positions.channels import locate
+from udkjax.positions.drive import Coordinate, value_of
+from udkjax.printing import PrintedTable, PrintsTable
+from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.fields import Numbers
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import require_finite
+
+AnyArray = Any  # of NumPy or JAX
+
+
+def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
+    def convert(value: Numbers) -> np.ndarray:
+        require_finite(name, value)
+        found = np.asarray(value, float)
+        found = found[:, None] if columns == 1 and found.ndim == 1 else found
+        if found.ndim != 2 or found.shape[1] != columns or not len(found):
+            shape = "(J,)" if columns == 1 else f"(J, {columns})"
+            raise ValueError(f"{name} must have the shape {shape}, one row for each position; it is {np.shape(value)}")
+        return found
+
+    return convert
+
+
+def _values(value: Numbers | None) -> np.ndarray | None:
+    if value is None:
+        return None
+    require_finite("values", value)
+    found = np.asarray(value, float)
+    if found.ndim != 1:
+        raise ValueError(f"values must be those of the driver at each position, (J,); the shape is {found.shape}")
+    return found
+
+
+class Goal(PrintsTable):
+    """A wish about a motion; `targets` has a row for each position.
+
+    Where `values` are given, each position has its value of the driver (rad, m); otherwise positions come in their order, at
+    values that are found. `start` "free": values count from one that is found; `line`: they count from the direction from one
+    pin to another, such as the ground link.
+    """
+
+    if TYPE_CHECKING:  # fields of each goal, in an order of its own
+
+        @property
+        def targets(self) -> np.ndarray: ...
+        @property
+        def values(self) -> np.ndarray | None: ...
+        @property
+        def start(self) -> str: ...
+        @property
+        def line(self) -> tuple[str, ...]: ...
+
+    def __check_init__(self):
+        if self.values is not None and len(self.values) != len(self.targets):
+            raise ValueError(f"values must be as many as targets: there are {len(self.values)} and {len(self.targets)}")
+        if self.start not in ("given", "free"):
+            raise ValueError(f'start must be "given" or "free", not {quote(str(self.start))}')
+        if self.values is None and (self.start != "given" or self.line):
+            raise ValueError("start and line say what values count from: give values, too")
+        if self.line and len(self.line) != 2:
+            raise ValueError("line must name two pins, from one to the other")
+
+    @property
+    def extras(self) -> int:
+        """The number of further unknowns, after the one that values count from."""
+        return 0
+
+    @property
+    def has_place(self) -> bool:
+        """True if the first two measures are a place, x and y, which follows the mechanism when that is moved and scaled."""
+        return False
+
+    @abstractmethod
+    def check(self, mechanism: Mechanism) -> None:
+        """Raise `SceneError` where the mechanism has not what is measured."""
+
+    @abstractmethod
+    def measure(self, mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> Float[Array, "G"]:
+        """Return the measures of a position."""
+
+    @abstractmethod
+    def residual(self, measured: AnyArray, target: AnyArray, extras: AnyArray, xp: ModuleType) -> AnyArray:
+        """Return by how much measures (..., G) differ from a target, as a list of G arrays."""
+
+    def origin(self, mechanism: Mechanism) -> Array:
+        """Return the value of the driver from which `values` count."""
+        if not self.line:
+            return jnp.zeros(())
+        pins = mechanism.drawing.pins  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+        way = pins[self.line[1]] - pins[self.line[0]]
+        return jnp.arctan2(way[1], way[0])
+
+    def check_line(self, mechanism: Mechanism) -> None:
+        """Raise `SceneError` where `line` names what is no pin of the drawing."""
+        known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
+        problems = [f"line: no pin named {quote(name)}{suggestion(name, known)}" for name in self.line if name not in known]
+        if problems:
+            raise SceneError(problems, mechanism.name)
+
+    def _table(self) -> PrintedTable:
+        how = "in order" if self.values is None else f"at given values{', from a free start' if self.start == 'free' else ''}"
+        return PrintedTable(type(self).__name__, [("positions", f"{len(self.targets)}, {how}")])
+
+
+def place_of(mechanism: Mechanism, of: str, point: Numbers | None, q: Float[Array, "bodies 3"]) -> list[Array]:
+    """Return x and y (m) of a point in a position: of a pin, or of a body at a point of its own frame."""
+    body, local = locate(mechanism, of, point)
+    if body == GROUND:
+        return [jnp.asarray(local[0]), jnp.asarray(local[1])]
+    x, y, angle = q[mechanism.body_names.index(body)]
+    found = Frame.at((x, y), angle).point(local)
+    return [jnp.asarray(found.x), jnp.asarray(found.y)]
+
+
+def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
+    """Raise `SceneError` where there is no such pin or body."""
+    try:
+        locate(mechanism, of, point)
+    except ValueError as problem:
+        raise SceneError([f"goal: {problem}"], mechanism.name) from None
+
+
+class PathGoal(Goal):
+    """A point goes through places, in their order.
+
+    Args:
+        point: the name of a pin, or of a body together with `at`.
+        targets: the places (J, 2) in m; of a closed curve the last one may be the first one again.
+        values: of the driver at each place (rad, m); by default they are found.
+        start: "free": values count from one that is found.
+        line: two pins: values count from the direction of the line from one to the other.
+        at: the point in the body's own frame (m).
+    """
+
+    point: str = eqx.field(static=True)
+    targets: np.ndarray = eqx.field(converter=_targets("targets", 2))
+    values: np.ndarray | None = eqx.field(converter=_values, default=None)
+    start: str = eqx.field(static=True, default="given")
+    line: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    at: tuple[float, ...] | None = eqx.field(static=True, default=None)
+
+    @property
+    def has_place(self) -> bool:
+        return True
+
+    def check(self, mechanism):
+        check_place(mechanism, self.point, self.at)
+
+    def measure(self, mechanism, q):
+        return jnp.stack(place_of(mechanism, self.point, self.at, q))
+
+    def residual(self, measured, target, extras, xp):
+        return [measured[..., 0] - target[..., 0], measured[..., 1] - target[..., 1]]
+
+
+class PoseGoal(Goal):
+    """A link goes through poses: a point of it through places, and the link through angles, which count from one that is found.
+
+    The residual of an angle is 2 `arm` sin(difference / 2), in m.
+
+    Args:
+        body: the link.
+        targets: x, y (m) and angle (rad) of each pose (J, 3).
+        arm: the length (m) by which angles are weighted; by default the extent of the places.
+        pin: a pin of the link that goes through the places; by default the link's origin, its centre of mass.
+        values: values of the driver, as in a `PathGoal`.
+        start: start, as in a `PathGoal`.
+        line: line, as in a `PathGoal`.
+    """
+
+    body: str = eqx.field(static=True)
+    targets: np.ndarray = eqx.field(converter=_targets("targets", 3))
+    arm: float | None = eqx.field(static=True, default=None)
+    pin: str | None = eqx.field(static=True, default=None)
+    values: np.ndarray | None = eqx.field(converter=_values, default=None)
+    start: str = eqx.field(static=True, default="given")
+    line: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+
+    @property
+    def extras(self) -> int:
+        return 1
+
+    @property
+    def has_place(self) -> bool:
+        return True
+
+    def check(self, mechanism):
+        if self.body not in mechanism.body_names:
+            problem = f"goal: no body named {quote(self.body)}{suggestion(self.body, mechanism.body_names)}"
+            raise SceneError([problem], mechanism.name)
+        if self.pin is not None:
+            check_place(mechanism, self.pin, None)
+
+    def measure(self, mechanism, q):
+        place = place_of(mechanism, f"body.{self.body}" if self.pin is None else f"joint.{self.pin}", None, q)
+        return jnp.stack([*place, q[mechanism.body_names.index(self.body), 2]])
+
+    def residual(self, measured, target, extras, xp):
+        arm = float(np.max(np.ptp(self.targets[:, :2], axis=0))) if self.arm is None else self.arm
+        turn = measured[..., 2] - target[..., 2] - extras[..., 0]
+        return [measured[..., 0] - target[..., 0], measured[..., 1] - target[..., 1], 2.0 * arm * xp.sin(0.5 * turn)]
+
+
+class FunctionGoal(Goal):
+    """A coordinate follows the driver: output values at input values, each counted from a start of its own where that is free.
+
+    Args:
+        output: the coordinate, such as `body.rocker.angle`, as `kinematics` names it.
+        values: of the driver (rad, m).
+        targets: of the output at each (rad, m).
+        start: "free": the driver's values count from one that is found.
+        output_start: "free": the output's, too.
+        line: line, as in a `PathGoal`.
+    """
+
+    output: str | Coordinate = eqx.field(static=True)
+    values: np.ndarray | None = eqx.field(converter=_values)
+    targets: np.ndarray = eqx.field(converter=_targets("targets", 1))
+    start: str = eqx.field(static=True, default="free")
+    output_start: str = eqx.field(static=True, default="free")
+    line: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+
+    def __check_init__(self):
+        if self.values is None:
+            raise ValueError("values must be those of the driver at which the output has its targets")
+        if self.output_start not in ("given", "free"):
+            raise ValueError(f'output_start must be "given" or "free", not {quote(str(self.output_start))}')
+
+    @property
+    def extras(self) -> int:
+        return int(self.output_start == "free")
+
+    def check(self, mechanism):
+        value_of(mechanism, self.output)
+
+    def measure(self, mechanism, q):
+        return jnp.reshape(value_of(mechanism, self.output)(q), (1,))
+
+    def residual(self, measured, target, extras, xp):
+        return [measured[..., 0] - target[..., 0] - (extras[..., 0] if self.extras else 0.0)]
+
+
+def goal_scale(goal: Goal, mechanism: Mechanism) -> float:
+    """Return the length (m) that residuals are judged by: the extent of the places; of a function one radian or metre."""
+    if not goal.has_place:
+        return 1.0
+    extent = float(np.max(np.ptp(goal.targets[:, :2], axis=0)))
+    return extent if extent > 0 else float(np.max(np.ptp(np.asarray(mechanism.q0)[:, :2], axis=0), initial=0.0)) or 1.0

@@ -1,0 +1,180 @@
+"""Limits of a design: bounds of free numbers, lengths between pins, areas of pins, and the least transmission."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.spatial import ConvexHull, QhullError
+
+from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.mechanism import Mechanism
+
+Range = tuple[float, float]
+# Distance of a position from where branches meet, over a turn that has to be complete, whatever transmission is required:
+# sine of the transmission angle of a four-bar. Closer, machine parts with clearances do not know their branch.
+LEAST_TRANSMISSION = 3e-3
+DEFAULT_REACH = 2.0  # times the extent of targets and drawing: how far pins are searched, where there are no bounds
+DEFAULT_FACTOR = 4.0  # other numbers: from this fraction of their values to this multiple
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """The ends of the ranges of free numbers (P,): `low` and `high` are kept, `first` and `last` are where searches start."""
+
+    low: np.ndarray
+    high: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+
+def read_bounds(
+    free: FreeNumbers, given: Mapping[str, object], places: np.ndarray, name: str, reach: float = DEFAULT_REACH
+) -> Bounds:
+    """Return the bounds of all free numbers; raise `SceneError` where one is not a range.
+
+    Args:
+        free: the numbers.
+        given: (low, high) by the name of a free number; each end is a number, or has its shape.
+        places: (k, 2) where the design is about (m).
+        name: of the mechanism, for errors.
+        reach: of the search for pins without bounds, in extents of the places.
+    """
+    low, high = np.full(free.count, -np.inf), np.full(free.count, np.inf)
+    centre, extent = 0.5 * (places.min(0) + places.max(0)), max(float(np.max(np.ptp(places, axis=0))), 1e-12)
+    problems = [f"bounds: {quote(key)} is not free{suggestion(key, free.names)}" for key in given if key not in free.names]
+    first, last = np.empty(free.count), np.empty(free.count)
+    for key, value, a, b in zip(free.names, free.values, free.starts, free.starts[1:], strict=False):
+        shape = np.shape(value)
+        if key.startswith("pin.") and shape in ((2,), ()):
+            middle = centre if shape else centre[int(key[-2])] if key.endswith(("[0]", "[1]")) else 0.0
+            first[a:b], last[a:b] = middle - reach * extent, middle + reach * extent
+        else:
+            ends = np.stack([np.ravel(value) / DEFAULT_FACTOR, np.ravel(value) * DEFAULT_FACTOR])
+            first[a:b], last[a:b] = ends.min(0), ends.max(0)
+        if key in given:
+            try:
+                one, two = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in given[key])  # pyright: ignore
+            except (TypeError, ValueError):
+                problems.append(f"bounds.{key}: must be a pair (low, high), each a number or of the shape {shape}")
+                continue
+            if not np.all(one <= two):  # also of what is not a number
+                problems.append(f"bounds.{key}: low must not exceed high")
+            low[a:b], high[a:b] = one, two
+            apart = (one > last[a:b]) | (two < first[a:b])  # from where a search would start otherwise
+            first[a:b], last[a:b] = (
+                np.where(apart, np.maximum(one, two - extent), np.maximum(one, first[a:b])),
+                np.where(apart, np.minimum(two, one + extent), np.minimum(two, last[a:b])),
+            )
+    if problems:
+        raise SceneError(problems, name)
+    return Bounds(low, high, first, last)
+
+
+class LengthLimits:
+    """Distances between pins of a drawing, and areas of pins: rows c(x) (K,) in m that must not exceed zero, with derivatives.
+
+    Args:
+        free: the free numbers x.
+        lengths: (least, most) in m by two pins.
+        areas: areas by pin: a circle (x, y, radius) or the corners (k, 2) of a convex polygon, in m.
+
+    Raises:
+        SceneError: there is no drawing, no such pin, no such range, or no such area.
+    """
+
+    def __init__(self, free: FreeNumbers, lengths: Mapping[tuple[str, str], Range], areas: Mapping[str, object] | None = None):
+        mechanism = free.mechanism
+        ranges = [_read_range(mechanism, pins, ends) for pins, ends in lengths.items()]
+        problems = [p for found in ranges for p in found[3]]
+        found = {pin: read_area(mechanism, pin, area, problems) for pin, area in (areas or {}).items()}
+        if problems:
+            raise SceneError(problems, mechanism.name)
+        rows = [(pins, way, end) for pins, low, high, _ in ranges for way, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf]
+        rows += [((None, pin), 1.0, area[2]) for pin, area in found.items() if area.ndim == 1]
+        centres = np.array([area[:2] for area in found.values() if area.ndim == 1]).reshape(-1, 2)
+        # Outward normal and distance from the origin of each side.
+        polygons = {pin: ConvexHull(area).equations for pin, area in found.items() if area.ndim == 2}
+        sides = [(pin, side[:2], -side[2]) for pin, equations in polygons.items() for side in equations]
+        self.count, self._free = len(rows) + len(sides), free.count
+        ends = [f"the area of {pin}" if a is None else f"the length {a}-{pin}" for (a, pin), *_ in rows]
+        self.names = [*ends, *(f"the area of {pin}" for pin, *_ in sides)]
+        self._way, self._end = np.array([way for _, way, _ in rows]), np.array([end for *_, end in rows])
+
+        def between(x: Array) -> Array:  # affine: pins are free numbers, or stay where they are
+            pins = free.moved(x).drawing.pins  # pyright: ignore
+            ways = [pins[b] if a is None else pins[b] - pins[a] for (a, b), *_ in rows]
+            return jnp.stack([*ways, *(pins[pin] for pin, *_ in sides)])
+
+        x = jnp.asarray(free.vector)
+        slopes = np.asarray(jax.jacobian(between)(x)) if self.count else np.zeros((0, 2, free.count))
+        offset = np.asarray(between(x)) - slopes @ free.vector if self.count else np.zeros((0, 2))
+        offset[len(rows) - len(centres) : len(rows)] -= centres
+        self._slopes, self._offset, ends = slopes[: len(rows)], offset[: len(rows)], slice(len(rows), None)
+        normals, distances = np.array([n for _, n, _ in sides]).reshape(-1, 2), np.array([d for *_, d in sides])
+        self._linear = np.einsum("kc,kcp->kp", normals, slopes[ends])
+        self._level = np.einsum("kc,kc->k", normals, offset[ends]) - distances
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return c (M, K) and dc/dx (M, K, P) of vectors (M, P), of which the first entries are the free numbers."""
+        between = np.tensordot(x[:, : self._free], self._slopes, (1, 2)) + self._offset  # (M, K, 2)
+        length = np.sqrt(np.sum(between**2, axis=2))
+        slopes, first = np.zeros((len(x), self.count, x.shape[1])), length.shape[1]
+        unit = self._way[:, None] * between / np.maximum(length, np.finfo(float).tiny)[..., None]
+        slopes[:, :first, : self._free] = np.sum(unit[..., None] * self._slopes, axis=2)
+        slopes[:, first:, : self._free] = self._linear
+        sides = x[:, : self._free] @ self._linear.T + self._level
+        return np.concatenate([self._way * (length - self._end), sides], 1), slopes
+
+
+def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str]) -> np.ndarray:
+    """Return an area of a pin: a circle (3,), or the corners (k, 2) of a convex polygon; tell where it is neither."""
+    known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
+    try:
+        found = np.asarray(area, float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    is_circle = found.shape == (3,) and found[2] > 0
+    is_polygon = found.ndim == 2 and found.shape[-1] == 2 and len(found) > 2 and _is_convex(found)
+    if pin not in known:
+        problems.append(f"areas: no pin named {quote(pin)}{suggestion(pin, known)}")
+    if not np.all(np.isfinite(found)) or not (is_circle or is_polygon):
+        problems.append(
+            f"areas.{pin}: must be a circle (x, y, radius), or the corners of a convex polygon, one after another (m)"
+        )
+        return np.zeros(3)
+    return found
+
+
+def box_of(area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest x and y of an area."""
+    return (area[:2] - area[2], area[:2] + area[2]) if area.ndim == 1 else (area.min(0), area.max(0))
+
+
+def _is_convex(corners: np.ndarray) -> bool:
+    """Return whether points (k, 2) are the corners of a convex polygon, one after another."""
+    try:
+        around = ConvexHull(corners).vertices
+    except (QhullError, ValueError):  # on a line, or no numbers
+        return False
+    steps = {*(np.diff(around, append=around[:1]) % len(corners)).tolist()}
+    return len(around) == len(corners) and steps in ({1}, {len(corners) - 1})
+
+
+def _read_range(mechanism: Mechanism, pins: Sequence[str], ends: Range) -> tuple[tuple[str, ...], float, float, list[str]]:
+    known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
+    where, problems = f"lengths[{', '.join(map(str, pins))}]", []
+    if isinstance(pins, str) or len(pins) != 2:
+        problems.append(f'lengths: {quote(str(pins))} must be two pins, such as ("A", "B")')
+    else:
+        problems += [f"{where}: no pin named {quote(p)}{suggestion(p, known)}" for p in pins if p not in known]
+    try:
+        low, high = (float(x) for x in ends)
+    except (TypeError, ValueError):
+        return tuple(pins), 0.0, np.inf, [*problems, f"{where}: must be a pair (least, most) in m"]
+    if not 0 <= low <= high:
+        problems.append(f"{where}: must be zero or more, the least before the most, not {low:g} and {high:g}")
+    return tuple(pins), low, high, problems

@@ -1,0 +1,233 @@
+"""Goals beside the path: torques, loads of joints, energies, frequencies and tolerances that must not exceed what is given.
+
+Each measures positions of a motion in which the driver goes at a constant rate: over the whole turn where there is one, else over
+the range of the values of the first goal. A measure m above its `most` adds the residual weight scale (m / most - 1), one below
+its `least` weight scale (1 - m / least), with the scale of the first goal over the root of the number of samples; one in between
+adds nothing.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.equations import constraints, loads
+from udkjax.positions.drive import Driven
+from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.printing import PrintedTable, PrintsTable
+from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.requirements import require_count, require_number
+from udkjax.synthesis.goals import check_place, place_of
+
+
+class MotionPoint(NamedTuple):
+    """A position of a motion, as motion goals measure it.
+
+    Attributes:
+        mechanism: with the numbers of the trial.
+        q: positions (bodies, 3) (m, rad).
+        v: velocities (bodies, 3) (m/s, rad/s).
+        a: accelerations (bodies, 3).
+        rate: dq/ds by the value of the driver (bodies, 3).
+        bend: d^2q/ds^2 (bodies, 3).
+        loads: loads that `loads` of a goal asked for (k, m).
+        numbers: the numbers that are free.
+        x: their values in the trial (P,).
+        psi: Psi (m,) of x (P,), at this position.
+    """
+
+    mechanism: Mechanism
+    q: Float[Array, "bodies 3"]
+    v: Float[Array, "bodies 3"]
+    a: Float[Array, "bodies 3"]
+    rate: Float[Array, "bodies 3"]
+    bend: Float[Array, "bodies 3"]
+    loads: Float[Array, "k m"]
+    numbers: FreeNumbers
+    x: Float[Array, "P"]
+    psi: Callable[[Array], Array]
+
+    @property
+    def missing(self) -> Float[Array, "n"]:
+        """M a - F: what joints and drivers exert (N, N m)."""
+        force = loads.force(self.mechanism, 0.0, self.q, self.v)
+        return loads.mass(self.mechanism) * self.a.ravel() - force
+
+
+def _float(x: Any) -> Any:
+    return float(x) if np.ndim(x) == 0 and isinstance(x, jax.Array | np.ndarray | np.generic) else x
+
+
+class MotionTerm(PrintsTable):
+    """A goal about a motion; see the module.
+
+    Args:
+        most: the measure's upper end, above zero.
+        least: its lower end, above zero.
+        speed: the rate of the driver (rad/s, m/s); by default that of its motion at the time 0.
+        weight: weight of a measure at twice its end: as much as a place missed by so many scales of the first goal.
+        samples: positions that are measured.
+    """
+
+    most: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
+    least: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
+    speed: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
+    weight: float = eqx.field(static=True, default=0.1, kw_only=True)
+    samples: int = eqx.field(static=True, default=36, kw_only=True)
+
+    def __check_init__(self):
+        if self.most is None and self.least is None:
+            raise ValueError("give most, least, or both: what the measure must not leave")
+        for name in ("most", "least", "weight"):
+            if getattr(self, name) is not None:
+                require_number(name, getattr(self, name), "positive")
+        if self.speed is not None:
+            require_number("speed", self.speed)
+        require_count("samples", self.samples)
+
+    def check(self, mechanism: Mechanism, driven: Driven, free: Sequence[str]) -> None:
+        """Raise `SceneError` where the mechanism has not what is measured."""
+
+    def loads(self, at: MotionPoint) -> Float[Array, "k n"]:
+        """Return b of as many systems Psi_q^T y = b as the measure needs; their solutions y are `at.loads`."""
+        return jnp.zeros((0, at.q.size))
+
+    def measure(self, at: MotionPoint) -> Float[Array, ""]:
+        """Return the measure of a position."""
+        raise NotImplementedError
+
+    def residual(self, measure: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals of measures, and their derivatives by them."""
+        unit, r, slope = self.weight * scale, np.zeros_like(measure), np.zeros_like(measure)
+        if self.most is not None:
+            above = measure > self.most
+            r, slope = np.where(above, unit * (measure / self.most - 1.0), r), np.where(above, unit / self.most, slope)
+        if self.least is not None:
+            below = measure < self.least
+            r, slope = np.where(below, unit * (1.0 - measure / self.least), r), np.where(below, -unit / self.least, slope)
+        return r, slope
+
+    def _table(self) -> PrintedTable:
+        ends = [(name, f"{getattr(self, name):g}") for name in ("least", "most") if getattr(self, name) is not None]
+        return PrintedTable(type(self).__name__, ends)
+
+
+class MotionGoal(MotionTerm):
+    """Any function of a motion stays between `least` and `most`.
+
+    Args:
+        function: returns the measure of a `MotionPoint`, written with jax.numpy.
+    """
+
+    function: Callable[[MotionPoint], Float[Array, ""]] = eqx.field(static=True)
+
+    def measure(self, at):
+        return jnp.asarray(self.function(at)).reshape(())
+
+
+class TorqueGoal(MotionTerm):
+    """The size of the driver's effort, its torque (N m) or force (N), stays below `most`.
+
+    It is the power of inertia, weight, springs and friction over the speed. Arguments are those of a `MotionGoal`.
+    """
+
+    def measure(self, at):
+        return jnp.abs(at.rate.ravel() @ at.missing)
+
+
+class LoadGoal(MotionTerm):
+    """The force (N) in a joint stays below `most`; of a mechanism without redundant joints.
+
+    Args:
+        joint: its name, of a drawing that of its pin. The further arguments are those of a `MotionGoal`.
+    """
+
+    joint: str = eqx.field(static=True)
+
+    def check(self, mechanism, driven, free):
+        if self.joint not in mechanism.joints:
+            listed = f"no joint named {quote(self.joint)}{suggestion(self.joint, mechanism.joints)}"
+            raise SceneError([f"goal: {listed}"], mechanism.name)
+        if driven.analysis.redundant_rows != ():
+            problem = "goal: joints are redundant, so that forces in them do not follow from the motion: measure another load"
+            raise SceneError([problem], mechanism.name)
+
+    def loads(self, at):
+        return at.missing[None]
+
+    def measure(self, at):
+        names = constraints.row_names(at.mechanism)
+        rows = jnp.stack([at.loads[0, k] for k, (name, _) in enumerate(names) if name == self.joint])
+        return _length(rows)
+
+
+class EnergyGoal(MotionTerm):
+    """The kinetic energy (J) stays below `most`, or above `least`. Arguments are those of a `MotionGoal`."""
+
+    def measure(self, at):
+        return loads.kinetic_energy(at.mechanism, at.v)
+
+
+class FrequencyGoal(MotionTerm):
+    """The frequency (Hz) of the motion that is left when the driver lets go: above `least`, below `most`; negative: unstable.
+
+    With u = dq/ds, the mass is u^T M u and the stiffness -d(u^T F)/ds. Arguments are those of a `MotionGoal`.
+    """
+
+    def measure(self, at):
+        u, mass = at.rate.ravel(), loads.mass(at.mechanism)
+
+        def force(q: Array) -> Array:
+            return loads.force(at.mechanism, 0.0, q, jnp.zeros_like(q))
+
+        F, slope = jax.jvp(force, (at.q.ravel(),), (u,))
+        square = -(at.bend.ravel() @ F + u @ slope) / (u @ (mass * u))
+        return jnp.sign(square) * _root(jnp.abs(square)) / (2.0 * jnp.pi)
+
+
+class ToleranceGoal(MotionTerm):
+    """The error of a point where numbers have errors t_k: sqrt(sum_k (t_k dp/dx_k)^2) (m) stays below `most`.
+
+    Args:
+        point: point, as for a `PathGoal`.
+        tolerances: of free numbers by their names, in their units; each entry of a pin has it by itself. The further arguments
+            are those of a `MotionGoal`.
+    """
+
+    point: str = eqx.field(static=True)
+    tolerances: Mapping[str, float] = eqx.field(static=True)
+
+    def check(self, mechanism, driven, free):
+        problems = [
+            f"goal: {quote(n)} has a tolerance and is not free{suggestion(n, free)}" for n in self.tolerances if n not in free
+        ]
+        if problems:
+            raise SceneError(problems, mechanism.name)
+        check_place(mechanism, self.point, None)
+
+    def loads(self, at):
+        return jax.jacfwd(lambda q: jnp.stack(place_of(at.mechanism, self.point, None, q.reshape(-1, 3))))(at.q.ravel())
+
+    def measure(self, at):
+        def place(x: Array) -> Array:
+            return jnp.stack(place_of(at.numbers.moved(x), self.point, None, at.q))
+
+        tolerances = [
+            jnp.full(np.size(v), self.tolerances.get(n, 0.0)) for n, v in zip(at.numbers.names, at.numbers.values, strict=True)
+        ]
+        change = jax.jacrev(place)(at.x) - jnp.stack([jax.grad(lambda x, y=y: y @ at.psi(x))(at.x) for y in at.loads])
+        return _length((change * jnp.concatenate(tolerances)).ravel())
+
+
+def _root(x: Array) -> Array:
+    """Return a square root with a finite derivative at zero."""
+    return jnp.where(x == 0.0, 0.0, jnp.sqrt(jnp.where(x == 0.0, 1.0, x)))
+
+
+def _length(x: Array) -> Array:
+    return _root(x @ x)

@@ -1,0 +1,159 @@
+"""Motion goals, compiled: their residuals and exact derivatives for batches of trials."""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.equations.motion_measures import MotionModel
+from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_programs import trace_model
+from udkjax.positions.drive import Drive, Driven
+from udkjax.positions.free_numbers import FreeNumbers, position_model
+from udkjax.positions.kinematics import FULL_TURN, kinematics
+from udkjax.positions.native_positions import compile_programs, position_code
+from udkjax.programs.deferred import deferred
+from udkjax.scene.checks import SceneError
+from udkjax.scene.mechanism import Mechanism
+from udkjax.synthesis.motion_goals import MotionPoint, MotionTerm
+
+
+class TermResiduals(NamedTuple):
+    """Residuals of M trials (M, K), their derivatives by the unknowns (M, K, P), and whether all positions exist (M,)."""
+
+    r: np.ndarray
+    by_unknowns: np.ndarray
+    is_there: np.ndarray
+
+
+class CompiledTerm:
+    """A motion goal of a design.
+
+    Args:
+        goal: the goal.
+        mechanism: the mechanism.
+        free: the numbers that are free.
+        driver: its driver, and the mechanism `driven` by it.
+        unit: units of the coordinates (n,).
+        scale: of the residuals.
+        span: the values of the driver between which it is measured, as the first goal has them; None: a whole turn.
+        unknowns: number of unknowns, of which one more than the free ones is the value that values count from, if they are
+            `shifted`.
+        origin: the value from which values count.
+        shifted: see there.
+    """
+
+    def __init__(
+        self,
+        goal: MotionTerm,
+        mechanism: Mechanism,
+        free: FreeNumbers,
+        driver: Drive,
+        driven: Driven,
+        unit: np.ndarray,
+        scale: float,
+        span: tuple[float, float] | None,
+        unknowns: int,
+        origin: Callable[[Mechanism], Array],
+        shifted: bool,
+    ):
+        goal.check(mechanism, driven, free.names)
+        self.goal, self._unit, self._span = goal, unit, span
+        self._unit_of_residuals = scale / np.sqrt(goal.samples)
+        self._longest = LONGEST_STEP * float(driven.unit)
+        turning = span is None
+        base = position_model(free, driver, lambda *_: jnp.zeros(0), None if turning else origin, shifted and not turning)
+        speed = goal.speed if goal.speed is not None else _speed(mechanism, driven.name)
+
+        def psi(x: Array, s: Array, q: Array) -> Array:
+            return base(x, s, q, jnp.zeros(0))["psi"]
+
+        def point(x: Array, s: Array, q: Array, u: Array, w: Array, y: Array) -> MotionPoint:
+            q, u, w = (a.reshape(-1, 3) for a in (q, u, w))
+            numbers = x[: free.count]
+            at = lambda changed: psi(jnp.concatenate([changed, x[free.count :]]), s, q.ravel())  # noqa: E731
+            return MotionPoint(free.moved(numbers), q, speed * u, speed**2 * w, u, w, y, free, numbers, at)
+
+        def loads(x: Array, s: Array, q: Array, u: Array, w: Array) -> Array:
+            return goal.loads(point(x, s, q, u, w, jnp.zeros((0, 0))))
+
+        def measures(x: Array, s: Array, q: Array, u: Array, w: Array, y: Array, d: Array) -> Array:
+            return goal.measure(point(x, s, q, u, w, y)).reshape(1)
+
+        n = mechanism.q0.size
+        programs = compile_programs(
+            mechanism,
+            trace_model(base, unknowns, n),
+            unknowns,
+            n,
+            transmission=False,
+            rows=np.asarray(driven.analysis.scales.rows),
+            motion=MotionModel(psi, loads, measures),
+        )
+        self._model, self._driver = (psi, loads, measures), driver
+        self._code, self._drawn = position_code(mechanism, programs), programs.drawn_value
+        self._places, self.entries = programs.places[0], programs.measure.outputs[programs.places[0].by_parameters]
+
+    def measures(self, x: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return measures (M, K), their derivatives by the unknowns (M, K, P), and whether all positions exist (M,)."""
+        s = self._values(x)
+        found = self._code(x, s, self._unit, longest=self._longest, threads=threads)
+        finite = np.isfinite(found.end).all(1)
+        out = np.where(finite[:, None, None], found.out, 0.0)
+        return out[..., self._places.value], out[..., self._places.by_parameters], finite
+
+    def __call__(self, x: np.ndarray, threads: int | None = None) -> TermResiduals:
+        """Return the residuals of trials x (M, P)."""
+        m, by_unknowns, there = self.measures(x, threads)
+        r, slope = self.goal.residual(m, self._unit_of_residuals)
+        return TermResiduals(r, slope[..., None] * by_unknowns, there)
+
+    def residual(self, measures: np.ndarray) -> np.ndarray:
+        """Return the residuals of measures (K,)."""
+        return self.goal.residual(measures, self._unit_of_residuals)[0]
+
+    def _values(self, x: np.ndarray) -> np.ndarray:
+        count = self.goal.samples
+        if self._span is not None:
+            return np.tile(np.linspace(*self._span, count), (len(x), 1))
+        # Fixed values, so that they do not change with the drawing; the first is the next one to it.
+        step, drawn = FULL_TURN / count, np.asarray(self._drawn.by_numpy(list(x.T))[0])
+        return step * (np.ceil(drawn / step)[:, None] + np.arange(count))
+
+    def measure_motion(self, mechanism: Mechanism, x: np.ndarray, origin: float) -> np.ndarray | None:
+        """Return the measures (K,) of a mechanism's motion by `kinematics`; None where it does not get there.
+
+        Args:
+            mechanism: the mechanism.
+            x: its free numbers and further unknowns (P,).
+            origin: the value of the driver from which values of the span count.
+        """
+        s = self._values(x[None])[0]
+        motion = kinematics(mechanism, self._driver, s if self._span is None else s + origin)
+        if not np.all(motion.reached):
+            return None
+        q, u, w = (np.asarray(a).reshape(len(s), -1) for a in (motion.q, motion.v, motion.a))
+        return np.asarray(self._of_motion(jnp.asarray(x), s, q, u, w))
+
+    @cached_property
+    def _of_motion(self) -> Callable[..., Array]:
+        psi, loads, measures = self._model
+
+        def one(x: Array, s: Array, q: Array, u: Array, w: Array) -> Array:
+            b, jacobian = loads(x, s, q, u, w), jax.jacfwd(lambda q: psi(x, s, q))(q)
+            y = b @ jnp.linalg.pinv(jacobian) if len(b) else jnp.zeros((0, len(jacobian)))
+            return measures(x, s, q, u, w, y, jnp.zeros(0))[0]
+
+        return deferred(jax.vmap(one, (None, 0, 0, 0, 0)))
+
+
+def _speed(mechanism: Mechanism, driver: str) -> float:
+    motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
+    rate = 0.0 if motion is None else float(jax.jvp(motion, (0.0,), (1.0,))[1])
+    if not rate:
+        raise SceneError(["goal: give speed, the rate of the driver: its motion has none at the time 0"], mechanism.name)
+    return rate

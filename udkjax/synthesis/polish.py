@@ -1,0 +1,138 @@
+"""Newton's method for the best trials of a search: where residuals remain, steps that neglect their curvature creep.
+
+The merit is that of search.py, of all unknowns z = (x, s) in units of their scales. Its gradient is exact; its Hessian is made of
+differences of gradients, all of which are trials of one batch. Steps go downhill along every eigenvector,
+
+    dz = -V (|Lambda| + mu)^(-1) V^T g.
+"""
+
+import numpy as np
+
+from udkjax.synthesis.design_problem import DesignProblem
+from udkjax.synthesis.search import ROUNDING, SearchState, goes_on, harden, merit_of
+from udkjax.synthesis.steps import ACTIVE_SETS
+from udkjax.synthesis.trials import TrialResiduals, Trials
+
+DIFFERENCE = 1e-7  # of the unknowns' scales: small enough for mechanisms that just turn; rounding leaves 1e-8 of a Hessian
+FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, of the largest eigenvalue
+CONVERGED = 1e-13  # relative fall of the merit that a step promises
+
+
+def polish(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
+    """Improve all trials of a state by so many Newton steps at most."""
+    members, sign = len(state.merit), np.sign(state.found.transmission[:, 0])
+    shift, done = np.full(members, FIRST_SHIFT), ~state.found.is_there
+    for _ in range(steps):
+        active = np.flatnonzero(~done)
+        if not len(active):
+            break
+        _newton_step(problem, state, active, sign, shift, done, threads)
+    return state
+
+
+def _newton_step(
+    problem: DesignProblem,
+    state: SearchState,
+    active: np.ndarray,
+    sign: np.ndarray,
+    shift: np.ndarray,
+    done: np.ndarray,
+    threads: int | None,
+):
+    trials, found = state.trials.take(active), state.found.take(active)
+    u, weight = state.multipliers[active], state.weight[active]
+    z, units = _join(problem, trials)
+    pressed = found.limits + u > 0
+    g = _gradient(problem, found, u, weight, pressed) * units
+    H = _hessian(problem, trials, z, units, (u, weight, state.margin[active], pressed), threads)
+    usable = np.isfinite(H).all((1, 2))
+    H = np.where(usable[:, None, None], H, np.eye(H.shape[1]))
+    slopes = np.zeros((*pressed.shape, len(units)))
+    slopes[..., : problem.unknowns] = found.limits_by_unknowns
+    slopes *= units
+    for _ in range(ACTIVE_SETS):
+        dz = _downhill(problem, trials, H, g, shift[active])
+        now = found.limits + u + np.einsum("mkp,mp->mk", slopes, dz) > 0
+        if np.array_equal(now, pressed):
+            break
+        # The merit's curvature and slope along a limit come and go with its pressure.
+        change = 2.0 * weight[:, None] ** 2 * (now.astype(float) - pressed)
+        H = H + slopes.transpose(0, 2, 1) @ (change[..., None] * slopes)
+        g = g + np.einsum("mkp,mk->mp", slopes, change * (found.limits + u))
+        pressed = now
+    longest = np.abs(dz).max(1)
+    dz *= np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))[:, None]
+    new = _split(problem, z + dz * units, trials)
+    trial = problem.evaluate(new, state.margin[active], threads)
+    ordered = np.all(np.diff(new.s, axis=1) * np.sign(trials.s[:, -1:] - trials.s[:, :1]) > 0, axis=1) | (not problem.local)
+    exists = usable & ordered & trial.is_there & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
+    merit = np.where(exists, merit_of(trial, u, weight), np.inf)
+    better = merit < state.merit[active]
+    taken, kept = active[better], active[~better]
+    state.accept(problem, taken, new.take(better), trial.take(better), merit[better])
+    promised = np.abs(np.einsum("mk,mk->m", g, dz))
+    small = promised <= CONVERGED * state.merit[active] + ROUNDING * problem.scale**2
+    shift[taken] = np.maximum(0.1 * shift[taken], LEAST_SHIFT)
+    shift[kept] = shift[kept] * 10.0
+    ended = active[small | (shift[active] > MOST_SHIFT)]
+    wrong = goes_on(problem, state, ended)
+    harden(problem, state, ended[wrong])
+    shift[ended[wrong]] = FIRST_SHIFT
+    done[ended[~wrong]] = True
+
+
+def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return the step of each trial, along which unknowns at their bounds that would leave them stay."""
+    held = np.zeros(g.shape, bool)
+    of_x = g[:, : problem.unknowns]
+    held[:, : problem.unknowns] = ((trials.x <= problem.low) & (of_x > 0)) | ((trials.x >= problem.high) & (of_x < 0))
+    values, V = np.linalg.eigh(np.where(held[:, :, None] | held[:, None, :], 0.0, H))
+    size = np.maximum(np.abs(values).max(1), 1e-300)
+    along = np.einsum("mki,mk->mi", V, np.where(held, 0.0, g)) / (np.abs(values) + (shift * size)[:, None])
+    return np.where(held, 0.0, -np.einsum("mki,mi->mk", V, along))
+
+
+def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (M, N) and its units (N,)."""
+    units = np.ones(problem.unknowns)
+    units[: problem.free.count] = problem.sizes
+    if not problem.local:
+        return trials.x, units
+    return np.concatenate([trials.x, trials.s], 1), np.append(units, np.ones(trials.s.shape[1]))
+
+
+def _split(problem: DesignProblem, z: np.ndarray, trials: Trials) -> Trials:
+    x = np.clip(z[:, : problem.unknowns], problem.low, problem.high)
+    return Trials(x, z[:, problem.unknowns :] if problem.local else trials.s, trials.q)
+
+
+def _gradient(
+    problem: DesignProblem, found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray, pressed: np.ndarray
+) -> np.ndarray:
+    excess = weight[:, None] ** 2 * (found.limits + multipliers) * pressed
+    by_x = np.einsum("mjgp,mjg->mp", found.by_unknowns, found.r) + np.einsum("mkp,mk->mp", found.limits_by_unknowns, excess)
+    by_x += np.einsum("mtp,mt->mp", found.terms_by_unknowns, found.terms)
+    if not problem.local:
+        return 2.0 * by_x
+    return 2.0 * np.concatenate([by_x, np.einsum("mjg,mjg->mj", found.by_value, found.r)], 1)
+
+
+def _hessian(
+    problem: DesignProblem,
+    trials: Trials,
+    z: np.ndarray,
+    units: np.ndarray,
+    limits: tuple[np.ndarray, ...],
+    threads: int | None,
+) -> np.ndarray:
+    members, N = z.shape
+    moves = DIFFERENCE * np.concatenate([np.diag(units), -np.diag(units)])  # (2 N, N)
+    moved = (z[:, None] + moves).reshape(-1, N)
+    repeated = Trials(*(np.repeat(a, 2 * N, 0) for a in trials))
+    split = Trials(moved[:, : problem.unknowns], moved[:, problem.unknowns :] if problem.local else repeated.s, repeated.q)
+    u, weight, margin, pressed = (np.repeat(a, 2 * N, 0) for a in limits)
+    found = problem.evaluate(split, margin, threads)
+    g = _gradient(problem, found, u, weight, pressed) * units
+    g = np.where(found.is_there[:, None], g, np.nan).reshape(members, 2, N, N)
+    H = (g[:, 0] - g[:, 1]) / (2.0 * DIFFERENCE)
+    return 0.5 * (H + H.transpose(0, 2, 1))

@@ -1,0 +1,212 @@
+"""Searches: trials improved side by side, with limits that harden.
+
+Limits c(x) <= 0 are kept by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u) whenever
+a trial has settled. Where valleys are narrow and bend, steps bend with them: beside a step v, the second derivative of the
+residuals along it, by one more evaluation, gives the acceleration of the geodesic (Transtrum and Sethna 2012, arXiv:1201.5885).
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from udkjax.synthesis.design_problem import MARGIN_WEIGHT, DesignProblem
+from udkjax.synthesis.steps import StepEquations, in_order
+from udkjax.synthesis.trials import TrialResiduals, Trials
+
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
+RELAX, TIGHTEN = 0.2, 4.0  # of the damping, after a step that is taken and one that is not
+# Weights w of limits beside residuals. A search begins with soft walls, along which it finds its way, and hardens them each time
+# it has settled: the violation falls by the square of the weight.
+FIRST_WEIGHT, HARDEN, MOST_WEIGHT = 0.5, 6.0, 100.0
+HIGH = 20.0  # of weights, for each scale of the root of the loss: walls that are low beside the loss hold nothing back
+# Squares of transmissions: where limits begin, and by what they shrink to what is asked for, whenever a trial has settled.
+FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
+KEPT_TO = 1e-8  # scales: final excess over a limit, before the last polish
+SETTLED = 1e-9  # relative fall of the loss below which a trial has settled
+PRESSED = 1e-5  # barrier of a design beyond a limit, or pressing on it, which is to harden
+ROUNDING = 1e-26  # of the squared scale: a loss below is zero to rounding
+AHEAD = 0.1  # of a step: where residuals are evaluated for their second derivative along it
+MOST_BEND = 0.75  # of a step: twice the acceleration, at most
+
+
+@dataclass
+class SearchState:
+    """Trials on their way: with all that is known where they are."""
+
+    trials: Trials
+    found: TrialResiduals
+    multipliers: np.ndarray
+    weight: np.ndarray
+    margin: np.ndarray
+    least: np.ndarray
+    damping: np.ndarray
+    merit: np.ndarray
+    settled: np.ndarray
+    kept: Trials
+    kept_loss: np.ndarray
+
+    def take(self, which: np.ndarray) -> "SearchState":
+        """Return some of them."""
+        every = ((field.name, getattr(self, field.name)) for field in fields(self))
+        taken: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in every}
+        return SearchState(**taken)
+
+    def accept(self, problem: DesignProblem, which: np.ndarray, trials: Trials, found: TrialResiduals, merit: np.ndarray):
+        """Take new places of some trials, and remember the best one of each that is within all limits."""
+        for a, b in zip((*self.trials, *self.found), (*trials[:2], found.q, *found), strict=True):
+            a[which] = b
+        self.merit[which] = merit
+        self.keep(problem, which)
+
+    def keep(self, problem: DesignProblem, which: np.ndarray):
+        """Remember trials that are within all limits, where they are better than what is remembered."""
+        found = self.found.take(which)
+        loss = np.where(found.is_there & (self.excess(problem, which) <= 0), loss_of(found), np.inf)
+        better = loss < self.kept_loss[which]
+        for a, b in zip(self.kept, self.trials, strict=True):
+            a[which[better]] = b[which[better]]
+        self.kept_loss[which[better]] = loss[better]
+
+    def excess(self, problem: DesignProblem, which: np.ndarray) -> np.ndarray:
+        """Return by how much some trials exceed the limits that are asked for in the end, at most (m)."""
+        limits, more = self.found.limits[which], self.margin[which] - self.least[which] ** 2
+        limits[:, problem.lengths.count :] -= MARGIN_WEIGHT * problem.scale * more[:, None]
+        return np.max(limits, axis=1, initial=-np.inf)
+
+
+def loss_of(found: TrialResiduals) -> np.ndarray:
+    """Return the sum of the squares of all residuals (M,)."""
+    return np.einsum("mjg,mjg->m", found.r, found.r) + np.einsum("mt,mt->m", found.terms, found.terms)
+
+
+def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
+    """Improve trials by so many steps at most; return where they got, those that have no positions with an infinite merit."""
+    sign = np.sign(state.found.transmission[:, 0])
+    for _ in range(steps):
+        active = np.flatnonzero(~state.settled)
+        if not len(active):
+            break
+        _step(problem, state, active, sign, threads)
+    return state
+
+
+def begin(problem: DesignProblem, trials: Trials, threads: int | None, least: float = 0.0) -> SearchState:
+    """Return the state in which the search from some trials begins, for a transmission that is not below `least`."""
+    members = len(trials.x)
+    leasts = np.full(members, max(problem.least, least))
+    margin = np.maximum(leasts**2, FIRST_MARGIN)
+    found = problem.evaluate(trials, margin, threads)
+    multipliers = np.zeros_like(found.limits)
+    weight, damping, merit = np.full(members, FIRST_WEIGHT), np.full(members, FIRST_DAMPING), np.full(members, np.inf)
+    kept = Trials(*(a.copy() for a in trials))
+    rest = (multipliers, weight, margin, leasts, damping, merit, ~found.is_there, kept, np.full(members, np.inf))
+    state = SearchState(trials, found, *rest)
+    state.keep(problem, np.arange(members))
+    state.merit[found.is_there] = merit_of(found, multipliers, weight)[found.is_there]
+    return state
+
+
+def merit_of(found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the loss with what limits add to it (M,)."""
+    return loss_of(found) + _pressure(found.limits, multipliers, weight)
+
+
+def _pressure(limits: np.ndarray, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    excess = weight[:, None] * np.maximum(limits + multipliers, 0.0)
+    return np.einsum("mk,mk->m", excess, excess)
+
+
+def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: np.ndarray, threads: int | None):
+    trials, found = state.trials.take(active), state.found.take(active)
+    equations = StepEquations(problem, trials, found, state.multipliers[active], state.weight[active], state.damping[active])
+    new = _stepped(problem, trials, *_bent_step(problem, equations, threads))
+    before, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
+
+    def worth(r: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < before
+
+    trial = problem.evaluate(new, state.margin[active], threads, worth)
+    exists = trial.is_there & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
+    merits = np.where(exists, merit_of(trial, u, weight), np.inf)
+    better, fall = merits < before, before - merits
+    taken, kept = active[better], active[~better]
+    state.accept(problem, taken, new.take(better), trial.take(better), merits[better])
+    slow = fall[better] < PRESSED * before[better]
+    settled = fall[better] < SETTLED * before[better]
+    settled[slow] |= goes_on(problem, state, taken[slow])
+    state.damping[taken] = np.maximum(RELAX * state.damping[taken], LEAST_DAMPING)
+    state.damping[kept] *= TIGHTEN
+    done = np.concatenate(
+        [taken[settled | (merits[better] < ROUNDING * problem.scale**2)], kept[state.damping[kept] > MOST_DAMPING]]
+    )
+    _settle(problem, state, done)
+
+
+def _stepped(problem: DesignProblem, trials: Trials, dx: np.ndarray, ds: np.ndarray) -> Trials:
+    return Trials(np.clip(trials.x + dx, problem.low, problem.high), trials.s + in_order(problem, ds, trials.s), trials.q)
+
+
+def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps with half of their acceleration, where that is short beside them."""
+    dx, ds = equations.find()
+    ds = in_order(problem, ds, equations.trials.s)
+    trials, found = equations.trials, equations.found
+    r, limits, there = problem.residuals_at(Trials(trials.x + AHEAD * dx, trials.s + AHEAD * ds, trials.q), threads)
+    along = np.einsum("mjgp,mp->mjg", found.by_unknowns, dx) + found.by_value * ds[..., None]
+    bend_of_r = ((r - found.r) / AHEAD - along) / AHEAD
+    bend_of_limits, count = np.zeros_like(found.limits), limits.shape[1]
+    slopes = found.limits_by_unknowns[:, :count]
+    bend_of_limits[:, :count] = ((limits - found.limits[:, :count]) / AHEAD - (slopes @ dx[..., None])[..., 0]) / AHEAD
+    bend_of_r[~there] = 0.0
+    ddx, dds = equations.correct(bend_of_r, bend_of_limits)
+    ratio = 2.0 * equations.length(ddx) / np.maximum(equations.length(dx), 1e-300)
+    share = np.where(there & (ratio <= MOST_BEND), 1.0, 0.0)[:, None]
+    return dx + share * ddx, ds + share * dds
+
+
+def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
+    """Trials that go no farther have settled, unless a limit is still exceeded or pressed on in vain: multipliers change then."""
+    restarted = done[goes_on(problem, state, done)]
+    state.settled[done] = True
+    harden(problem, state, restarted)
+    state.damping[restarted] = np.minimum(state.damping[restarted], FIRST_DAMPING)
+
+
+def goes_on(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
+    """Return of trials that go no farther whether they should, once limits have changed."""
+    limits, u = state.found.limits[which], state.multipliers[which]
+    wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > KEPT_TO * problem.scale
+    rows = slice(problem.lengths.count, None)  # of transmission
+    return wrong | (state.margin[which] > state.least[which] ** 2) & np.any(limits[:, rows] + u[:, rows] > 0, axis=1)
+
+
+def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
+    """Update the multipliers of some trials, harden their limits, and bring their margins nearer to what is asked for."""
+    most = MOST_WEIGHT * _height(problem, state, which)
+    limits, u, weight = state.found.limits[which], state.multipliers[which], state.weight[which]
+    state.multipliers[which], state.settled[which] = np.maximum(0.0, limits + u), False
+    margin = np.maximum(SHRINK_MARGIN * state.margin[which], state.least[which] ** 2)
+    unit = MARGIN_WEIGHT * problem.scale
+    state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
+    state.margin[which] = margin
+    _reweigh(problem, state, which, np.maximum(weight, np.minimum(HARDEN * weight, most)))
+
+
+def raise_walls(problem: DesignProblem, state: SearchState):
+    """Raise limits to the height of what is left of the losses."""
+    every = np.arange(len(state.merit))
+    _reweigh(problem, state, every, np.maximum(state.weight, FIRST_WEIGHT * _height(problem, state, every)))
+
+
+def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
+    """Return the unit of the weights of some trials."""
+    return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(state.found.take(which))))
+
+
+def _reweigh(problem: DesignProblem, state: SearchState, which: np.ndarray, weight: np.ndarray):
+    """Change weights of some trials, by which limits press on as hard as before."""
+    state.multipliers[which] *= (state.weight[which] / weight)[:, None] ** 2
+    state.weight[which] = weight
+    merit = merit_of(state.found.take(which), state.multipliers[which], weight)
+    state.merit[which] = np.where(np.isfinite(state.merit[which]), merit, np.inf)

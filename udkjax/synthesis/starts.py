@@ -1,0 +1,161 @@
+"""Starts of searches: random mechanisms, turned once, moved and scaled to their targets, with values assigned in order.
+
+Of each the curve of a whole turn is known, and so is what it would be if the mechanism were moved, turned and scaled: a place p
+becomes a p + b, in complex numbers. The best a and b for an assignment of values to targets are a linear least-squares problem;
+the best assignment in order, for given a and b, one of dynamic programming.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.synthesis.design_problem import TURN_VALUES, DesignProblem
+from udkjax.synthesis.trials import Trials, Turn
+
+PHASES = 12  # first values that are tried, around a turn
+SPANS = (1.0, 0.6, 0.3)  # of a turn, from the first value to the last, that are tried for open curves
+LEAST_SCALE = 0.03  # of the curve beside its targets: a curve that fits best as a point does not fit at all
+ROUNDS = 2  # of moving to the targets and assigning anew
+CLEAR = 0.02  # transmission over the whole turn, at least: those that come closer to where branches meet end there soon
+
+
+class _Fitted(NamedTuple):
+    """Assignments: places among the values of a turn (M, J) that may go beyond it, and what remains (M,)."""
+
+    places: np.ndarray
+    cost: np.ndarray
+
+
+def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random.Generator, threads: int | None = None) -> Trials:
+    """Return the `count` best of some random mechanisms, as trials; fewer where fewer have all positions."""
+    x = np.zeros((samples, problem.unknowns))
+    x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
+    turn = problem.turn(x, TURN_VALUES, threads)
+    reached = turn.reached.all(1) & (np.abs(turn.transmission).min(1) > CLEAR)
+    if problem.rotation or problem.local:
+        x, turn = x[reached], Turn(*(a[reached] for a in turn))
+    if not len(x):
+        return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
+    trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
+    s, moved = trials
+    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # lengths that scaling has made too long
+    q, there = problem.march(moved, s, threads)
+    best = np.argsort(np.where(there & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
+    best = best[there[best]]
+    return Trials(moved[best], s[best], q[best])
+
+
+# --- values that are unknown
+
+
+def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    target = problem.data[:, 0] + 1j * problem.data[:, 1]
+    curve = turn.measures[:, :-1, 0] + 1j * turn.measures[:, :-1, 1]
+    moves = problem.can_move
+    fitted = _best_phase(curve, target, moves, problem.is_closed)
+    for _ in range(ROUNDS):
+        a, b, _ = _move(np.take_along_axis(curve, fitted.places % TURN_VALUES, 1), target, moves)
+        fitted = _in_order(a[:, None] * curve + b[:, None], target, fitted.places)
+    a, b, cost = _move(np.take_along_axis(curve, fitted.places % TURN_VALUES, 1), target, moves)
+    s = turn.s[:, :1] + fitted.places * (problem.period / TURN_VALUES)
+    return (s + problem.turned_by(a)[:, None], problem.moved(x, a, b)), cost
+
+
+def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool) -> _Fitted:
+    """Assign values evenly over spans of a turn, either way round, from the phase that fits best."""
+    J, K = len(target), curve.shape[1]
+    spans = (1.0,) if closed else SPANS
+    best = _Fitted(np.zeros((len(curve), J), int), np.full(len(curve), np.inf))
+    for span in spans:
+        for way in (1, -1):
+            even = way * np.round(span * K * np.arange(J) / max(J - 1, 1)).astype(int)
+            for phase in range(0, K, K // PHASES):
+                places = np.broadcast_to(phase + even, (len(curve), J))
+                cost = _move(curve[:, (phase + even) % K], target, moves)[2]
+                better = cost < best.cost
+                best = _Fitted(np.where(better[:, None], places, best.places), np.where(better, cost, best.cost))
+    return best
+
+
+def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a, b (M,) of the best a z + b, and the sum of squares that remains; `moves` says what may be done."""
+    ones = np.ones(len(z), complex)
+    if moves == "nothing":
+        return ones, 0 * ones, np.sum(np.abs(z - target) ** 2, 1)
+    middle, centre = z.mean(1), target.mean()
+    dz, dt = z - middle[:, None], target - centre
+    size = np.maximum(np.sum(np.abs(dz) ** 2, 1), 1e-300)
+    a = np.sum(np.conj(dz) * dt, 1) / size
+    a = np.where(np.abs(a) ** 2 * size > LEAST_SCALE**2 * np.sum(np.abs(dt) ** 2), a, 1.0)  # not shrunk to a point
+    if moves == "no turn":
+        a = np.maximum(np.real(a), 1e-3) + 0j
+    return a, centre - a * middle, np.sum(np.abs(a[:, None] * dz - dt) ** 2, 1)
+
+
+def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fitted:
+    """Return the best assignment whose values come in order, the way round that they did, from the same first value on."""
+    M, K = curve.shape
+    J, rows = len(target), np.arange(M)
+    way = np.where(before[:, -1] >= before[:, 0], 1, -1)
+    along = (before[:, :1] + way[:, None] * np.arange(-(K // 8), K + K // 8 + 1)) % K
+    cost = np.abs(np.take_along_axis(curve, along, 1)[..., None] - target) ** 2  # (M, L, J)
+    L = cost.shape[1]
+    total, back = cost[..., 0].copy(), np.zeros((M, J, L), int)
+    total[:, K // 4 + 1 :] = np.inf  # the first one stays about where it was
+    for j in range(1, J):
+        least = np.minimum.accumulate(total, 1)
+        where = np.maximum.accumulate(np.where(total == least, np.arange(L), 0), 1)
+        total = np.full((M, L), np.inf)
+        total[:, 1:] = least[:, :-1] + cost[:, 1:, j]
+        back[:, j, 1:] = where[:, :-1]
+    places = np.zeros((M, J), int)
+    places[:, -1] = total.argmin(1)
+    for j in range(J - 1, 0, -1):
+        places[:, j - 1] = back[rows, j, places[:, j]]
+    return _Fitted(before[:, :1] + way[:, None] * (places - K // 8), total.min(1))
+
+
+# --- values that are given
+
+
+def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    goal, moves = problem.goal, problem.can_move
+    values = np.asarray(goal.values)
+    x, start = x.copy(), turn.s[:, 0]
+    whole = problem.period / TURN_VALUES
+    phases = range(0, TURN_VALUES, max(TURN_VALUES // 36, 1)) if problem.shifted else [None]
+    best, chosen = np.full(len(x), np.inf), [np.ones(len(x), complex), np.zeros(len(x), complex), np.zeros(len(x))]
+    for phase in phases:
+        first = start if phase is not None else start * 0.0
+        shift = first + (0.0 if phase is None else phase * whole)
+        place = (shift[:, None] + values - start[:, None]) / whole % TURN_VALUES
+        measured = _interpolate(turn.measures, place)
+        a, b = np.ones(len(x), complex), np.zeros(len(x), complex)
+        if goal.has_place:
+            target = problem.data[:, 0] + 1j * problem.data[:, 1]
+            a, b, cost = _move(measured[..., 0] + 1j * measured[..., 1], target, moves)
+        else:
+            difference = measured[..., 0] - problem.data[:, 0]
+            level = difference.mean(1, keepdims=True) if goal.extras else 0.0
+            cost = np.sum((difference - level) ** 2, 1)
+        better = cost < best
+        best = np.where(better, cost, best)
+        chosen = [np.where(better, new, old) for new, old in zip((a, b, shift), chosen, strict=True)]
+    a, b, shift = chosen
+    moved = problem.moved(x, a, b)
+    if problem.shifted:
+        moved[:, problem.free.count] = shift + problem.turned_by(a)
+    # The drawn position is at most half a period away from the first value.
+    s = np.broadcast_to(values, (len(x), len(values))).copy()
+    if not problem.shifted:
+        drawn = problem.value_drawn(moved)
+        if problem.driven.is_angle:
+            s += problem.period * np.round((drawn - s[:, 0]) / problem.period)[:, None]
+    return (s, moved), best
+
+
+def _interpolate(table: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return rows (M, J, G) of a table (M, K + 1, G) at places (M, J) between them."""
+    low = np.clip(np.floor(place).astype(int), 0, table.shape[1] - 2)
+    one, two = (np.take_along_axis(table, k[..., None], 1) for k in (low, low + 1))
+    return one + (place - low)[..., None] * (two - one)

@@ -1,0 +1,125 @@
+"""Steps of Levenberg and Marquardt's method for many trials at once, with values of the driver as unknowns of their own.
+
+With residuals r(x, s), a position's value s_j moves its own residuals alone. So it is eliminated: with a_j = dr_j/ds_j,
+
+    (A - W^T H^-1 W) dx = -(b - W^T H^-1 g),    ds_j = -(g_j + w_j dx) / h_j,
+    A = sum_j J_j^T J_j,  w_j = a_j^T J_j,  g_j = a_j^T r_j,  h_j = a_j^T a_j,
+
+each diagonal increased by a damping. Limits add rows w max(0, c + u). Bounds are kept by active sets: unknowns that would leave
+them stay.
+"""
+
+import numpy as np
+
+from udkjax.synthesis.design_problem import DesignProblem
+from udkjax.synthesis.trials import TrialResiduals, Trials
+
+LONGEST_MOVE = 0.5  # scales: of an unknown in one step
+ACTIVE_SETS = 5  # rounds in which a step finds out which limits it will press on
+GAP_SHARE = 0.45  # of the gap to the next value that a value may move by in one step: so that their order stays
+REGULAR = float(np.finfo(float).eps)  # of the largest diagonal entry: keeps matrices regular where nothing else does
+
+
+class StepEquations:
+    """The linear least-squares problem of the steps of some trials; `find` solves it, `correct` again for other residuals."""
+
+    def __init__(
+        self,
+        problem: DesignProblem,
+        trials: Trials,
+        found: TrialResiduals,
+        multipliers: np.ndarray,
+        weight: np.ndarray,
+        damping: np.ndarray,
+    ):
+        self.problem, self.trials, self.found = problem, trials, found
+        self.excess, self.weight, self.damping = found.limits + multipliers, weight, damping
+        members, P = trials.x.shape
+        J = found.by_unknowns.reshape(members, -1, P)
+        self.A = J.transpose(0, 2, 1) @ J
+        if found.terms.size:
+            self.A += found.terms_by_unknowns.transpose(0, 2, 1) @ found.terms_by_unknowns
+        self.diagonal = np.einsum("mpp->mp", self.A).copy()
+        if problem.local:
+            self.w = np.einsum("mjg,mjgp->mjp", found.by_value, found.by_unknowns)
+            h = np.einsum("mjg,mjg->mj", found.by_value, found.by_value)
+            self.h = h * (1.0 + damping[:, None]) + REGULAR * problem.scale**2
+            self.A = self.A - (self.w / self.h[..., None]).transpose(0, 2, 1) @ self.w
+
+    def find(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return changes dx (M, P), ds (M, J) that are not too long, and leave values in their order."""
+        b, g = self._right_hand_side(self.found.r)
+        b = b + (self.found.terms[:, None] @ self.found.terms_by_unknowns)[:, 0]
+        members, P = b.shape
+        slopes, low, high = self.found.limits_by_unknowns, self.trials.x <= self.problem.low, self.trials.x >= self.problem.high
+        self.matrix, dx = np.empty((members, P, P)), np.empty((members, P))
+        self.pressed, self.held = self.excess > 0, np.zeros((members, P), bool)
+        self.size = self.diagonal.copy()
+        which, places = np.arange(members), np.arange(P)
+        for _ in range(ACTIVE_SETS):
+            C, excess, pressed = slopes[which], self.excess[which], self.pressed[which]
+            force = self.weight[which, None] ** 2 * pressed
+            matrix = self.A[which] + C.transpose(0, 2, 1) @ (force[..., None] * C)
+            gradient = b[which] + ((force * excess)[:, None] @ C)[:, 0]
+            size = self.diagonal[which] + (force[:, None] @ C**2)[:, 0]
+            steepest = np.max(size, axis=1, keepdims=True)
+            matrix[:, places, places] += self.damping[which, None] * size + REGULAR * (steepest + (steepest == 0))
+            held = (low[which] & (gradient > 0)) | (high[which] & (gradient < 0))
+            matrix = _held_out(matrix, held)
+            change = -np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None])[..., 0]
+            self.matrix[which], self.size[which], self.held[which], dx[which] = matrix, size, held, change
+            now = excess + (C @ change[..., None])[..., 0] > 0
+            changed = (now != pressed).any(1)
+            which = which[changed]
+            if not len(which):
+                break
+            self.pressed[which] = now[changed]
+        longest = np.max(np.abs(dx[:, : self.problem.free.count]), axis=1, initial=0.0)
+        dx *= np.minimum(1.0, LONGEST_MOVE * self.problem.reach / np.maximum(longest, 1e-300))[:, None]
+        return dx, self._values(dx, g)
+
+    def correct(self, r: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return changes dx, ds that take away residuals r (M, J, G) and what limits (M, K) there are beside them."""
+        b, g = self._right_hand_side(r)
+        force = self.weight[:, None] ** 2 * self.pressed * limits
+        gradient = b + (force[:, None] @ self.found.limits_by_unknowns)[:, 0]
+        dx = -np.linalg.solve(self.matrix, np.where(self.held, 0.0, gradient)[..., None])[..., 0]
+        return dx, self._values(dx, g)
+
+    def length(self, dx: np.ndarray) -> np.ndarray:
+        """Return the length (M,) of changes, in the unit of residuals."""
+        return np.sqrt(np.sum(self.size * dx**2, axis=1))
+
+    def _right_hand_side(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        members, P = self.trials.x.shape
+        b = (r.reshape(members, 1, -1) @ self.found.by_unknowns.reshape(members, -1, P))[:, 0]
+        if not self.problem.local:
+            return b, np.zeros_like(self.trials.s)
+        g = np.einsum("mjg,mjg->mj", self.found.by_value, r)
+        return b - ((g / self.h)[:, None] @ self.w)[:, 0], g
+
+    def _values(self, dx: np.ndarray, g: np.ndarray) -> np.ndarray:
+        if not self.problem.local:
+            return np.zeros_like(self.trials.s)
+        return -(g + (self.w @ dx[..., None])[..., 0]) / self.h
+
+
+def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return matrices by which unknowns that are held stay."""
+    if not held.any():
+        return matrix
+    matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, matrix)
+    np.einsum("mpp->mp", matrix)[...] += held
+    return matrix
+
+
+def in_order(problem: DesignProblem, ds: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Shorten changes of values so that their order stays, around the whole period; of a closed curve its ends may meet."""
+    if not problem.local:
+        return ds
+    gap = np.abs(np.diff(s, axis=1))
+    period = np.inf if problem.is_closed else problem.period
+    last = np.maximum(period - np.abs(s[:, -1:] - s[:, :1]), 0.0)
+    gap = np.concatenate([gap, last], 1)
+    most = GAP_SHARE * np.minimum(gap, np.roll(gap, 1, axis=1))
+    return np.clip(ds, -most, most)

@@ -1,0 +1,72 @@
+"""Trees of numbers some of which are traced: those alone are the arguments of a function with derivatives."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, PyTree
+
+from udkjax.programs.varying_axes import vary_together
+from udkjax.scene.fields import number
+from udkjax.transforms.gradients import TreeDef
+
+Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
+
+
+class KnownNumbers:
+    """The known arrays among those of a tree, None in place of the others; compared by value, so that they are static."""
+
+    def __init__(self, arrays: Sequence[Array | None]):
+        self.arrays = arrays
+        self._key = tuple(None if x is None else (x.shape, np.asarray(x).tobytes()) for x in arrays)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, KnownNumbers) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+class TreeOfNumbers(eqx.Module):
+    """A tree as a function of the arrays of floats in it that are traced. The others stay known: JAX would trace them all."""
+
+    rest: PyTree  # the tree without arrays of floats
+    known: KnownNumbers = eqx.field(static=True)
+    structure: TreeDef = eqx.field(static=True)
+
+    def __call__(self, xs: Sequence[Array]) -> Any:
+        traced = iter(xs)
+        arrays = [next(traced) if x is None else x for x in self.known.arrays]
+        return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
+
+    def marks(self, active: Mask) -> Any:
+        """Return the tree with True in place of the arrays that are active, and False in place of the others."""
+        traced = iter(active)
+        return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.known.arrays])
+
+    def changes(self, active: Mask, some: Sequence[Array]) -> Any:
+        """Return the tree with some arrays in place of those that are active, and None in place of the others."""
+        marks, rest = jax.tree.leaves(self.marks(active)), iter(some)
+        return jax.tree.unflatten(self.structure, [next(rest) if m else None for m in marks])
+
+
+def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
+    """Return a tree as a function of the arrays of floats in it that are traced, and these arrays."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    known = KnownNumbers([None if isinstance(x, Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves])
+    return TreeOfNumbers(rest, known, structure), vary_together([x for x in leaves if isinstance(x, Tracer)])
+
+
+def select(xs: Sequence[Any], which: Mask) -> list[Any]:
+    """Select the marked entries."""
+    return [x for x, m in zip(xs, which, strict=True) if m]
+
+
+def replaced(xs: Sequence[Array], active: Mask, some: Sequence[Array]) -> list[Array]:
+    """Return the same, with others in place of those that are active."""
+    rest = iter(some)
+    return [next(rest) if m else x for x, m in zip(xs, active, strict=True)]
