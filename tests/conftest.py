@@ -19,7 +19,8 @@ CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 import udkjax as udk
 from tests.quick_code import optimize
-from udkjax.native import code_cache, primitive
+from udkjax.native import primitive
+from udkjax.native.base import code_cache
 
 optimize(False)  # but in tests/native
 if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other

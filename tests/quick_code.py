@@ -1,6 +1,7 @@
 """Machine code that LLVM does not optimize, in a quarter of the time: it rounds alike, and few tests are about its speed."""
 
-from udkjax.native import machine, primitive
+from udkjax.native import primitive
+from udkjax.native.base import machine
 
 _PASSES, _TARGET_MACHINE = machine.PASSES, machine._target_machine
 

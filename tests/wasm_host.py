@@ -75,7 +75,7 @@ def record_of(
     following: int,
 ) -> list[int]:
     """Return the words of the record that `run` is called with."""
-    from udkjax.native.layout import INPUTS
+    from udkjax.native.base.layout import INPUTS
 
     names, outputs = (*INPUTS, *module.inputs), (*module.results, *module.outputs)
     fields: dict[str, int] = {"members": shapes[0][0], "next": following}
@@ -89,7 +89,7 @@ def record_of(
 
 def run_without_contraction(module: Any, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
     """The same on this processor, compiled without its fused multiply-add."""
-    from udkjax.native import machine
+    from udkjax.native.base import machine
 
     llvm = machine._llvm()
     target = llvm.Target.from_default_triple().create_target_machine(

@@ -17,7 +17,8 @@ from udkjax.integrate.compiled_mechanism import compile_known
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.prepare import AUTO
 from udkjax.integrate.projection import Projection
-from udkjax.native import primitive, row_marks
+from udkjax.native import primitive
+from udkjax.native.run import row_marks
 
 TIMES = np.linspace(0.0, 2.0, 9)
 REDUNDANT = ("parallelogram", "planetary_gear", "scissor_lift", "peaucellier", "slider_crank", "n_four_bar")

@@ -10,9 +10,9 @@ import pytest
 
 from tests.quick_code import optimize
 from udkjax.expressions import Graph, ScalarProgram, trace
-from udkjax.native import machine
-from udkjax.native.ir import POINTER, Function
-from udkjax.native.program import write
+from udkjax.native.base import machine
+from udkjax.native.base.ir import POINTER, Function
+from udkjax.native.base.program import write
 
 WIDTHS = sorted({1, 2, machine.lanes()})
 

@@ -12,7 +12,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.native import code_cache, machine, record
+from udkjax.native.base import code_cache, machine
+from udkjax.native.derivatives import record
 
 TS = np.array([0.0, 0.2, 0.4, 0.6])
 PENDULUM = udk.library.compound_pendulum()

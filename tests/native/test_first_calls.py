@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
-from udkjax.native import machine, primitive
+from udkjax.native import primitive
+from udkjax.native.base import machine
 
 TS = np.linspace(0.0, 1.0, 11)
 

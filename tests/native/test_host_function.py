@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.native.host_function import call_host
+from udkjax.native.base.host_function import call_host
 
 
 @dataclass(frozen=True)

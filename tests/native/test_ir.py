@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from udkjax.native.ir import BOOL, DOUBLE, INT, POINTER, Function, literal
+from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, literal
 
 NUMBERS = np.array([-2.5, -1.0, -0.0, 0.0, 0.25, 1.0, 3.75, 1e300, -np.inf, np.inf, np.nan, 5e-324])
 

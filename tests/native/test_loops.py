@@ -23,8 +23,8 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.written_out import WrittenOut
 from udkjax.expressions.loop_derivative import LoopDerivative
 from udkjax.expressions.loop_program import KernelLoop, Reset
-from udkjax.native import machine
-from udkjax.native.loops import LoopWriter
+from udkjax.native.base import machine
+from udkjax.native.base.loops import LoopWriter
 from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
 

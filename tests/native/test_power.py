@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.native.ir import POINTER, Function
-from udkjax.native.power import power
+from udkjax.native.base.ir import POINTER, Function
+from udkjax.native.base.power import power
 
 X = np.concatenate([10.0 ** np.linspace(-30, 30, 241), 1 + np.linspace(-1e-3, 1e-3, 41), 2.0 ** np.arange(-4.0, 5.0)])
 

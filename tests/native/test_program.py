@@ -8,7 +8,7 @@ from jax import lax
 from numpy.testing import assert_allclose, assert_array_equal
 
 from udkjax.expressions import Graph, ScalarProgram, cotangents, tangents, trace
-from udkjax.native.program import UnsupportedError, write
+from udkjax.native.base.program import UnsupportedError, write
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, 1e-9, -1e-9, 1e-300, 700.0, -700.0, 1e200, np.inf, -np.inf, np.nan])
 RNG = np.random.default_rng(0)

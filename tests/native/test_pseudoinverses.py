@@ -13,10 +13,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.pinv.matrices import read_exact
 from udkjax import pinv
-from udkjax.native import machine
-from udkjax.native.ir import POINTER, Function
-from udkjax.native.layout import Layout
-from udkjax.native.memory import Memory
+from udkjax.native.base import machine
+from udkjax.native.base.ir import POINTER, Function
+from udkjax.native.base.layout import Layout
+from udkjax.native.base.memory import Memory
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 

@@ -54,7 +54,7 @@ def store_compiled_programs() -> None:
 
     A folder that the environment names for JAX's programs stays, and JAX is left alone where it is imported already.
     """
-    from udkjax.native.code_cache import cache_folder
+    from udkjax.native.base.code_cache import cache_folder
 
     folder = cache_folder()
     if folder is None or "jax" in sys.modules:

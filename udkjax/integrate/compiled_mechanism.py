@@ -21,11 +21,11 @@ from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
-from udkjax.native.formulations import FormulationCode, formulation_code
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
 from udkjax.native.primitive import unsupported
 from udkjax.native.pseudoinverses import dense_method
+from udkjax.native.run.formulations import FormulationCode, formulation_code
 from udkjax.native.runs import RunStates, Tableau
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy

@@ -17,7 +17,7 @@ from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
 from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, evaluations
-from udkjax.native.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.base.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.transforms.gradients import stop_gradients
 
 

@@ -16,14 +16,14 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.native.formulations import formulation_tol
-from udkjax.native.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
+from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
+from udkjax.native.base.steps import DONE, FALLBACK_RANK_SHARE
+from udkjax.native.derivatives.record import PER_BREAKPOINT, STORED
 from udkjax.native.operations import MarkRows
 from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
 from udkjax.native.primitive import call_known, native_p
-from udkjax.native.record import PER_BREAKPOINT, STORED
+from udkjax.native.run.formulations import formulation_tol
 from udkjax.native.runs import RunStates
-from udkjax.native.steps import DONE, FALLBACK_RANK_SHARE
 from udkjax.pinv import Auto, OneOf
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.identity_cache import cached_by_identity

@@ -24,7 +24,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_known, evaluation_of
 from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem
-from udkjax.native.layout import INPUTS
+from udkjax.native.base.layout import INPUTS
 from udkjax.native.operations import Accelerate, FindTangentPart, ProjectStates, StateOperation
 from udkjax.native.primitive import machine_code, native_p
 from udkjax.pinv import SVD, OneOf, Pseudoinverse

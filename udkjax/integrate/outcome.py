@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.steps import DONE, LEAST_ATOL, LOOK_AHEAD, LOST, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.base.steps import DONE, LEAST_ATOL, LOOK_AHEAD, LOST, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
 
 
 class FinishedRun(NamedTuple):

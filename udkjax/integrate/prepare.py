@@ -17,7 +17,7 @@ from udkjax.integrate.outcome import increases, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit
-from udkjax.native.steps import LEAST_ATOL, SMALLEST_STEP
+from udkjax.native.base.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.scene.checks import traced_numbers_hold

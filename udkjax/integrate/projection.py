@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
-from udkjax.native.steps import NORMAL_ERROR_WEIGHT
+from udkjax.native.base.steps import NORMAL_ERROR_WEIGHT
 from udkjax.printing import PrintsLine
 from udkjax.transforms.gradients import stop_gradients
 

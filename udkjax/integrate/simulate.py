@@ -26,7 +26,7 @@ from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices,
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
-from udkjax.native.steps import LEAST_ATOL
+from udkjax.native.base.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembly import AssemblyWarning, Closure, State, require_closed
 from udkjax.programs.deferred import deferred

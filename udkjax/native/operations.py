@@ -18,16 +18,16 @@ from jaxtyping import ArrayLike
 
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.native.conditions import Conditions
-from udkjax.native.event_states import EventStates
-from udkjax.native.formulations import FormulationCode
-from udkjax.native.layout import FORMULATION_SETTINGS, OUTPUTS, SETTINGS, SHARE
-from udkjax.native.memory import Memory
-from udkjax.native.module import Module
+from udkjax.native.base.layout import FORMULATION_SETTINGS, OUTPUTS, SETTINGS, SHARE
+from udkjax.native.base.memory import Memory
+from udkjax.native.base.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.row_marks import RowMarks
-from udkjax.native.scale_code import ScaleCode
-from udkjax.native.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
+from udkjax.native.run.formulations import FormulationCode
+from udkjax.native.run.row_marks import RowMarks
+from udkjax.native.run.scale_code import ScaleCode
+from udkjax.native.run.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
+from udkjax.native.watching.conditions import Conditions
+from udkjax.native.watching.event_states import EventStates
 
 Shape = tuple[int, ...]
 

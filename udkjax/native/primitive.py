@@ -20,14 +20,14 @@ from jaxtyping import Array
 
 from udkjax.equations.scales import evaluate_scales, scales_by_jax, scales_p
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native import machine
-from udkjax.native.ffi import handler
-from udkjax.native.layout import INFO, INPUTS, OUTPUTS
-from udkjax.native.loops import LoopWriter
-from udkjax.native.memory import Memory
+from udkjax.native.base import machine
+from udkjax.native.base.ffi import handler
+from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
+from udkjax.native.base.loops import LoopWriter
+from udkjax.native.base.memory import Memory
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.base.steps import STEP_LIMIT
 from udkjax.native.operations import FindScales, Operation
-from udkjax.native.program import UnsupportedError
-from udkjax.native.steps import STEP_LIMIT
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 

@@ -6,18 +6,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from udkjax.native.backpropagation import Reverse
-from udkjax.native.conditions import Conditions
-from udkjax.native.formulations import FormulationCode
-from udkjax.native.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
-from udkjax.native.module import Module
+from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
+from udkjax.native.base.module import Module
+from udkjax.native.base.tableau import Method
+from udkjax.native.derivatives.backpropagation import Reverse
+from udkjax.native.derivatives.record import STORED, record_length
+from udkjax.native.derivatives.tangents import Forward, ForwardTwice
 from udkjax.native.operations import Operation, Shape
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.record import STORED, record_length
-from udkjax.native.tableau import Method
-from udkjax.native.tangents import Forward, ForwardTwice
-from udkjax.native.trajectory import Trajectory
-from udkjax.native.watching import Watching
+from udkjax.native.run.formulations import FormulationCode
+from udkjax.native.run.trajectory import Trajectory
+from udkjax.native.watching.conditions import Conditions
+from udkjax.native.watching.watching import Watching
 
 
 class Tableau:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.native.host_function import call_host
+from udkjax.native.base.host_function import call_host
 from udkjax.programs.deferred import deferred_p, trace_once
 from udkjax.programs.numpy_program import Meter, has_rules, numpy_program
 

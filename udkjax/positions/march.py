@@ -1,4 +1,4 @@
-"""Positions of a driven mechanism by machine code (native/marching.py), and how many of them are right."""
+"""Positions of a driven mechanism by machine code (native/closing/marching.py), and how many of them are right."""
 
 from collections.abc import Sequence
 from types import ModuleType

@@ -1,4 +1,4 @@
-"""Machine code that closes mechanisms (native/closing.py): which it serves, and how their numbers go in and come out."""
+"""Machine code that closes mechanisms (native/closing/closing.py): which it serves, and how their numbers go in and come out."""
 
 from collections.abc import Sequence
 from types import ModuleType

@@ -1,10 +1,10 @@
-"""Machine code of the positions of batches (native/positions.py) for models of mechanisms, with errors that name the scene."""
+"""Machine code of the positions of batches (native/closing/positions.py) for models of mechanisms, with errors that name the scene."""
 
 from typing import Any
 
 from udkjax.equations.position_programs import PositionPrograms, TracedModel
-from udkjax.native.positions import PositionCode
-from udkjax.native.program import UnsupportedError
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.closing.positions import PositionCode
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.batch_program import BatchProgram
+from udkjax.native.closing.batch_program import BatchProgram
 
 FIRST_STEP = 0.02  # of the way; predicted along the rate, and shortened where that is too far
 SHORTEST_STEP = 1e-10  # of the way: a path that takes shorter ones does not go on

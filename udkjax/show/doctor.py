@@ -13,7 +13,7 @@ import numpy as np
 from udkjax.extras import EXTRAS
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native import code_cache, machine
+from udkjax.native.base import code_cache, machine
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import cores, processor
 

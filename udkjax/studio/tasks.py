@@ -7,7 +7,7 @@ import numpy as np
 
 from udkjax.equations import analyse
 from udkjax.integrate.portable import portable_engine
-from udkjax.native.program import UnsupportedError
+from udkjax.native.base.program import UnsupportedError
 from udkjax.scene import Mechanism, SceneError, loads
 from udkjax.scene.drawing import Drawing
 from udkjax.studio.drawn_scenes import drawing_text_of

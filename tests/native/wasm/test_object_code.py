@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.wasm_host import Host
-from udkjax.native import machine
-from udkjax.native.ir import POINTER, Function
+from udkjax.native.base import machine
+from udkjax.native.base.ir import POINTER, Function
 from udkjax.native.wasm import compile_wasm
 from udkjax.native.wasm.object_code import MAGIC, Reader, leb128, link
 

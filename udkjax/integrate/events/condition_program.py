@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
 from udkjax.integrate.events.conditions import frames_of
 from udkjax.integrate.events.event import Event, sees_velocity
-from udkjax.native.conditions import Conditions
-from udkjax.native.program import UnsupportedError, consecutive, write
+from udkjax.native.base.program import UnsupportedError, consecutive, write
+from udkjax.native.watching.conditions import Conditions
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 

@@ -22,7 +22,7 @@ from udkjax.integrate.events.crossings import (
     cubic_slope,
     cubic_value,
 )
-from udkjax.native.conditions import FAR, MISS, RESOLVED
+from udkjax.native.watching.conditions import FAR, MISS, RESOLVED
 
 INTERVALS = 32  # of a window
 # The nodes, of a window's length: not quite uniform, so that no oscillation is zero at all of them.

@@ -27,8 +27,8 @@ from udkjax.integrate.events.phases import Phases
 from udkjax.integrate.events.plain_system import run_plain
 from udkjax.integrate.events.runs import EventRun, RunState, results, runs_before, shapes_of_run
 from udkjax.integrate.problem import Problem
-from udkjax.native.conditions import Conditions
-from udkjax.native.host_function import call_host
+from udkjax.native.base.host_function import call_host
+from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.numpy_program import Meter, numpy_program
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.transforms.gradients import TreeDef, stop_gradients
@@ -81,7 +81,7 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
 
 @dataclass(frozen=True)
 class KnownRun:
-    """Runs of the members of a batch, as a function of arrays of NumPy (native/host_function.py).
+    """Runs of the members of a batch, as a function of arrays of NumPy (native/base/host_function.py).
 
     Attributes:
         plan: common part of all runs.

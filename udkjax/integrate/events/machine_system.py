@@ -18,8 +18,8 @@ from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.runs import Change, MemberRuns, Members, RunState, take
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.solution import Result
-from udkjax.native.layout import INFO
-from udkjax.native.steps import CROSSED, DONE, LOST, NOT_FINITE, STEP_LIMIT, UNSURE
+from udkjax.native.base.layout import INFO
+from udkjax.native.base.steps import CROSSED, DONE, LOST, NOT_FINITE, STEP_LIMIT, UNSURE
 
 STATUS, TIME, COUNTS, WRITTEN = 0, 1, slice(2, 5), 5  # of `INFO`
 

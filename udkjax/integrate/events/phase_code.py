@@ -16,11 +16,11 @@ from udkjax.integrate.events.added_joints import places_of_joints
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.native_engine import run_inputs
 from udkjax.integrate.problem import Problem
-from udkjax.native.conditions import HEAD, Conditions
-from udkjax.native.layout import INPUTS
+from udkjax.native.base.layout import INPUTS
 from udkjax.native.operations import EvaluateEvents, MarkRows, ProjectStates
 from udkjax.native.primitive import call_members
 from udkjax.native.runs import RunWatched
+from udkjax.native.watching.conditions import HEAD, Conditions
 
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # of the inputs of a run: times and the initial state
 PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # of a phase, as arrays; then its samples, if there are some

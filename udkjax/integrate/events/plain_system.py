@@ -26,8 +26,8 @@ from udkjax.integrate.events.runs import Change, EventRun, MemberRuns, Members, 
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.conditions import FINER, FINEST, PER_TIME, SHORT
-from udkjax.native.steps import DONE, LOST, NOT_FINITE, STEP_LIMIT, UNIT
+from udkjax.native.base.steps import DONE, LOST, NOT_FINITE, STEP_LIMIT, UNIT
+from udkjax.native.watching.conditions import FINER, FINEST, PER_TIME, SHORT
 
 MOST_OUTPUTS = 32  # output times of a window
 

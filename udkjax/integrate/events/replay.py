@@ -17,7 +17,7 @@ from udkjax.integrate.events.loop import condition_values
 from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_member, without_member
 from udkjax.integrate.events.runs import EventRun, RunState
 from udkjax.integrate.solution import Result
-from udkjax.native.conditions import Conditions
+from udkjax.native.watching.conditions import Conditions
 from udkjax.transforms.gradients import TreeDef, stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
 

@@ -26,7 +26,7 @@ from udkjax.integrate.events.runs import EventRun
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
-from udkjax.native.conditions import Conditions
+from udkjax.native.watching.conditions import Conditions
 from udkjax.positions.assembly import Closure, State
 from udkjax.programs.deferred import deferred
 from udkjax.scene.checks import quote

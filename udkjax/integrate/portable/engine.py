@@ -21,11 +21,11 @@ from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
-from udkjax.native.evaluation import Evaluation
-from udkjax.native.layout import INFO, INPUTS
+from udkjax.native.base.layout import INFO, INPUTS
+from udkjax.native.base.steps import SMALLEST_STEP
 from udkjax.native.operations import MarkRows, Operation
 from udkjax.native.position_operations import Close
-from udkjax.native.steps import SMALLEST_STEP
+from udkjax.native.run.evaluation import Evaluation
 from udkjax.native.wasm import compile_wasm, wasm_module
 from udkjax.native.wasm.object_code import LinkedModule
 from udkjax.positions.assembly import State

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
-from udkjax.native.ir import Function
+from udkjax.native.base.ir import Function
+from udkjax.native.base.program import consecutive, write
 from udkjax.native.packing import SampleRows
-from udkjax.native.program import consecutive, write
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_in, split_index
 

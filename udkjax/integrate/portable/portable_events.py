@@ -14,10 +14,10 @@ from udkjax.integrate.events.condition_program import condition_numbers, watched
 from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.events.phases import HeldContact
-from udkjax.native.conditions import HEAD
+from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents
-from udkjax.native.program import UnsupportedError
 from udkjax.native.runs import RunStates
+from udkjax.native.watching.conditions import HEAD
 from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import ArgumentError

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from udkjax.native.tableau import DOPRI8, Method, method
+from udkjax.native.base.tableau import DOPRI8, Method, method
 
 if TYPE_CHECKING:
     import diffrax

@@ -8,8 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from udkjax.native.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
-from udkjax.native.memory import Memory
+from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
+from udkjax.native.base.memory import Memory
 
 UNROLLED = 16  # registers of a row up to which operations on it are written out; of longer ones, as many a round
 SUMS = 4  # independent partial sums of a scalar product: as many as hide the latency of an addition

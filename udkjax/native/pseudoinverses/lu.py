@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from udkjax.native.ir import Value
+from udkjax.native.base.ir import Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import reversed_each
 

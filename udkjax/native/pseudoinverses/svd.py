@@ -10,7 +10,7 @@ The rows of R are nearly orthogonal from the first, so that fewer rounds do (Drm
 
 from dataclasses import dataclass
 
-from udkjax.native.ir import INT, Operand, Value
+from udkjax.native.base.ir import INT, Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q, apply_q_transposed, pivoted_qr, qr_matrices
 

@@ -8,8 +8,8 @@ free) are imports.
 from functools import cache
 from typing import Any, NamedTuple
 
-from udkjax.native import code_cache, machine
-from udkjax.native.memory import Memory
+from udkjax.native.base import code_cache, machine
+from udkjax.native.base.memory import Memory
 from udkjax.native.operations import Operation
 from udkjax.native.wasm.object_code import LinkedModule, link
 

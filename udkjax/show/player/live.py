@@ -15,7 +15,7 @@ import numpy as np
 from udkjax.equations import analyse
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine
-from udkjax.native.program import UnsupportedError
+from udkjax.native.base.program import UnsupportedError
 from udkjax.positions.assembly import close
 from udkjax.scene import Mechanism
 from udkjax.scene.requirements import ArgumentError

@@ -1,0 +1,156 @@
+"""A function of ours as an operation of a compiled JAX program: XLA's typed foreign functions, without a C++ compiler.
+
+XLA calls a handler with a frame whose layout is its stable C interface (jaxlib/include/xla/ffi/api/c_api.h). The handler is
+generated along with the code that it calls: it reads the buffers of the frame and writes the call record of `run`
+(trajectory.py).
+
+Many members are shared with the threads of XLA's pool, as its own operations are. A thread that comes too late finds the work
+closed and leaves: the handler waits for those alone that have begun, so that threads that all wait cannot be waited for.
+"""
+
+from typing import Any
+
+from udkjax.native.base.ir import INT, POINTER, Function, Value
+from udkjax.native.base.layout import INPUTS, SHARE
+from udkjax.native.base.memory import Memory
+
+# Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
+# size, extensions, count, types, buffers.
+EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
+# Functions of XLA_FFI_Api, each of a struct of its arguments: size, extensions, and then the words that are given.
+DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 64, 136, 144
+# XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
+DATA, RANK, DIMS = 24, 32, 40
+# Of an extension that asks for metadata: where they go, and in them the version (of the interface) that the handler speaks.
+METADATA, MAJOR, MINOR = 24, 24, 28
+VERSION = (0, 1)  # major, minor
+# Words of the work that threads share: how many may still look at it, how many have begun (and whether it is closed), how many
+# are done, the number of the next member, and what `run` is called with.
+USERS, BEGUN, ENDED, NEXT, CALL = range(5)
+CLOSED = 2**32
+
+
+def handler(trajectory: Memory, name: str) -> list[Function]:
+    """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions.
+
+    The last of some functions.
+    """
+    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), trajectory.call_fields
+    inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
+    frame = f.given["frame"]
+
+    def word(pointer: Value, offset: int, base: str = INT) -> Value:
+        return f.load(f.at(pointer, offset, "i8"), 0, base=base)
+
+    extension = word(frame, EXTENSIONS)
+    with f.if_(extension.is_not(0)):
+        metadata = word(word(frame, EXTENSIONS, POINTER), METADATA, POINTER)
+        for offset, number in ((MAJOR, VERSION[0]), (MINOR, VERSION[1])):
+            f.line(f"store i32 {number}, ptr {f.at(metadata, offset, 'i8').name}, align 4")
+        f.line("ret ptr null")
+        f.line(f"{f._label('after')}:")
+    call = Value(f, f.reserve(INT, len(fields)), POINTER)
+
+    def put(field: str, value: Any, base: str = INT):
+        f.store(value, call, fields.index(field), base=base)
+
+    buffers = [word(f.at(frame, start, "i8"), BUFFERS, POINTER) for start in (ARGUMENTS, RESULTS)]
+    found = {}
+    for pointers, names in zip(buffers, (inputs, outputs), strict=True):
+        for k, field in enumerate(names):
+            found[field] = f.load(pointers, k, base=POINTER)
+            put(field, word(found[field], DATA, POINTER), POINTER)
+
+    def dimension(field: str, k: int) -> Value:
+        return f.load(word(found[field], DIMS, POINTER), k, base=INT)
+
+    put("members", dimension(outputs[0], 0))
+    put("times", dimension("ts", 1))
+    put("knots", dimension("breaks", 1))
+    put("directions", dimension(inputs[-1], trajectory.directions_in))
+    for field in trajectory.lengths:
+        put(f"{field} length", dimension(field, 1))
+    for field in inputs:
+        length = f.variable(1, INT, 1)
+        with f.each(word(found[field], RANK), 1) as k:
+            length.value = length.value * f.load(word(found[field], DIMS, POINTER), k, base=INT)
+        put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
+    following = Value(f, f.reserve(INT), POINTER)
+    f.store(0, following, base=INT)
+    put("next", following, POINTER)
+    shares = f.arithmetic("div", dimension(outputs[0], 0), SHARE)
+    threads = f.variable(1, INT, 1)
+    with f.if_(shares > 1):
+        threads.value = _thread_count(f, frame)
+    helpers = f.select(threads.value < shares, threads.value, shares) - 1
+    f.choose(helpers > 0, lambda: _run_shared(f, frame, call, len(fields), helpers), lambda: f.call("run", call))
+    f.line("ret ptr null")
+    return [_help(), f]
+
+
+def _of_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
+    """Call one of XLA's functions; return its error, or null."""
+    given = Value(f, f.reserve(INT, 2 + len(arguments)), POINTER)
+    for k, x in enumerate((f.const(8 * (2 + len(arguments)), INT), f.const(0, INT), *arguments)):
+        f.store(x, given, k, base=x.base)
+    api = f.load(f.at(frame, API, "i8"), 0, base=POINTER)
+    address = f.load(f.at(api, function, "i8"), 0, base=POINTER)
+    return f.op(f"call ptr {address.name}(ptr {given.name})", POINTER)
+
+
+def _is_null(f: Function, pointer: Value) -> Value:
+    return f.op(f"ptrtoint ptr {pointer.name} to i64", INT).is_(0)
+
+
+def _thread_count(f: Function, frame: Value) -> Value:
+    """Count the threads of XLA's pool; one if there is none."""
+    count = Value(f, f.reserve(INT), POINTER)
+    f.store(1, count, base=INT)
+    error = _of_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
+    with f.if_(~_is_null(f, error)):
+        _of_api(f, frame, DESTROY_ERROR, error)
+    return f.load(count, base=INT)
+
+
+def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:
+    """Add to a word of shared work; return what it was."""
+    number = f.like(number, INT, 1)
+    return f.op(f"atomicrmw add ptr {f.at(work, word, 'i64').name}, i64 {number.name} seq_cst", INT)
+
+
+def _leave(f: Function, work: Value):
+    """Look at shared work no more: who does so last frees it."""
+    with f.if_(_add(f, work, USERS, -1).is_(1)):
+        f.line(f"call void @free(ptr {work.name})")
+
+
+def _help() -> Function:
+    """`help(work)`: take part in the work, if it is not closed yet."""
+    f = Function("help", [(POINTER, "work")], cold=True)
+    work = f.given["work"]
+    with f.if_(_add(f, work, BEGUN, 1) < CLOSED):
+        f.call("run", f.at(work, CALL, "i64"))
+        _add(f, work, ENDED, 1)
+    _leave(f, work)
+    return f
+
+
+def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Value):
+    """Run the members together with so many threads of the pool."""
+    work = f.op(f"call ptr @malloc(i64 {8 * (CALL + count)})", POINTER)
+    for word, x in ((USERS, helpers + 1), (BEGUN, f.const(0, INT)), (ENDED, f.const(0, INT)), (NEXT, f.const(0, INT))):
+        f.store(x, work, word, base=INT)
+    with f.each(count - 1) as k:  # all but the next member's address, the last
+        f.store(f.load(call, k, base=INT), work, k + CALL, base=INT)
+    f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
+    context, task = f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
+    with f.each(helpers):
+        error = _of_api(f, frame, SCHEDULE, context, task, work)
+        with f.if_(~_is_null(f, error)):
+            _of_api(f, frame, DESTROY_ERROR, error)
+            _add(f, work, USERS, -1)
+    f.call("run", f.at(work, CALL, "i64"))
+    begun = _add(f, work, BEGUN, CLOSED)
+    with f.while_(lambda: _add(f, work, ENDED, 0) < begun):
+        pass
+    _leave(f, work)

@@ -1,0 +1,139 @@
+"""Functions of Python as operations of compiled JAX programs: arrays of float64 in and out, the members of a batch in front.
+
+XLA calls a handler, as that of machine code (ffi.py); this one is ctypes', and what it calls takes arrays of NumPy. It must not
+call JAX, which may wait for the very thread that it runs on.
+"""
+
+import ctypes
+import math
+import traceback
+import uuid
+from collections.abc import Hashable, Sequence
+from functools import lru_cache
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+from jaxtyping import Array
+
+from udkjax.native.base.ffi import API, ARGUMENTS, BUFFERS, DATA, DIMS, EXTENSIONS, MAJOR, METADATA, MINOR, RANK, RESULTS, VERSION
+from udkjax.programs.numpy_program import evaluate_as
+from udkjax.programs.varying_axes import result_type
+
+CREATE_ERROR = 48  # offset in XLA_FFI_Api: a function of a text and a code
+INTERNAL = 13  # the code of errors of programs
+
+
+class HostFunction(Hashable, Protocol):
+    """A function of arrays, each (1 or members, ...); equal ones are compiled once."""
+
+    def __call__(self, *inputs: Any) -> Sequence[Any]:
+        """Return the outputs, all (members, ...)."""
+        ...
+
+    def shapes(self, members: int) -> Sequence[tuple[int, ...]]:
+        """Return the shapes of the outputs."""
+        ...
+
+
+def call_host(function: HostFunction, inputs: Sequence[Any]) -> list[Array]:
+    """Call a function on arrays that may be traced, which have their members in front."""
+    return host_p.bind(*(jnp.asarray(x, float) for x in inputs), function=function)
+
+
+def _members(inputs: Sequence[Any]) -> int:
+    return max(x.shape[0] for x in inputs)
+
+
+def _evaluate(*inputs: np.ndarray, function: HostFunction) -> list[np.ndarray]:
+    return [np.asarray(x, float) for x in function(*inputs)]
+
+
+def _abstract_eval(*inputs: Any, function: HostFunction) -> list[Any]:
+    return [result_type(shape, inputs) for shape in function.shapes(_members(inputs))]
+
+
+def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunction) -> tuple[list[Array], list[int]]:
+    """A batch is more members."""
+    size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
+    members = max(x.shape[0] if axis is None else np.delete(x.shape, axis)[0] for x, axis in zip(inputs, axes, strict=True))
+
+    def each(x: Any, axis: int | None) -> Any:
+        if axis is None and x.shape[0] <= 1:
+            return x
+        x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
+        return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])
+
+    found = host_p.bind(*(each(x, axis) for x, axis in zip(inputs, axes, strict=True)), function=function)
+    return [x.reshape(size, members, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
+    results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in function.shapes(_members(inputs))]
+    return jax.ffi.ffi_call(_register(function), results)(*inputs)
+
+
+@lru_cache(maxsize=256)
+def _register(function: HostFunction) -> str:
+    """Return the name that XLA knows a function by: of this process alone, so that no program on disk calls another one."""
+
+    @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    def handle(frame: int) -> int | None:
+        if extension := _word(frame + EXTENSIONS):
+            metadata = _word(extension + METADATA)
+            for offset, number in zip((MAJOR, MINOR), VERSION, strict=True):
+                ctypes.c_int32.from_address(metadata + offset).value = number
+            return None
+        try:
+            outputs = _buffers(frame + RESULTS)
+            for to, x in zip(outputs, function(*_buffers(frame + ARGUMENTS)), strict=True):
+                to[...] = x
+        except Exception:  # C called this function: no exception may leave it
+            return _error(_word(frame + API), traceback.format_exc())
+        return None
+
+    name = f"udkjax_host_{uuid.uuid4().hex}"
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.cast(handle, ctypes.c_void_p)), platform="cpu")
+    _REGISTERED.append(handle)
+    return name
+
+
+_REGISTERED: list[Any] = []  # XLA may call these for as long as the process runs
+
+
+def _word(address: int) -> int:
+    return ctypes.c_int64.from_address(address).value
+
+
+def _buffers(block: int) -> list[np.ndarray]:
+    """Return the arrays of the arguments, or of the results, of a frame."""
+    count, pointers = _word(block + 16), _word(block + BUFFERS)
+    return [_array(_word(pointers + 8 * k)) for k in range(count)]
+
+
+def _array(buffer: int) -> np.ndarray:
+    rank, dims = _word(buffer + RANK), _word(buffer + DIMS)
+    shape = [_word(dims + 8 * k) for k in range(rank)]
+    size = math.prod(shape)
+    if not size:
+        return np.zeros(shape)
+    return np.frombuffer((ctypes.c_double * size).from_address(_word(buffer + DATA)), float).reshape(shape)
+
+
+def _error(api: int, text: str) -> int:
+    create = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(_word(api + CREATE_ERROR))
+    message = ctypes.create_string_buffer(text.encode())
+    given = (ctypes.c_int64 * 4)(32, 0, ctypes.addressof(message), INTERNAL)
+    return create(ctypes.addressof(given))
+
+
+host_p = Primitive("host_function")
+host_p.multiple_results = True
+host_p.def_impl(lambda *inputs, function: jax.device_put(_evaluate(*map(np.asarray, inputs), function=function)))
+host_p.def_abstract_eval(_abstract_eval)
+batching.primitive_batchers[host_p] = _batch
+mlir.register_lowering(host_p, mlir.lower_fun(_lower), platform="cpu")
+evaluate_as(host_p, _evaluate)

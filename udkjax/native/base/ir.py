@@ -1,0 +1,305 @@
+"""A thin layer over LLVM's text, in which an algorithm reads like one: values with operators, variables, loops, branches.
+
+A `Function` is written once for one state, or for W of them side by side: wide values are vectors of W lanes, and plain numbers
+where W is one. Numbers meet wide values by being repeated. Of W lanes no branch is taken by one alone: differences between them
+are chosen (`select`), and a condition of all of them is `any_of`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from udkjax.native.base.values import BOOL, DOUBLE, INT, POINTER, Operand, Product, Value, literal, llvm_type
+
+_COMPARE = {
+    "lt": ("olt", "slt"),
+    "le": ("ole", "sle"),
+    "gt": ("ogt", "sgt"),
+    "ge": ("oge", "sge"),
+    "eq": ("oeq", "eq"),
+    "ne": ("une", "ne"),
+}
+
+
+class Variable:
+    """A place that holds a value; LLVM keeps it in a register where it can."""
+
+    def __init__(self, f: "Function", base: str, width: int):
+        self.f, self.base, self.width = f, base, width
+        self.place = f.reserve(llvm_type(base, width))
+
+    @property
+    def value(self) -> Value:
+        return self.f.op(f"load {llvm_type(self.base, self.width)}, ptr {self.place}", self.base, self.width)
+
+    @value.setter
+    def value(self, new: Operand):
+        new = self.f.like(new, self.base, self.width)
+        self.f.line(f"store {new.type} {new.name}, ptr {self.place}")
+
+    def where(self, mask: Value, new: Operand):
+        """Set it in some lanes."""
+        self.value = self.f.select(mask, self.f.like(new, self.base, self.width), self.value)
+
+
+class Function:
+    """A function. `name` and `arguments` (pairs of base type and name) are those of its definition.
+
+    One that is `cold` is left as it is written: LLVM's optimizations would take longer than it ever runs.
+    """
+
+    def __init__(
+        self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void", cold: bool = False
+    ):
+        self.name, self.width, self.returns, self.cold = name, width, returns, cold
+        self.noinline = False  # whether it is to be called, and never put in place of its call
+        self._arguments, self._lines, self._reserved = list(arguments), [], []
+        self._count, self.declared = 0, set()
+        self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
+
+    # --- text
+
+    def line(self, text: str):
+        self._lines.append(text)
+
+    def op(self, text: str, base: str, width: int = 1) -> Value:
+        self._count += 1
+        name = f"%t{self._count}"
+        self._lines.append(f"{name} = {text}")
+        return Value(self, name, base, width)
+
+    def reserve(self, type_: str, count: int = 1) -> str:
+        """Memory of the function's own, for as long as it runs."""
+        self._count += 1
+        name = f"%m{self._count}"
+        self._reserved.append(f"{name} = alloca {type_}, i64 {count}, align 64")
+        return name
+
+    def text(self) -> str:
+        """Return the definition; what it calls of LLVM's own is in `declared`."""
+        arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
+        end = "ret void" if self.returns == "void" else None
+        body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
+        cold = " cold noinline optnone" if self.cold else " noinline" if self.noinline else ""
+        return f"define {self.returns} @{self.name}({arguments}){cold} {{\n  {body}\n}}\n"
+
+    # --- values
+
+    def const(self, number: Any, base: str = DOUBLE, width: int = 1) -> Value:
+        one = literal(number, base)
+        return Value(self, one if width == 1 else f"<{', '.join([f'{base} {one}'] * width)}>", base, width)
+
+    def like(self, x: Operand, base: str, width: int) -> Value:
+        """Return a value or a number as so many lanes of a type."""
+        if not isinstance(x, Value):
+            return self.const(x, base, width)
+        if x.base == INT and base == DOUBLE:
+            x = self.op(f"sitofp {x.type} {x.name} to {llvm_type(DOUBLE, x.width)}", DOUBLE, x.width)
+        if x.base == BOOL and base != BOOL:
+            to = "uitofp" if base == DOUBLE else "zext"
+            x = self.op(f"{to} {x.type} {x.name} to {llvm_type(base, x.width)}", base, x.width)
+        if x.base != base:
+            raise TypeError(f"{x.base} for {base}")
+        return x if x.width == width else self.repeat(x, width)
+
+    def repeat(self, x: Value, width: int) -> Value:
+        """Repeat a number in all lanes."""
+        if x.width != 1:
+            raise TypeError(f"{x.width} lanes for {width}")
+        kind = llvm_type(x.base, width)
+        one = self.op(f"insertelement {kind} poison, {x.base} {x.name}, i64 0", x.base, width)
+        return self.op(f"shufflevector {kind} {one.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
+
+    def both(self, a: Operand, b: Operand) -> tuple[Value, Value]:
+        if isinstance(a, Value) and isinstance(b, Value) and a.base == b.base and a.width == b.width:
+            return a, b
+        width = max(x.width for x in (a, b) if isinstance(x, Value))
+        bases = [x.base for x in (a, b) if isinstance(x, Value)]
+        base = DOUBLE if DOUBLE in bases else bases[0]
+        return self.like(a, base, width), self.like(b, base, width)
+
+    def arithmetic(self, kind: str, a: Operand, b: Operand) -> Value:
+        """Add, subtract, multiply or divide.
+
+        A product that is added to something is not rounded before that. It is said here, and not left to LLVM, whose levels of
+        optimization would round in different places.
+        """
+        x, y = self.both(a, b)
+        if x.base != DOUBLE:
+            return self.op(f"{'sdiv' if kind == 'div' else kind} {x.type} {x.name}, {y.name}", x.base, x.width)
+        if kind == "sub" and (x.product or y.product):
+            kind, y = "add", -y
+        if kind == "add":
+            for product, other in ((x.product, y), (y.product, x)):
+                if product:
+                    return self.fma(-product.a if product.is_negative else product.a, product.b, other)
+        found = self.op(f"f{kind} {x.type} {x.name}, {y.name}", DOUBLE, x.width)
+        if kind == "mul":
+            found.product = Product(x, y)
+        return found
+
+    def compare(self, kind: str, a: Operand, b: Operand) -> Value:
+        x, y = self.both(a, b)
+        real, whole = _COMPARE[kind]
+        name = f"fcmp {real}" if x.base == DOUBLE else f"icmp {whole}"
+        return self.op(f"{name} {x.type} {x.name}, {y.name}", BOOL, x.width)
+
+    def logic(self, kind: str, a: Operand, b: Operand) -> Value:
+        x, y = self.both(a, b)
+        return self.op(f"{kind} {x.type} {x.name}, {y.name}", x.base, x.width)
+
+    def select(self, mask: Value, yes: Operand, no: Operand) -> Value:
+        given = [x for x in (yes, no) if isinstance(x, Value)]
+        base = given[0].base if given else DOUBLE
+        width = max(mask.width, *(x.width for x in given)) if given else mask.width
+        a, b = self.like(yes, base, width), self.like(no, base, width)
+        mask = mask if mask.width in (width, 1) else self.repeat(mask, width)
+        return self.op(f"select {mask.type} {mask.name}, {a.type} {a.name}, {b.type} {b.name}", base, width)
+
+    def intrinsic(self, name: str, *arguments: Operand) -> Value:
+        """Call an intrinsic function of LLVM on numbers, lane by lane: fmuladd, sqrt, fabs, maximum, floor, exp, log, pow, ..."""
+        width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
+        values = [self.like(x, DOUBLE, width) for x in arguments]
+        kind = llvm_type(DOUBLE, width)
+        full = f"llvm.{name}.{'f64' if width == 1 else f'v{width}f64'}"
+        self.declared.add(f"declare {kind} @{full}({', '.join([kind] * len(values))})")
+        return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
+
+    def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
+        """Return a b + c, rounded once where the processor has an instruction for it; a call of a library nowhere."""
+        return self.intrinsic("fmuladd", a, b, c)
+
+    def abs(self, a: Value) -> Value:
+        return self.intrinsic("fabs", a)
+
+    def max(self, a: Operand, b: Operand) -> Value:
+        """Return the larger of two numbers; b where one is none: one instruction."""
+        x, y = self.both(a, b)
+        return self.select(x > y, x, y)
+
+    def min(self, a: Operand, b: Operand) -> Value:
+        """Return the smaller of two numbers; b where one is none."""
+        x, y = self.both(a, b)
+        return self.select(x < y, x, y)
+
+    def is_finite(self, a: Value) -> Value:
+        return self.abs(a) < float("inf")
+
+    def largest_of(self, x: Value) -> Value:
+        """Return the largest of all lanes, none of which may be not a number."""
+        while x.width > 1:
+            half, lanes = x.width // 2, range(x.width)
+            take = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
+            parts = [", ".join(f"i32 {k}" for k in some) for some in (lanes[:half], lanes[half:])]
+            halves = [f"{take} <{part}>" for part in parts]
+            if half == 1:
+                halves = [f"extractelement {x.type} {x.name}, i64 {k}" for k in lanes]
+            x = self.max(*(self.op(text, x.base, half) for text in halves))
+        return x
+
+    def reduce(self, name: str, x: Value) -> Value:
+        """Reduce all lanes to one value: `or` and `and` of conditions."""
+        if x.width == 1:
+            return x
+        full = f"llvm.vector.reduce.{name}.v{x.width}{'f64' if x.base == DOUBLE else x.base}"
+        self.declared.add(f"declare {x.base} @{full}({x.type})")
+        return self.op(f"call {x.base} @{full}({x.type} {x.name})", x.base)
+
+    def total(self, x: Value) -> Value:
+        """Return the sum of all lanes, in any order."""
+        if x.width == 1:
+            return x
+        full = f"llvm.vector.reduce.fadd.v{x.width}f64"
+        self.declared.add(f"declare double @{full}(double, {x.type})")
+        return self.op(f"call reassoc double @{full}(double {self.const(0.0).name}, {x.type} {x.name})", DOUBLE)
+
+    def any_of(self, mask: Value) -> Value:
+        return self.reduce("or", mask)
+
+    def all_of(self, mask: Value) -> Value:
+        return self.reduce("and", mask)
+
+    def lane(self, x: Value, k: Value) -> Value:
+        """Return the number in one lane."""
+        if x.width == 1:
+            return x
+        return self.op(f"extractelement {x.type} {x.name}, i64 {k.name}", x.base)
+
+    def only(self, k: Value) -> Value:
+        """Return the mask of one lane alone."""
+        if self.width == 1:
+            return self.const(True, BOOL)
+        lanes = Value(self, f"<{', '.join(f'i64 {j}' for j in range(self.width))}>", INT, self.width)
+        return lanes.is_(k)
+
+    # --- memory
+
+    def at(self, pointer: Value | str, k: Operand, base: str = DOUBLE) -> Value:
+        """Return the address of the k-th number from a pointer. Of pointers as well each takes 8 bytes, whatever size it has."""
+        name = pointer.name if isinstance(pointer, Value) else pointer
+        index, stored = self.like(k, INT, 1), INT if base == POINTER else base
+        return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
+
+    def load(self, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
+        place = self.at(pointer, k, base)
+        return self.op(f"load {llvm_type(base, width)}, ptr {place.name}, align 8", base, width)
+
+    def store(self, x: Operand, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE):
+        x = self.like(x, base, width)
+        place = self.at(pointer, k, base)
+        self.line(f"store {x.type} {x.name}, ptr {place.name}, align 8")
+
+    def variable(self, start: Operand, base: str = DOUBLE, width: int | None = None) -> Variable:
+        found = Variable(self, base, self.width if width is None else width)
+        found.value = start
+        return found
+
+    def call(self, name: str, *arguments: Value):
+        self.line(f"call void @{name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
+
+    # --- control
+
+    def _label(self, name: str) -> str:
+        self._count += 1
+        return f"{name}{self._count}"
+
+    @contextmanager
+    def if_(self, condition: Value) -> Iterator[None]:
+        """Run the block if a condition holds."""
+        then, end = self._label("then"), self._label("end")
+        self.line(f"br i1 {condition.name}, label %{then}, label %{end}")
+        self.line(f"{then}:")
+        yield
+        self.line(f"br label %{end}")
+        self.line(f"{end}:")
+
+    def choose(self, condition: Value, then: Callable[[], None], otherwise: Callable[[], None]):
+        """Do one of two things."""
+        yes, no, end = self._label("then"), self._label("else"), self._label("end")
+        self.line(f"br i1 {condition.name}, label %{yes}, label %{no}")
+        for label, do in ((yes, then), (no, otherwise)):
+            self.line(f"{label}:")
+            do()
+            self.line(f"br label %{end}")
+        self.line(f"{end}:")
+
+    @contextmanager
+    def while_(self, condition: Callable[[], Value]) -> Iterator[None]:
+        """Run the block while a condition holds, which is tested first."""
+        head, body, end = self._label("while"), self._label("do"), self._label("end")
+        self.line(f"br label %{head}")
+        self.line(f"{head}:")
+        self.line(f"br i1 {condition().name}, label %{body}, label %{end}")
+        self.line(f"{body}:")
+        yield
+        self.line(f"br label %{head}")
+        self.line(f"{end}:")
+
+    @contextmanager
+    def each(self, end: Operand, start: Operand = 0) -> Iterator[Value]:
+        """Run the block for every whole number from `start` to before `end`."""
+        k = self.variable(start, INT, 1)
+        last = self.like(end, INT, 1)
+        with self.while_(lambda: k.value < last):
+            yield k.value
+            k.value = k.value + 1

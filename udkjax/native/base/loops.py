@@ -1,0 +1,95 @@
+"""Programs of loops (expressions/loop_program.py) as LLVM functions."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, Address, Kernel, LoopProgram, Reset
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.program import Place, Writer, from_memory
+
+
+class LoopWriter:
+    """The functions that programs of loops are made of, in one module: every kernel once."""
+
+    def __init__(self, width: int, cold: bool = False):
+        self.width, self._cold = width, cold
+        self.functions: list[Function] = []
+        self.globals: list[str] = []
+        self._kernels: dict[tuple[Kernel, int, int], str] = {}
+        self._tables: dict[bytes, str] = {}
+
+    def write(
+        self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
+    ) -> None:
+        """Write a program as a function of some pointers.
+
+        Args:
+            program: The program.
+            name: The function's name.
+            pointers: The names of its arguments.
+            at: Place where each array begins: a pointer, and an index from there.
+            width: The number of lanes, if it is another than that of the others.
+        """
+        width = width or self.width
+        f = Function(name, [(POINTER, x) for x in pointers], width, cold=self._cold)
+
+        def address(array: str) -> Value:
+            pointer, place = at[array]
+            return f.at(f.given[pointer], place * width)
+
+        for part in program.parts:
+            if isinstance(part, Reset):
+                with f.each(part.count) as i:
+                    f.store(part.value, address(part.array), (i + part.start) * width, width)
+            elif len(part.table):
+                arrays = [address(part.array(x)) for x in part.kernel.arrays]
+                table = Value(f, self._table(part.table), POINTER)
+                f.call(self._kernel(part.kernel, part.table.shape[1], width), *arrays, table, f.const(len(part.table), INT))
+        self.functions.append(f)
+
+    def _kernel(self, kernel: Kernel, columns: int, width: int) -> str:
+        key = kernel, columns, width
+        if key not in self._kernels:
+            self._kernels[key] = name = f"loop{len(self._kernels)}"
+            self.functions.append(self._write_result(kernel, columns, width, name))
+        return self._kernels[key]
+
+    def _write_result(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
+        """`name(arrays..., table, count)`, of a table with so many columns."""
+        f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width, cold=self._cold)
+        f.noinline = True  # copies of kernels in each of their programs would take as often as long to compile
+        with f.each(f.given["count"]) as i:
+            row = f.at(f.given["table"], i * columns, "i32")
+            bases: dict[tuple[str, int], Value] = {}
+
+            def address(slot: Address) -> tuple[Value, int]:
+                if slot.base is None:
+                    return f.given[slot.array], slot.offset * width
+                if (slot.array, slot.base) not in bases:
+                    place = f.op(f"load i32, ptr {f.at(row, slot.base, 'i32').name}, align 4", "i32")
+                    whole = f.op(f"sext i32 {place.name} to i64", INT)
+                    bases[slot.array, slot.base] = f.at(f.given[slot.array], whole * width)
+                return bases[slot.array, slot.base], slot.offset * width
+
+            writer = Writer(f, kernel.program)
+            for s, slot in zip(kernel.program.inputs, kernel.inputs, strict=True):
+                if kernel.program.uses(s):
+                    writer.known[s.index] = from_memory(f, f.load(*address(slot), width), s.node.dtype)
+            for value, slot in zip(writer.run(), kernel.outputs, strict=True):
+                new = f.like(value, DOUBLE, width)
+                if slot.update == ADD:
+                    new = f.load(*address(slot), width) + new
+                elif slot.update in (MAXIMUM, ALL):  # NaN stays
+                    name = "maximum" if slot.update == MAXIMUM else "minimum"
+                    new = f.intrinsic(name, f.load(*address(slot), width), new)
+                f.store(new, *address(slot), width)
+        return f
+
+    def _table(self, table: np.ndarray) -> str:
+        data = np.ascontiguousarray(table, "<i4").tobytes()
+        if data not in self._tables:
+            self._tables[data] = name = f"@table{len(self._tables)}"
+            text = "".join(f"\\{byte:02X}" for byte in data)
+            self.globals.append(f'{name} = private unnamed_addr constant [{len(data)} x i8] c"{text}", align 4')
+        return self._tables[data]

@@ -1,0 +1,188 @@
+"""Access of a run's code to its memory, its inputs and its outputs."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
+from udkjax.native.base.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, Plan
+
+
+class Memory:
+    """The memory of a run, laid out by `places`, and what `run` is called with.
+
+    That is a record of 8-byte fields (`call_fields`): how many members, output times, breakpoints and directions there are; the
+    addresses of inputs, their strides from member to member (numbers), the addresses of outputs, how many numbers some of them
+    have of each member, and the address of the number of the next member, which threads share.
+    """
+
+    plan: Plan
+    places: Layout
+    tangents: Layout  # of one direction of a derivative
+    begins: list[Callable[[Function], None]]  # write what is stored once a run
+    n: int  # coordinates
+    m: int  # rows of Psi
+    rowcount: int  # registers that they take
+    stage_accelerations: list[str]
+
+    settings: tuple[str, ...] = SETTINGS  # settings that it takes
+    inputs: tuple[str, ...] = ()  # besides those of every run
+    results: tuple[str, ...] = OUTPUTS
+    outputs: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()  # inputs and outputs of which it must know how many numbers they have of each member
+    directions_in = 0  # the dimension of the last input that counts the directions
+    written_text = ""  # the whole module, once it is written
+
+    @property
+    def call_fields(self) -> tuple[str, ...]:
+        inputs = (*INPUTS, *self.inputs)
+        strides = (f"{x} stride" for x in inputs)
+        lengths = (f"{x} length" for x in self.lengths)
+        return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, *lengths, "next"
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        raise NotImplementedError
+
+    def layout(self, pointer: str) -> Layout:
+        """Return the layout of the memory at a pointer."""
+        return self.places if pointer == "work" else self.tangents
+
+    def start(self, name: str, pointer: str) -> int:
+        """Return the place of an array, in numbers from a pointer."""
+        layout = self.layout(pointer)
+        return layout[name] * layout.width
+
+    def registers(self, pointer: str) -> int:
+        """Count the registers that the coordinates take."""
+        return -(-self.n * self.layout(pointer).width // self.plan.vector)
+
+    def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
+        """Return one register of an array of coordinates."""
+        return f.load(f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
+
+    def put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
+        f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
+
+    def broadcast(self, f: Function, x: Value) -> Value:
+        """Repeat a number of each lane, to go with registers of coordinates."""
+        return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
+
+    def largest(self, f: Function, values: Callable[[Value], Iterable[Value]]) -> Value:
+        """Return the largest, in each lane, of `values(r)` of each register; without what is not a number."""
+        worst = f.variable(0.0, width=self.plan.vector)
+        with f.each(self.rowcount) as r:
+            for x in values(r):
+                worst.value = f.max(x, worst.value)
+        found = worst.value
+        return found if self.plan.width > 1 else f.largest_of(found)
+
+    def address(self, f: Function, name: str) -> Value:
+        return f.at(f.given["work"], self.places[name] * self.plan.width)
+
+    def invoke(self, f: Function, name: str, out: str | None = None):
+        f.call(name, f.given["work"], self.address(f, out) if out else f.given["work"])
+
+    def weighted_sum(
+        self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
+    ) -> Value | None:
+        """Return sum_j row_j a_j of one register of coordinates; None where all are zero."""
+        total = None
+        for weight, name in zip(row, names or self.stage_accelerations, strict=False):
+            if weight != 0:
+                a = self.vector(f, name, r, pointer)
+                total = a * float(weight) if total is None else f.fma(a, float(weight), total)
+        return total
+
+    def copy(self, f: Function, source: str, to: str, mask: Value | None = None):
+        """Copy an array of coordinates, or that of some lanes, to another one, or to the pointer `out`."""
+        pointer, start = f.given["out" if to == "out" else "work"], 0 if to == "out" else self.start(to, "work")
+        with f.each(self.rowcount) as r:
+            place, new = r * self.plan.vector + start, self.vector(f, source, r)
+            old = f.load(pointer, place, self.plan.vector)
+            f.store(new if mask is None else f.select(mask, new, old), pointer, place, self.plan.vector)
+
+    def copy_point(self, f: Function, mask: Value, source: str | tuple[str, ...], to: str):
+        sources = source if isinstance(source, tuple) else [f"{source} {x}" for x in "qva"]
+        with f.each(self.rowcount) as r:
+            for name, x in zip(sources, "qva", strict=True):
+                self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
+
+    # --- single numbers of arrays, in all lanes or of one
+
+    def place(self, name: str, i: Operand = 0, pointer: str = "work") -> Operand:
+        """Return the place of the i-th number of an array, in numbers from a pointer: that of the first lane."""
+        return i * self.layout(pointer).width + self.start(name, pointer)
+
+    def entry(self, f: Function, name: str, i: Operand = 0, pointer: str = "work") -> Value:
+        """Return the i-th number of an array, in all lanes."""
+        return f.load(f.given[pointer], self.place(name, i, pointer), self.layout(pointer).width)
+
+    def put_entry(self, f: Function, name: str, i: Operand, x: Operand, pointer: str = "work"):
+        f.store(x, f.given[pointer], self.place(name, i, pointer), self.layout(pointer).width)
+
+    def lane_entry(self, f: Function, name: str, k: Value, i: Operand = 0, pointer: str = "work", base: str = DOUBLE) -> Value:
+        """Return the i-th number of an array, of lane k."""
+        return f.load(f.given[pointer], k + self.place(name, i, pointer), base=base)
+
+    def put_lane_entry(
+        self, f: Function, name: str, k: Value, x: Operand, i: Operand = 0, pointer: str = "work", base: str = DOUBLE
+    ):
+        f.store(x, f.given[pointer], k + self.place(name, i, pointer), base=base)
+
+    @contextmanager
+    def each_lane(self, f: Function, mask: Value) -> Iterator[Value]:
+        """Run the block for every lane in which a condition holds, or a number is one, with the number of the lane."""
+        marks = mask if mask.base == DOUBLE else f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+        with f.each(f.width) as k, f.if_(f.lane(marks, k) > 0.5):
+            yield k
+
+    def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
+        """Copy the coordinates of lane k to an address, or the first numbers of another array."""
+        with f.each(self.n if count is None else count) as i:
+            f.store(self.lane_entry(f, name, k, i, pointer), to, i + start)
+
+    def to_int(self, f: Function, x: Value) -> Value:
+        return f.op(f"fptosi double {x.name} to i64", INT)
+
+    # --- what `run` is called with
+
+    def call_record(self, f: Function) -> Value:
+        """Return the pointer to the call record of `run`."""
+        return f.given["call"] if "call" in f.given else f.load(f.given["work"], self.start("call", "work"), base=POINTER)
+
+    def field(self, f: Function, name: str, base: str = INT) -> Value:
+        """Return a field of the call record: a count, or an address."""
+        return f.load(self.call_record(f), self.call_fields.index(name), base=base)
+
+    def input_number(self, f: Function, name: str, member: Value, k: Value) -> Value:
+        """Return the k-th number of an input of a member (one lane)."""
+        return f.load(self.member_address(f, name, member), k)
+
+    def member_address(self, f: Function, name: str, member: Value) -> Value:
+        """Return the address of what an input holds of a member (one lane)."""
+        number = member if member.base == INT else self.to_int(f, member)
+        return f.at(self.field(f, name, POINTER), number * self.field(f, f"{name} stride"))
+
+    def result_address(self, f: Function, name: str, number: Value, length: Operand) -> Value:
+        """Return the address of row `number` of an output, which has so many numbers in each."""
+        return f.at(self.field(f, name, POINTER), number * length)
+
+    def write_state(self, f: Function, s: Lane, k: Value, number: Value, q: str, v: str):
+        """Write state number `number` of lane k into the outputs."""
+        row, violated = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number, f.lane(s.violated, k)
+        for name, x in (("qs", q), ("vs", v)):
+            self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, k)
+        f.store(violated, self.field(f, "violation", POINTER), row)
+        with f.if_(~(violated <= f.lane(s.drift_tol, k))):
+            first = f.min(f.lane(s.lost, k), f.op(f"sitofp i64 {number.name} to double", DOUBLE))
+            self.put_lane_entry(f, "lost", k, first)
+
+    def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
+        """Reserve so many numbers: return what to free, and where they begin, at a register's boundary."""
+        size = count * 8 + 64
+        block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
+        address = f.op(f"ptrtoint ptr {block.name} to i64", INT)
+        aligned = f.logic("and", address + 63, -64)
+        return block, f.op(f"inttoptr i64 {aligned.name} to ptr", POINTER)

@@ -1,0 +1,299 @@
+"""One module of machine code: its functions, and what the memory of a run has room for."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from udkjax.equations.differentiable_programs import FORWARD
+from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
+from udkjax.native.base.ir import POINTER, Function, Value
+from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
+from udkjax.native.base.loops import LoopWriter
+from udkjax.native.base.memory import Memory
+from udkjax.native.base.program import Place, consecutive, write
+from udkjax.native.base.steps import POINTS
+
+# Once a run, beside singularities, or where a piece may end.
+COLD = (
+    "leave",
+    "finish_members",
+    "begin",
+    "rows_and_loads",
+    "fallback",
+    "fallback_tangent_part",
+    "finish_by_fallback",
+    "close_output",
+    "accelerate_by_fallback",
+    "equation_terms",
+    "newton_v_and_psi",
+)
+
+
+class Module(Memory):
+    """The text of one module of machine code: its functions.
+
+    Args:
+        plan: Choices that the code depends on.
+        differentiated: Of which differentiable programs of the scene the module takes derivatives.
+        active: Of the numbers of the scene: along which there are derivatives.
+    """
+
+    mode = FORWARD  # of derivatives
+
+    def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
+        self.plan, self.code, self.method = plan, plan.code, plan.method
+        code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
+        self.n, self.m = n, m
+        if plan.sampled:
+            self.inputs = ("samples", *self.inputs)
+        if plan.formulation is not None:
+            self.settings = (*self.settings, *FORMULATION_SETTINGS)
+        self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small to be trusted
+        self.is_dense = plan.pseudoinverse is not None and m > 0
+        self.is_formulated = plan.formulation is not None and m > 0
+        self.takes_dense_rows = self.is_dense or self.is_formulated
+        self.pieces = code.piece_count if plan.breaks else 0
+        self.programs = {name: getattr(code, name) for name in self.program_names()}
+        self.written_out = WrittenOut(code, list(self.programs), differentiated, active, self.mode) if plan.written_out else None
+        self.constants = len(self.written_out.constants if self.written_out else code.constants)
+        self.moving = range(self.constants if any(active) else 0) if self.written_out is None else self.written_out.moving
+        """The constants, by their numbers in the layout of the scene, along which there are derivatives."""
+        self._lay_out()
+        self.tangents = self.places  # of one direction of a derivative
+        self.functions: list[Function] = []
+        self.begins = []
+        self.loops = LoopWriter(plan.width, cold=plan.written_out)
+        self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
+        self.rowcount = -(-n * plan.width // plan.vector)
+
+    def _lay_out(self):
+        """Reserve room in memory for all arrays; layout.py says what they hold."""
+        plan, code, n, m = self.plan, self.code, self.n, self.m
+        p = self.places = Layout(plan.width, plan.vector)
+        for name in (*LANE_NUMBERS, *(FORMULATION_SETTINGS if plan.formulation else ())):
+            p.add(name)
+        p.add("constants", self.constants)
+        p.add("state t")
+        for name in (
+            "state q",
+            "state v",
+            "state dq",
+            "state dv",
+            "result v",
+            "result a",
+            "result dq",
+            "result dv",
+            "corrected q",
+            "scale q",
+            "scale v",
+            "inverse unit",
+        ):
+            p.add(name, n)
+        for k in range(POINTS):
+            for x in "qva":
+                p.add(f"point{k} {x}", n)
+        for i in range(1, plan.method.stages):
+            p.add(f"stage{i} a", n)
+        for k in range(3 * POINTS):
+            p.add(f"difference{k}", n)
+        p.add("rows", m)
+        p.add("psi", m)
+        p.add("terms", code.term_count)
+        for name in ("pieces", "pieces before"):
+            p.add(name, self.pieces)
+        if plan.sampled:
+            p.add("numbers", -(-code.number_count // plan.width))
+        if not self.written_out:
+            self._add_arrays("", code.scratch)
+        if self.takes_dense_rows and "root" not in p.places:
+            self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.written_out else {}))
+        if self.is_formulated:
+            p.add("saved v", n)
+        if self.falls_back:
+            self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
+            if self.written_out:
+                self._add_arrays("", {"psi_q": code.scratch["psi_q"], "psi_dot": m, "root": n})
+            else:
+                self._add_arrays("fallback ", code.with_all_rows.scratch | {"constants": len(code.constants)})
+
+    @property
+    def drop_tol_place(self) -> int | None:
+        """The place of the threshold of pivots; None if no pivot is compared with it."""
+        place = (self.written_out or self.code).drop_tol_index
+        return None if place is None else self.places["constants"] + place
+
+    def _add_arrays(self, prefix: str, sizes: Mapping[str, int]):
+        for name, count in sizes.items():
+            self.places.add(prefix + name, count)
+
+    def module_text(self) -> str:
+        functions = [*self.functions, *self.loops.functions]
+        declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
+        return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
+
+    # --- programs
+
+    @property
+    def solving(self) -> list[str]:
+        """The names of the functions that the module calls to solve: programs by elimination, or dense equations."""
+        if not self.plan.projected:
+            return ["accelerations"]
+        of_step = ["project_and_accelerate", "tangent_part"] if self.method.ends else ["end_of_step"]
+        return ["accelerations", "newton_q", *of_step, "newton_v_and_psi", "project"]
+
+    def program_names(self) -> list[str]:
+        """Return the names of the scene's programs that the module calls."""
+        names = ["equation_terms", "psi"]
+        if self.pieces:
+            names.append("pieces")
+        if self.is_dense:
+            names += ["dense_accelerations", *(["dense_newton_q", "dense_newton_v", "psi_dot"] if self.plan.projected else [])]
+        else:
+            names += self.solving
+        if self.is_formulated and not self.is_dense:
+            names.append("dense_accelerations")
+        if self.falls_back and self.plan.written_out:
+            names.append("rows_and_loads")
+        return names
+
+    @property
+    def arrays(self) -> dict[str, Place]:
+        """The places of the arrays of the scene's programs."""
+        named = {
+            "t": "state t",
+            "q": "state q",
+            "v": "state v",
+            "dq": "state dq",
+            "dv": "state dv",
+            "q1": "corrected q",
+            "v1": "result v",
+            "a": "result a",
+        }
+        named |= {"dq1": "result dq", "dv1": "result dv"} | {
+            x: x for x in ("constants", "psi", "terms", "pieces", "safe", "distance", "rank")
+        }
+        if not self.written_out:
+            named |= {x: x for x in self.code.scratch}
+        elif self.falls_back:
+            named |= {x: x for x in ("psi_q", "psi_dot", "root")}
+        if self.takes_dense_rows:
+            named |= {x: x for x in ("psi_q", "root")}
+        return {x: ("work", self.places[place]) for x, place in named.items()}
+
+    def write_programs(self):
+        for name in self.programs:
+            out = {"a": ("out", 0)} if name == "accelerations" else {}
+            self.write_program(name, self.arrays | out)
+        self.write_prologue("prologue", self.written_out)
+
+    def write_program(self, name: str, at: Mapping[str, Place]):
+        """Write one of the scene's programs, with its arrays where `at` says, as a function of `work` and `out`."""
+        if self.written_out:
+            self.write_scalars(self.written_out.program(name), name, ("work", "out"), at)
+        else:
+            self.loops.write(self.programs[name], name, ("work", "out"), at)
+
+    def write_scalars(
+        self, program: WrittenOutProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
+    ):
+        """Write a program without loops."""
+
+        def find(places: Sequence[Place]) -> list[Place]:
+            return [(at[x][0], at[x][1] + k) if x in at else (pointers[0], 0) for x, k in places]
+
+        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers}
+        inputs, outputs = find(program.inputs), find(program.outputs)
+        self.functions.append(
+            write(
+                program.program,
+                name,
+                width or self.plan.width,
+                pointers,
+                inputs,
+                outputs,
+                name in COLD and not self.is_dense,
+                lanes,
+            )
+        )
+
+    def write_prologue(self, name: str, written_out: WrittenOut | None):
+        """Write `name(numbers, constants)`, of one member."""
+        if written_out:
+            inputs, outputs = consecutive("numbers", self.code.number_count), consecutive("constants", self.constants)
+            self.functions.append(write(written_out.prologue, name, 1, ("numbers", "constants"), inputs, outputs))
+        else:
+            at = {"numbers": ("numbers", 0), "constants": ("constants", 0)}
+            self.loops.write(self.code.prologue, name, ("numbers", "constants"), at, width=1)
+
+    def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
+        f = self.new_function(name, arguments, self.plan.width)
+        return f, Lane(f, self.places)
+
+    def new_function(self, name: str, arguments: Sequence[tuple[str, str]], width: int) -> Function:
+        """Return a function of so many lanes."""
+        f = Function(name, arguments, width, cold=name in COLD and not self.is_dense)
+        self.functions.append(f)
+        return f
+
+    def write_derivatives(self):
+        """Hook: writes the functions of derivatives; none by default."""
+
+    def record_stage(self, f: Function, s: Lane, i: int):
+        """Hook: called after stage i of a step, at its state."""
+
+    def record_step(self, f: Function, s: Lane, accept: Value):
+        """Hook: called after a step, once its end is point 3 in lanes that `accept`."""
+
+    def record_output(self, f: Function, s: Lane):
+        """Hook: called with a state between steps (`state t`, `state q`, `result v`) of lanes that are `due`."""
+
+    def weigh_rows(self):
+        """Reserve room for the weights of rows, which then are those of the member in each lane."""
+        if "weights" not in self.places.places:
+            self.places.add("weights", self.m)
+
+    def begin_memory(self, f: Function):
+        """Store numbers that no member changes, once a run, with all memory zero."""
+        for begin in self.begins:
+            begin(f)
+
+    def begin_rows(self, f: Function, lane: Value, length: Value):
+        """Store the weights of the rows of a member, whose scales are in its lane."""
+        if "weights" in self.places.places:
+            with f.each(self.m) as i:
+                self.put_lane_entry(f, "weights", lane, length / self.lane_entry(f, "rows", lane, i), i)
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        """Hook: called with a member that is taken into a lane; does nothing by default."""
+
+    def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
+        """Hook: called with the addresses of the numbers and constants that a lane goes on with; does nothing by default."""
+
+    def end_members(self, f: Function, s: Lane):
+        """Hook: called with members that are done, in lanes that are `due`."""
+
+    def goes_on(self, f: Function, s: Lane) -> Value:
+        """Return whether there is something to do in the lanes."""
+        return f.any_of(s.active > 0.5)
+
+    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Take one step in all lanes, and finish those that are done."""
+        raise NotImplementedError
+
+    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Fill the lanes whose members are done with the next ones."""
+        fill()
+
+    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+        """Further memory of a run, in `work` already: what to free."""
+        del f, call
+        return []
+
+    def accelerate_stage(self, f: Function, i: int):
+        """Compute the accelerations of stage i, of its state."""
+        self.accelerate(f, f"stage{i} a")
+
+    def accelerate(self, f: Function, to: str):
+        """Compute the accelerations of the state."""
+        self.invoke(f, "accelerations", to)
+
+    def accelerate_end(self, f: Function):
+        """Hook: called with `state q` and `result v` at the end of a step, and `result a` of them."""

@@ -1,0 +1,228 @@
+"""A straight-line program as an LLVM function: one state, or W lanes of them.
+
+It finds its inputs and leaves its outputs in memory: all are numbers side by side, W of each.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from udkjax.expressions import ScalarProgram
+from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
+
+SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
+COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
+HALF_PI = (math.pi / 2, 6.123233995736766e-17)  # in two parts: their sum is exact to 107 binary digits
+ROUND = 1.5 * 2.0**52  # added to a number, it leaves the nearest whole one in the last digits
+_COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
+_INTRINSIC = {
+    "abs": "fabs", "exp": "exp", "log": "log", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum", "pow": "pow",
+    "tanh": "tanh", "tan": "tan", "sinh": "sinh", "cosh": "cosh", "asin": "asin", "acos": "acos", "atan": "atan", "exp2": "exp2",
+    "atan2": "atan2",
+}  # fmt: skip
+
+
+class UnsupportedError(ValueError):
+    """Something in a scene that machine code has no instruction for."""
+
+
+Place = tuple[str, int]  # the name of a pointer, and an index from there
+
+
+def consecutive(pointer: str, count: int) -> list[Place]:
+    """Return the places of so many numbers from a pointer on."""
+    return [(pointer, k) for k in range(count)]
+
+
+def write(
+    program: ScalarProgram,
+    name: str,
+    width: int,
+    pointers: Sequence[str],
+    inputs: Sequence[Place],
+    outputs: Sequence[Place],
+    cold: bool = False,
+    lanes: Mapping[str, int] | None = None,
+) -> Function:
+    """Return a function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
+
+    `lanes` are those of pointers to numbers of another width: results of single numbers alone are computed once for all.
+    """
+    f = Function(name, [(POINTER, x) for x in pointers], width, cold=cold)
+    writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})
+    for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
+        if program.uses(s):
+            x = f.load(f.given[pointer], place * lanes[pointer], lanes[pointer])
+            writer.known[s.index] = from_memory(f, x, s.node.dtype)
+    for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
+        f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
+    return f
+
+
+def from_memory(f: Function, x: Value, dtype: Any) -> Value:
+    """Return a number from memory as what it is in the graph."""
+    if dtype.kind == "b":
+        return x.is_not(0.0)
+    return f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
+
+
+class Writer:
+    """The operations of a program, within a function that has put the values of its inputs into `known`."""
+
+    def __init__(self, f: Function, program: ScalarProgram):
+        self.f, self.program, self.known = f, program, {}
+        self._negative: dict[int, Value] = {}
+        self._pairs: dict[str, tuple[Value, Value]] = {}
+
+    def run(self) -> list[Value]:
+        """Write all operations; return the outputs."""
+        nodes = self.program.graph.nodes
+        used = Counter(s.index for index in self.program.order for s in nodes[index].arguments)
+        used.update(s.index for s in self.program.outputs)
+        for index in self.program.order:
+            self.known[index] = found = self._operation(nodes[index])
+            if used[index] > 1:  # fused with each sum, a product would keep two numbers in registers in place of one
+                found.product = None
+        return [self._with_sign(s) for s in self.program.outputs]
+
+    def _with_sign(self, s: Any) -> Value:
+        if s.sign > 0:
+            return self.known[s.index]
+        if s.index not in self._negative:
+            self._negative[s.index] = -self.known[s.index]
+        return self._negative[s.index]
+
+    def _operation(self, node: Any) -> Value:
+        f = self.f
+        if node.kind == "constant":
+            base = BOOL if node.dtype == bool else INT if node.dtype.kind in "iu" else DOUBLE
+            return f.const(node.detail, base, f.width)
+        if node.kind in ("call", "pick"):
+            raise UnsupportedError(f"{node.detail} of arrays")
+        a = [self._with_sign(s) for s in node.arguments]
+        if node.kind in ("add", "sub", "mul", "div"):
+            return f.arithmetic(node.kind, *a)
+        name = node.kind if node.kind != "apply" else node.detail.primitive.name
+        parameters: Mapping[str, Any] = node.detail.parameters if node.kind == "apply" else {}
+        return apply(f, name, parameters, a, self._sincos)
+
+    def _sincos(self, angle: Value) -> tuple[Value, Value]:
+        if angle.name not in self._pairs:
+            self._pairs[angle.name] = sincos(self.f, angle)
+        return self._pairs[angle.name]
+
+
+def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value], pair: Any) -> Value:
+    """Apply one of JAX's primitives to numbers."""
+    match name:
+        case "sin" | "cos":
+            return pair(a[0])[name == "cos"]
+        case "sqrt":
+            return f.intrinsic("sqrt", a[0])
+        case "rsqrt":
+            return 1.0 / f.intrinsic("sqrt", a[0])
+        case "neg":
+            return -a[0]
+        case "square":
+            return a[0] * a[0]
+        case "one_minus_square":
+            return (1.0 - a[0]) * (a[0] + 1.0)
+        case "integer_pow":
+            return integer_power(a[0], parameters["y"])
+        case "logistic":
+            return 1.0 / (f.intrinsic("exp", -a[0]) + 1.0)
+        case "expm1":
+            return f.intrinsic("exp", a[0]) - 1.0 if a[0].base == INT else _expm1(f, a[0])
+        case "log1p":
+            return _log1p(f, a[0])
+        case "sign":
+            zero = f.const(0.0, DOUBLE, f.width)
+            one = f.select(a[0] > zero, f.const(1.0, DOUBLE, f.width), f.const(-1.0, DOUBLE, f.width))
+            return f.select(a[0].is_(zero) | a[0].is_not(a[0]), a[0], one)
+        case "select_n" if len(a) == 3 and a[0].base == BOOL:
+            return f.select(a[0], a[2], a[1])
+        case "clamp":
+            return f.intrinsic("minimum", f.intrinsic("maximum", a[1], a[0]), a[2])
+        case "and" | "or" | "xor" if a[0].base == BOOL:
+            return f.logic(name, *a)
+        case "not" if a[0].base == BOOL:
+            return ~a[0]
+        case "is_finite":
+            return f.is_finite(a[0])
+        case "convert_element_type":
+            return _convert(f, a[0], parameters["new_dtype"])
+        case "copy" | "copy_p" | "stop_gradient":
+            return a[0]
+        case _ if name in _COMPARED:
+            return f.compare(name, *a)
+        case _ if name in _INTRINSIC and all(x.base == DOUBLE for x in a):
+            return f.intrinsic(_INTRINSIC[name], *a)
+        case _:
+            raise UnsupportedError(name)
+
+
+def _convert(f: Function, a: Value, dtype: Any) -> Value:
+    kind = np.dtype(dtype).kind
+    if kind == "f":
+        return f.like(a, DOUBLE, a.width)
+    if kind in "iu" and a.base == BOOL:
+        return f.like(a, INT, a.width)
+    if kind in "iu" and a.base == INT:
+        return a
+    if kind == "b" and a.base == DOUBLE:
+        return a.is_not(0.0)
+    raise UnsupportedError(f"{a.base} as {dtype}")
+
+
+def _expm1(f: Function, x: Value) -> Value:
+    """Return e^x - 1 (Kahan): exact also where x is small."""
+    u = f.intrinsic("exp", x)
+    small, gone = u.is_(1.0), (u - 1.0).is_(-1.0)
+    exact = (u - 1.0) * x / f.intrinsic("log", f.select(small | gone | ~f.is_finite(u), 2.0, u))
+    return f.select(small, x, f.select(gone | ~f.is_finite(u), u - 1.0, exact))
+
+
+def _log1p(f: Function, x: Value) -> Value:
+    """Return log(1 + x) (Kahan)."""
+    u = x + 1.0
+    small = u.is_(1.0)
+    return f.select(small | ~(u < math.inf), x, f.intrinsic("log", u) * x / f.select(small, 1.0, u - 1.0))
+
+
+def integer_power(a: Value, n: int) -> Value:
+    """Return a^n by squares."""
+    f = a.f
+    if n < 0:
+        return 1.0 / integer_power(a, -n)
+    if n == 0:
+        return f.const(1.0, DOUBLE, a.width)
+    half = integer_power(a, n // 2) if n > 1 else None
+    square = None if half is None else half * half
+    return a if square is None else square * a if n % 2 else square
+
+
+def sincos(f: Function, a: Value) -> tuple[Value, Value]:
+    """Sine and cosine to rounding, by one reduction to within a quarter of pi and two polynomials: no call of a library."""
+    width, T, whole = a.width, a.type, llvm_type(INT, a.width)
+    shifted = f.fma(a, 2 / math.pi, ROUND)
+    turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)
+    x = f.fma(turns, -HALF_PI[0], a)
+    x = f.fma(turns, -HALF_PI[1], x)
+    y = x * x
+    s, c = f.const(SIN[8], DOUBLE, width), f.const(COS[9], DOUBLE, width)
+    for k in range(7, 0, -1):
+        s = f.fma(s, y, SIN[k])
+    s = f.fma(s, y * x, x)
+    for k in range(8, -1, -1):
+        c = f.fma(c, y, COS[k])
+    quarter = f.op(f"bitcast {T} {shifted.name} to {whole}", INT, width)
+
+    def bit(j: Value, mask: int) -> Value:
+        return f.logic("and", j, mask).is_not(0)
+
+    odd, minus_s, minus_c = bit(quarter, 1), bit(quarter, 2), bit(quarter + 1, 2)
+    sine, cosine = f.select(odd, c, s), f.select(odd, s, c)
+    return f.select(minus_s, -sine, sine), f.select(minus_c, -cosine, cosine)

@@ -1,0 +1,109 @@
+"""The functions of the derivatives of a scene's programs, written out or as loops.
+
+For the accelerations (no suffix), for the projection of a state on the manifold ("_projection") and for the corrections that
+close a mechanism ("_newton_q", "_newton_v") there are
+
+    evaluation(work, out, stored)   the results, and what its derivatives need to know of the state
+    forward(work, stored, tangent, out)   the change of the results, from those of the constants and the state in a tangent
+    twice(work, stored, tangent, out)     the same along two directions and along both, in three tangents one behind the other
+    reverse(work, stored, bar)      `bar constants` and `bar state`, from the cotangents of the results
+
+where all but the accelerations leave their changes in `result` of a tangent, and find their cotangents in `bar result`.
+"""
+
+from collections.abc import Sequence
+
+from udkjax.equations.differentiable_programs import PREFIXES, TWICE, DifferentiableProgram
+from udkjax.expressions.loop_derivative import COTANGENT
+from udkjax.expressions.loop_program import LoopProgram, Reset
+from udkjax.native.base.module import Module
+from udkjax.native.base.program import Place
+
+WAYS = ("d", "e", "de")  # the changes along two directions and along both, of which tangents hold one each
+GIVEN = ("d", "e")  # directions of numbers and of the first state do not change along either
+
+
+class ProgramDerivative:
+    """One of the differentiable programs of a scene with its derivative, in a module."""
+
+    stored: int
+    """The number of values that its derivatives know of a state."""
+
+    def __init__(self, module: Module, name: str, evaluation: str = "evaluation"):
+        self._module, self._name = module, name
+        self._suffix = "" if name == "accelerations" else f"_{name}"
+        self._evaluation = evaluation + self._suffix
+        self._evaluated: DifferentiableProgram = module.code.differentiable[name]
+        self._fixed = [] if module.moving else ["constants"]
+        self._stored: dict[str, int] = {}  # the arrays of loops, and where they begin
+        self.stored = 0
+        if module.written_out:
+            self._written_out = module.written_out.derivative(name)
+            self.stored = sum(x == "stored" for x, _ in self._written_out.evaluation.outputs)
+            return
+        parts = self._evaluated.second_parts if module.mode == TWICE else self._evaluated.parts
+        used = self._evaluated.program.arrays | LoopProgram(parts).arrays
+        for x, count in module.code.stored_sizes.items():
+            if x in used:
+                self._stored[x] = self.stored
+                self.stored += count
+        if "along" not in module.places.places:  # changes or cotangents of what is stored, of all such programs
+            module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
+
+    def place(self, name: str) -> int:
+        """Return the place of an array among those that loops store."""
+        return self._stored[name]
+
+    @property
+    def _at(self) -> dict[str, Place]:
+        results = {x: ("stored", place) for x, place in self._stored.items()}
+        return self._module.arrays | results | {"stored": ("stored", 0)}
+
+    def _along(self, prefixes: Sequence[str]) -> dict[str, Place]:
+        if self._module.written_out:
+            return {}
+        start, size = self._module.places["along"], sum(self._module.code.stored_sizes.values())
+        return {
+            prefix + x: ("work", start + k * size + place)
+            for k, prefix in enumerate(prefixes)
+            for x, place in self._stored.items()
+        }
+
+    def evaluation(self):
+        at = self._at | {"a": ("out", 0)}
+        pointers, name = ("work", "out", "stored"), self._evaluation
+        if self._module.written_out:
+            self._module.write_scalars(self._written_out.evaluation, name, pointers, at)
+        else:
+            self._module.loops.write(self._evaluated.program, name, pointers, at)
+
+    def forward(self):
+        """Write `forward`, or `twice`."""
+        module, w = self._module, self._module.tangents
+        changes = {"constants": "constants", "q": "state q", "v": "state v", "q1": "result q", "v1": "result v"}
+        prefixes, program = PREFIXES[module.mode], self._evaluated.in_mode(module.mode, self._fixed)
+        at = self._at | self._along(prefixes)
+        for k, prefix in enumerate(prefixes):
+            at |= {prefix + x: ("tangent", w[place] + k * w.size) for x, place in changes.items()}
+            at[f"{prefix}a"] = ("out", k * w.size)
+        self._write(program, f"{module.mode}{self._suffix}", ("work", "stored", "tangent", "out"), at)
+
+    def reverse(self):
+        module, p = self._module, self._module.places
+        found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v", "q1": "bar result q", "v1": "bar result v"}
+        prefixes, program = PREFIXES[module.mode], self._evaluated.in_mode(module.mode, self._fixed)
+        at = self._at | self._along(prefixes) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
+        counts = {x: module.code.stored_sizes[x] for x in self._stored} | {
+            "constants": len(module.moving),
+            "q": module.n,
+            "v": module.n,
+        }
+        cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items() if x not in ("q1", "v1")]
+        program = LoopProgram([*cleared, *program.parts])
+        self._write(program, f"reverse{self._suffix}", ("work", "stored", "bar"), at | {f"{COTANGENT}a": ("bar", 0)})
+
+    def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
+        if self._module.written_out:
+            self._module.write_scalars(self._written_out.derivative, name, pointers, at)
+        else:
+            self._module.loops.write(program, name, pointers, at)

@@ -1,0 +1,33 @@
+"""Derivatives of the prologue: of what a scene's code computes of its numbers alone, once a run. Of one member,
+
+    prologue_forward(numbers, constants, dnumbers, dconstants)          changes of the constants, from those of the numbers
+    prologue_reverse(numbers, constants, constants_bar, numbers_bar)    cotangents of the numbers, from those of the constants
+    prologue_twice(numbers, constants, dnumbers, enumbers, denumbers, dconstants, econstants, deconstants)
+
+of all numbers, and of the constants that move; the last along two directions, and along both.
+"""
+
+from collections.abc import Sequence
+
+from udkjax.equations.differentiable_programs import FORWARD, PREFIXES, REVERSE, TWICE
+from udkjax.expressions.loop_derivative import COTANGENT, LoopDerivative
+from udkjax.expressions.loop_program import LoopProgram, Reset
+from udkjax.native.base.module import Module
+
+PROLOGUE = {mode: f"prologue_{mode}" for mode in (FORWARD, REVERSE, TWICE)}
+
+
+def write_prologue_derivative(module: Module, active: Sequence[bool], mode: str):
+    """Write the derivative of a mode, along the numbers that are active."""
+    changes = ("constants", "numbers") if mode == REVERSE else ("numbers", "constants")
+    pointers = ("numbers", "constants", *(prefix + x for x in changes for prefix in PREFIXES[mode]))
+    at = {x: (x, 0) for x in pointers}
+    if module.written_out:
+        module.write_scalars(module.written_out.prologue_derivative(active, mode), PROLOGUE[mode], pointers, at, 1)
+        return
+    derivative = LoopDerivative(module.code.prologue.parts, ())
+    if mode == REVERSE:
+        parts = [Reset(f"{COTANGENT}numbers", 0, module.code.number_count), *derivative.reverse.parts]
+    else:
+        parts = (derivative.forward if mode == FORWARD else derivative.second(())).parts
+    module.loops.write(LoopProgram(parts), PROLOGUE[mode], pointers, at, width=1)

@@ -1,0 +1,134 @@
+"""Rows for dense methods: D = W Psi_q M^(-1/2), with W the characteristic length over the scale of each row.
+
+They come from the arrays `psi_q` and `root`, which holds M^(-1/2).
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from udkjax.native.base.ir import INT, POINTER, Function, Operand, Value
+from udkjax.native.base.module import Module
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
+
+_ENTRIES, _FACTORS, _CHOSEN = "@entries", "@factors", "@chosen"
+
+
+class RowEntries:
+    """The entries of Psi_q, or of the chosen ones of its rows, with their tables among the constants of a module.
+
+    A module has one choice of rows.
+    """
+
+    def __init__(self, module: Module, chosen: Sequence[int] | None = None):
+        self._module = module
+        rows, columns, places, factors = module.code.psi_q_entries
+        if chosen is not None:
+            kept = np.isin(rows, chosen)
+            rows, columns, places, factors = (x[kept] for x in (np.searchsorted(chosen, rows), columns, places, factors))
+        self._count = len(rows)
+        self._chosen = range(module.m) if chosen is None else chosen
+        entries = ", ".join(f"i64 {x}" for entry in zip(rows, columns, places, strict=True) for x in entry)
+        numbers = ", ".join(f"double {float(x)}" for x in factors)
+        for line in (
+            f"{_ENTRIES} = private constant [{3 * self._count} x i64] [{entries}]",
+            f"{_FACTORS} = private constant [{self._count} x double] [{numbers}]",
+            f"{_CHOSEN} = private constant [{len(self._chosen)} x i64] [{', '.join(f'i64 {x}' for x in self._chosen)}]",
+        ):
+            if line not in module.loops.globals:
+                module.loops.globals.append(line)
+
+    def entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
+        """Run the block for each entry: its row, its column, its place in `psi_q`, and the factor of what is there.
+
+        Rows are counted among the chosen ones.
+        """
+        with f.each(self._count) as e:
+            row, column, place = (f.load(Value(f, _ENTRIES, POINTER), e * 3 + j, base=INT) for j in range(3))
+            yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
+
+    def row_of_psi(self, f: Function, row: Value) -> Value:
+        """Return the row of Psi of a chosen one."""
+        return row if len(self._chosen) == self._module.m else f.load(Value(f, _CHOSEN, POINTER), row, base=INT)
+
+
+class WeightedRows(RowEntries):
+    """The rows of a module, and what a dense method solves by them: in all lanes, or lane by lane.
+
+    Where it is lane by lane, functions that use it have one lane, and its number as their argument `lane`.
+    """
+
+    def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False, chosen: Sequence[int] | None = None):
+        super().__init__(module, chosen)
+        self._method = method
+        shape, width = (len(self._chosen), module.n), 1 if by_lane else module.plan.width
+        self._layout = DenseLayout(module, method.matrices(*shape), shape, width=width)
+        self._arguments = [(POINTER, "work"), *([(INT, "lane")] if by_lane else [])]
+        module.weigh_rows()
+
+    def write(self):
+        """Write the functions that factorize and solve."""
+        for name in ("factor", "solve"):
+            f = self._module.new_function(f"{name}_rows", self._arguments, self._layout.width)
+            getattr(self._method, name)(self.matrices(f))
+
+    def matrices(self, f: Function) -> DenseMatrices:
+        """Return the matrices in a function."""
+        return DenseMatrices(self._layout, f)
+
+    def array(self, f: Function, name: str, i: Operand) -> Value:
+        """Return one number of an array, in all lanes of the function."""
+        place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
+        return f.load(f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
+
+    def put(self, f: Function, name: str, i: Operand, x: Value):
+        """Store one number of an array, in all lanes of the function."""
+        place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
+        f.store(x, f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
+
+    def weighted_entries(self, f: Function) -> Iterator[tuple[Value, Value, Value]]:
+        """Run the block for each entry of W Psi_q: its row, its column and its value."""
+        for row, column, place, factor in self.entries(f):
+            yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", self.row_of_psi(f, row))
+
+    def factor(self, f: Function):
+        """Factorize D, of the entries of Psi_q at hand."""
+        d = self.matrices(f)
+        with f.each(d.m) as i:
+            d.row("D", i).clear()
+        for row, column, value in self.weighted_entries(f):
+            d.row("D", row).put(column, value * self.array(f, "root", column))
+        self._call(f, "factor_rows")
+
+    def solve(self, f: Function, right: str, start: int = 0) -> MatrixRow:
+        """Return D^+ W b, with b in an array."""
+        d = self.matrices(f)
+        b = d.row("b")
+        b.clear()  # padding of the last register may have been multiplied by NaN
+        with f.each(d.m) as i:
+            row = self.row_of_psi(f, i)
+            b.put(i, self.array(f, right, row + start) * self.array(f, "weights", row))
+        return self.solve_right(f)
+
+    def solve_right(self, f: Function) -> MatrixRow:
+        """Return D^+ b, with b in its row."""
+        self._call(f, "solve_rows")
+        return self.matrices(f).row("x")
+
+    def solve_transposed(self, f: Function) -> MatrixRow:
+        """Return (D^+)^T x, with x in its row, of a method that solves so."""
+        d = self.matrices(f)
+        self._method.solve_transposed(d)
+        return d.row("b")
+
+    def solve_rates(self, f: Function, change: str) -> MatrixRow:
+        """Return D^+ W Psi_q dq."""
+        d = self.matrices(f)
+        b = d.row("b")
+        b.clear()
+        for row, column, value in self.weighted_entries(f):
+            b.put(row, f.fma(value, self.array(f, change, column), b.entry(row)))
+        return self.solve_right(f)
+
+    def _call(self, f: Function, name: str):
+        f.call(name, *(f.given[argument] for _, argument in self._arguments))

@@ -1,0 +1,54 @@
+"""Machine code of a straight-line program for whole batches: W members of arrays (numbers, members) side by side."""
+
+import ctypes
+
+import numpy as np
+
+from udkjax.expressions import ScalarProgram
+from udkjax.native.base import machine
+from udkjax.native.base.ir import INT, POINTER, Function
+from udkjax.native.base.program import Writer, from_memory
+
+
+class BatchProgram:
+    """A program of scalars, evaluated for M members at once, on the calling core.
+
+    Args:
+        program: the program; its first inputs differ between members.
+        shared: number of inputs, the last ones, that are the same for all members.
+    """
+
+    def __init__(self, program: ScalarProgram, shared: int = 0):
+        self.program, self.width = program, machine.lanes()
+        self.own = len(program.inputs) - shared
+        f = self._write()
+        self._library = machine.library("\n".join([*sorted(f.declared), f.text()]), (f.name,))
+        self._run = machine.function(self._library[f.name], *[ctypes.c_void_p] * 3, ctypes.c_int64)
+
+    def __call__(self, members: np.ndarray, shared: np.ndarray | None = None) -> np.ndarray:
+        """Return the outputs (outputs, M) for inputs (inputs, M) and what is the same for all."""
+        count = members.shape[1]
+        padded = -(-count // self.width) * self.width
+        given = np.empty((self.own, padded))
+        given[:, :count], given[:, count:] = members, members[:, -1:]
+        same = np.ascontiguousarray(np.zeros(1) if shared is None else shared, float)
+        found = np.empty((len(self.program.outputs), padded))
+        self._run(given.ctypes.data, same.ctypes.data, found.ctypes.data, padded)
+        return found[:, :count]
+
+    def _write(self) -> Function:
+        f = Function("run", [(POINTER, "members"), (POINTER, "shared"), (POINTER, "found"), (INT, "count")], self.width)
+        count = f.given["count"]
+        with f.each(count / self.width) as block:
+            first, writer = block * self.width, Writer(f, self.program)
+            for k, s in enumerate(self.program.inputs):
+                if not self.program.uses(s):
+                    continue
+                if k < self.own:
+                    x = f.load(f.given["members"], count * k + first, self.width)
+                else:
+                    x = f.repeat(f.load(f.given["shared"], k - self.own), self.width)
+                writer.known[s.index] = from_memory(f, x, s.node.dtype)
+            for k, value in enumerate(writer.run()):
+                f.store(value, f.given["found"], count * k + first, self.width)
+        return f

@@ -1,0 +1,171 @@
+"""Machine code that closes a mechanism: the loop of equations/position_closure.py, for numbers that are known when it runs.
+
+    q <- q - s C J^T y,      J C J^T y = Psi,      J = Psi_q,      C = M^(-1)
+
+by steps that are limited, and halved until the residual falls; then the velocities that the constraints allow. Corrections are
+those of corrections.py, of all rows.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, LONGEST_STEP, ROUNDING_UNITS, STEP_HALVINGS, VELOCITIES
+from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.native.base.ir import INT, POINTER, Function, Value
+from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.module import Module
+from udkjax.native.base.tableau import EULER
+from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.native.closing.corrections import EliminationCorrection, LeastNormCorrection
+from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.native.run.members import write_begin, write_run
+
+CORRECTED = "qv"  # corrected quantities, by their number in a record
+
+
+class Closing(Module):
+    """The text of a module whose `run` closes members, from their guesses q and v at the time ts[0]."""
+
+    settings = ("length", "fallback_tol")
+    results = ("state", "residuals", "rank")
+    further = 1  # corrections of a closed state, which change nothing but derivatives
+
+    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
+        plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, written_out=False, steps=False)
+        super().__init__(plan, active=active)
+        self.active, self.count = active, len(self.moving)
+        self._rows = WeightedRows(self, SVDCode(relative=True)) if code.is_small else None
+        self.corrections = {x: self._correction(f"newton_{x}") for x in CORRECTED}
+        self.places.add("correction", max(x.stored for x in self.corrections.values()))
+
+    def _correction(self, name: str) -> LeastNormCorrection | EliminationCorrection:
+        return LeastNormCorrection(self, name, self._rows) if self._rows else EliminationCorrection(self, name)
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        self.write_programs()
+        if self._rows:
+            self._rows.write()
+        for correction in self.corrections.values():
+            correction.evaluation()
+        self.write_derivatives()
+        write_begin(self)
+        self._close()
+        write_run(self)
+        return self.module_text()
+
+    def program_names(self) -> list[str]:
+        return ["psi", "psi_dot"] if self.code.is_small else ["psi", "psi_dot", "rank"]
+
+    def _close(self):
+        """`close(work, call)`: the member in the one lane."""
+        f, s = self.function("close", [(POINTER, "work"), (POINTER, "call")])
+        n, m = self.n, self.m
+
+        def size() -> Value:
+            """Return |Psi|, each row over its scale; not a number where a row is none."""
+            self.invoke(f, "psi")
+            total = f.variable(0.0)
+            with f.each(m) as i:
+                part = self.entry(f, "psi", i) / self.entry(f, "rows", i)
+                total.value = f.fma(part, part, total.value)
+            return f.intrinsic("sqrt", total.value)
+
+        def moved(scale: Value):
+            with f.each(n) as i:
+                q = f.fma(scale, self.entry(f, "state dq", i), self.entry(f, "corrected q", i))
+                self.put_entry(f, "state q", i, q)
+
+        setattr(s, "state t", s.start)
+        with f.each(n) as i:
+            for name in "qv":
+                self.put_entry(f, f"state {name}", i, self.entry(f, f"point3 {name}", i))
+        better, steps = f.variable(1.0), f.variable(0, INT)
+        with f.while_(lambda: (better.value > 0.5) & (steps.value < CLOSURE_ITERATIONS)):
+            steps.value = steps.value + 1
+            before = size()
+            largest, longest = f.variable(1.0), f.variable(0.0)
+            with f.each(n) as i:
+                q = self.entry(f, "state q", i)
+                largest.value = f.max(f.abs(q) * self.entry(f, "inverse unit", i), largest.value)
+                self.put_entry(f, "corrected q", i, q)
+            better.value = f.select(before > largest.value * (ROUNDING_UNITS * np.finfo(float).eps), f.const(1.0), 0.0)
+            with f.if_(better.value > 0.5):
+                self._correct(f, "q")
+                with f.each(n) as i:
+                    step = f.abs(self.entry(f, "state dq", i)) * self.entry(f, "inverse unit", i)
+                    longest.value = f.max(step, longest.value)
+                scale = f.variable(f.select(longest.value > LONGEST_STEP, LONGEST_STEP / longest.value, f.const(1.0)))
+                halvings, better.value = f.variable(0, INT), 0.0
+                with f.while_(lambda: (better.value < 0.5) & (halvings.value < STEP_HALVINGS)):
+                    moved(scale.value)
+                    better.value = f.select(size() < before, f.const(1.0), 0.0)
+                    scale.value = scale.value * 0.5
+                    halvings.value = halvings.value + 1
+                with f.if_(better.value < 0.5):
+                    moved(f.const(0.0))
+                with f.if_(better.value > 0.5):
+                    taken = scale.value * 2.0
+                    limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
+                    self._at_previous_state(f, "q", lambda: self._record_correction(f, "q", taken, limited))
+        for _ in range(self.further):
+            self._record_correction(f, "q", f.const(1.0), f.const(0.0))
+        for _ in range(VELOCITIES):
+            self._record_correction(f, "v", f.const(1.0), f.const(0.0))
+            self._correct(f, "v")
+            with f.each(n) as i:
+                self.put_entry(f, "state v", i, self.entry(f, "state v", i) + self.entry(f, "state dv", i))
+        self._write_result(f, s)
+
+    def _write_result(self, f: Function, s: Lane):
+        """Write the state, Psi and Psi_dot there, and the rank of D."""
+        member = self.to_int(f, s.member)
+        state, residuals = (self.result_address(f, x, member, 2 * size) for x, size in (("state", self.n), ("residuals", self.m)))
+        self.copy_lane(f, state, 0, "state q", f.const(0, INT))
+        self.copy_lane(f, state, self.n, "state v", f.const(0, INT))
+        for name, offset in (("psi", 0), ("psi_dot", self.m)):
+            self.invoke(f, name)
+            with f.each(self.m) as i:
+                f.store(self.entry(f, "psi", i), residuals, i + offset)
+        self.corrections["v"].find_rank(f)
+        f.store(s.rank, self.result_address(f, "rank", member, 1))
+        self._finish_closing(f, member)
+
+    def _evaluate(self, f: Function, x: str):
+        """Evaluate a correction of q or v at the state, with what its derivatives know of it."""
+        f.call(f"evaluation_newton_{x}", f.given["work"], f.given["work"], self.address(f, "correction"))
+
+    def change(self, f: Function, x: str, i: Value) -> Value:
+        """Return a coordinate of the whole correction."""
+        place = self.places["correction"] + self.corrections[x].place(f"{x}1")
+        return f.load(f.given["work"], i + place) - self.entry(f, f"state {x}", i)
+
+    def _correct(self, f: Function, x: str):
+        """Compute the whole correction of q or v, in `state dq` or `state dv`."""
+        self._evaluate(f, x)
+        with f.each(self.n) as i:
+            self.put_entry(f, f"state d{x}", i, self.change(f, x, i))
+
+    # --- hooks for derivatives (closing_derivatives.py)
+
+    def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
+        """Hook: called at the state before each correction with its `scale`, and one if that was `limited`."""
+
+    def _finish_closing(self, f: Function, member: Value):
+        """Hook: called with a member that is closed."""
+
+    def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
+        """Do something at the state before a step, which lies in `corrected q`, in place of the one that it led to."""
+        with f.each(self.n) as i:
+            current, before = self.entry(f, f"state {x}", i), self.entry(f, "corrected q", i)
+            self.put_entry(f, "corrected q", i, current)
+            self.put_entry(f, f"state {x}", i, before)
+        do()
+        with f.each(self.n) as i:
+            self.put_entry(f, f"state {x}", i, self.entry(f, "corrected q", i))
+
+    def step_all(self, f: Function, s: Lane, fill):
+        f.call("close", f.given["work"], f.given["call"])
+        s.active = f.const(0.0)
+        fill()

@@ -1,0 +1,269 @@
+"""Derivatives of closing a mechanism: of its steps as they are, forward along directions and backward.
+
+The coordinates change by -s times a correction; s, where it limits the step, is a function of it, too. Behind the last step there
+is one more correction, which changes nothing but the derivative: it returns it to the constraint manifold. Corrections
+are differentiated as corrections.py has it. Second derivatives take one correction more: the first leaves a state that changes by
+much beside the manifold by the square of that.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from udkjax.equations.differentiable_programs import FORWARD, REVERSE, TWICE
+from udkjax.equations.position_closure import CLOSURE_ITERATIONS, VELOCITIES
+from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import Layout
+from udkjax.native.base.program_derivative import GIVEN, WAYS, ProgramDerivative
+from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.closing.closing import CORRECTED, Closing
+
+
+class ClosingDerivative(Closing):
+    """The base of both modes."""
+
+    def _increase(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
+        self.put_entry(f, name, i, self.entry(f, name, i, pointer) + x, pointer)
+
+    def _longest(self, f: Function, x: str) -> tuple[Value, Value]:
+        """Return the largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
+        longest, which = f.variable(0.0), f.variable(0, INT)
+        with f.each(self.n) as i:
+            size = f.abs(self.change(f, x, i)) * self.entry(f, "inverse unit", i)
+            which.value = f.select(size > longest.value, i, which.value)
+            longest.value = f.max(size, longest.value)
+        return longest.value, which.value
+
+
+class ClosingForward(ClosingDerivative):
+    """Closing along directions, each with memory of its own: a tangent for each of the changes that are taken."""
+
+    mode = FORWARD
+    ways = ("d",)  # the changes along a direction, and prefixes of inputs
+    outputs = ("dstate",)
+    directions_in = 1
+
+    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+        super().__init__(code, vector, active)
+        self.inputs = tuple(f"{way}{x}" for way in self.ways if way in GIVEN for x in ("numbers", "q", "v"))
+        self.tangents = w = Layout(1, self.plan.vector)
+        w.add("numbers", code.number_count)
+        w.add("constants", self.constants)
+        for name in ("state q", "state v", "result q", "result v"):
+            w.add(name, self.n)
+
+    def write_derivatives(self):
+        write_prologue_derivative(self, self.active, self.mode)
+        for x in self.corrections:
+            self._write_correction(x)
+            self._write_push(x)
+
+    def _write_correction(self, x: str):
+        self.corrections[x].write_adjoint()
+        self.corrections[x].forward()
+
+    def _linearize(self, f: Function, x: str) -> Value:
+        """Evaluate a correction at the state; return the address of what its derivative needs to know."""
+        self._evaluate(f, x)
+        self.corrections[x].prepare_derivative(f)
+        return self.address(f, "correction")
+
+    def _write_push(self, x: str):
+        """Write push_x(work, scale, limited): the change of the state by so much of a correction, which was limited or not."""
+        f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        known = self._linearize(f, x)
+        longest, which = self._longest(f, x)
+        limits = (f.given["limited"] > 0.5) & (longest > 0.0)
+        with self._each_direction(f):
+            f.call(f"{self.mode}_newton_{x}", f.given["work"], known, f.given["d"], f.given["d"])
+            for way in self.ways:
+                with f.each(self.n) as i:
+                    self._increase(f, f"result {x}", i, -self.entry(f, f"state {x}", i, way), way)
+            # Of the longest step, over its length: with it the limit changes.
+            steps = {way: self.entry(f, f"result {x}", which, way) for way in self.ways}
+            shares = {way: f.select(limits, step / self.change(f, x, which), 0.0) for way, step in steps.items()}
+            with f.each(self.n) as i:
+                steps = {way: self.entry(f, f"result {x}", i, way) for way in self.ways}
+                for way, step in self._limited(steps, shares, self.change(f, x, i)).items():
+                    self._increase(f, f"state {x}", i, f.given["scale"] * step, way)
+
+    def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
+        """Return the changes of a coordinate of a limited step c / c_j, times c_j: dc - a c, with the share a = dc_j / c_j."""
+        return {way: change - shares[way] * step for way, change in steps.items()}
+
+    @contextmanager
+    def _each_direction(self, f: Function) -> Iterator[Value]:
+        """Run the block for every direction, with the addresses of its tangents by their names."""
+        first = f.load(f.given["work"], self.places["tangents"], base=POINTER)
+        with f.each(self.field(f, "directions")) as p:
+            for k, way in enumerate(self.ways):
+                f.given[way] = f.at(first, p * (len(self.ways) * self.tangents.size) + k * self.tangents.size)
+            yield p
+
+    def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
+        f.call(f"push_{x}", f.given["work"], scale, limited)
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        del lane
+        constants = self.address(f, "constants")
+        with self._each_direction(f) as p:
+            for way in self.ways:
+                for name, to, count in (
+                    ("numbers", "numbers", self.code.number_count),
+                    ("q", "state q", self.n),
+                    ("v", "state v", self.n),
+                ):
+                    start = self.member_address(f, f"{way}{name}", member) if way in GIVEN else None
+                    with f.each(count) as i:
+                        self.put_entry(f, to, i, f.load(start, p * count + i) if start else f.const(0.0), way)
+            changes = [f.at(f.given[way], self.tangents[x]) for x in ("numbers", "constants") for way in self.ways]
+            f.call(PROLOGUE[self.mode], self.member_address(f, "numbers", member), constants, *changes)
+
+    def _finish_closing(self, f: Function, member: Value):
+        directions = self.field(f, "directions")
+        with self._each_direction(f) as p:
+            to = self.result_address(f, "dstate", member * directions + p, 2 * self.n)
+            for k, x in enumerate("qv"):
+                with f.each(self.n) as i:
+                    f.store(self.entry(f, f"state {x}", i, self.ways[-1]), to, i + k * self.n)
+
+    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+        size = self.field(f, "directions") * (len(self.ways) * self.tangents.size)
+        block, start = self.allocate(f, size)
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.places["tangents"], base=POINTER)
+        return [block]
+
+
+class ClosingTwice(ClosingForward):
+    """Closing along pairs of directions, with its second derivatives.
+
+    Those of corrections are taken by elimination, which agrees with the least-norm solution wherever rows do not contradict each
+    other; so they are to first order.
+    """
+
+    mode = TWICE
+    ways = WAYS
+    further = 2
+
+    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+        super().__init__(code, vector, active)
+        self._eliminated = {x: ProgramDerivative(self, f"newton_{x}", "eliminated") for x in self.corrections}
+        self.places.add("linearization", max(x.stored for x in self._eliminated.values()))
+
+    def _write_correction(self, x: str):
+        self._eliminated[x].evaluation()
+        self._eliminated[x].forward()
+
+    def _linearize(self, f: Function, x: str) -> Value:
+        known = self.address(f, "linearization")
+        f.call(f"eliminated_newton_{x}", f.given["work"], f.given["work"], known)
+        self._evaluate(f, x)
+        return known
+
+    def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
+        (one, other, _), (a, b, _) = ([found[way] for way in self.ways] for found in (steps, shares))
+        moved = super()._limited(steps, shares, step)
+        return moved | {"de": moved["de"] - a * other - b * one + (a * b * 2.0) * step}
+
+
+class ClosingReverse(ClosingDerivative):
+    """Closing, and back: its corrections are recorded and walked back from a cotangent of the state."""
+
+    mode = REVERSE
+    inputs = ("statebar",)
+    outputs = ("numbersbar", "qbar", "vbar")
+
+    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+        super().__init__(code, vector, active)
+        n, most, p = self.n, CLOSURE_ITERATIONS + 1 + VELOCITIES, self.places
+        self.row = 3 + 2 * n  # of the record: what was corrected, scale, whether it was limited, q and v before
+        p.add("record", most * self.row)
+        p.add("records")
+        for name, count in {
+            "total bar constants": self.constants,
+            "bar constants": self.constants,
+            "numbersbar": code.number_count,
+        }.items():
+            p.add(name, count)
+        for name in ("bar iterate q", "bar iterate v", "bar state q", "bar state v", "bar result q", "bar result v"):
+            p.add(name, n)
+
+    def write_derivatives(self):
+        write_prologue_derivative(self, self.active, REVERSE)
+        for x, correction in self.corrections.items():
+            correction.write_adjoint()
+            correction.reverse()
+            self._write_pull(x)
+
+    def _write_pull(self, x: str):
+        """Write pull_x(work, scale, limited): from `bar iterate` behind a correction, made at the state, to that before."""
+        f, _ = self.function(f"pull_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
+        self._evaluate(f, x)
+        self.corrections[x].prepare_derivative(f)
+        longest, which = self._longest(f, x)
+        along = f.variable(0.0)
+        with f.each(self.n) as i:
+            bar = f.given["scale"] * self.entry(f, f"bar iterate {x}", i)
+            along.value = f.fma(bar, self.change(f, x, i), along.value)
+            self.put_entry(f, f"bar result {x}", i, bar)
+        with f.if_((f.given["limited"] > 0.5) & (longest > 0.0)):
+            self._increase(f, f"bar result {x}", which, -(along.value / self.change(f, x, which)))
+        with f.each(self.n) as i:
+            self._increase(f, f"bar iterate {x}", i, -self.entry(f, f"bar result {x}", i))
+        f.call(f"reverse_newton_{x}", f.given["work"], self.address(f, "correction"), f.given["work"])
+        self._accumulate(f)
+
+    def _accumulate(self, f: Function):
+        """Add the cotangents that a correction's derivative has left in `bar state`."""
+        with f.each(self.constants) as i:
+            self._increase(f, "total bar constants", i, self.entry(f, "bar constants", i))
+        with f.each(self.n) as i:
+            for x in "qv":
+                self._increase(f, f"bar iterate {x}", i, self.entry(f, f"bar state {x}", i))
+
+    def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
+        number = self.to_int(f, self.entry(f, "records", 0))
+        row = f.at(f.given["work"], number * self.row + self.places["record"])
+        for k, value in enumerate((f.const(float(CORRECTED.index(x))), scale, limited)):
+            f.store(value, row, k)
+        self.copy_lane(f, row, 3, "state q", f.const(0, INT))
+        self.copy_lane(f, row, 3 + self.n, "state v", f.const(0, INT))
+        self.put_entry(f, "records", 0, self.entry(f, "records", 0) + 1.0)
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        del lane
+        self.put_entry(f, "records", 0, f.const(0.0))
+        with f.each(self.constants) as i:
+            self.put_entry(f, "total bar constants", i, f.const(0.0))
+        bars = self.member_address(f, "statebar", member)
+        for k, x in enumerate("qv"):
+            with f.each(self.n) as i:
+                self.put_entry(f, f"bar iterate {x}", i, f.load(bars, i + k * self.n))
+
+    def _finish_closing(self, f: Function, member: Value):
+        def left() -> Value:
+            return self.entry(f, "records", 0) > 0.5
+
+        with f.while_(left):
+            self.put_entry(f, "records", 0, self.entry(f, "records", 0) - 1.0)
+            row = f.at(f.given["work"], self.to_int(f, self.entry(f, "records", 0)) * self.row + self.places["record"])
+            for k, x in enumerate("qv"):
+                with f.each(self.n) as i:
+                    self.put_entry(f, f"state {x}", i, f.load(row, i + (3 + k * self.n)))
+
+            def pull(name: str) -> Callable[[], None]:
+                return lambda: f.call(name, f.given["work"], f.load(row, 1), f.load(row, 2))
+
+            f.choose(f.load(row, 0) > 0.5, pull("pull_v"), pull("pull_q"))
+        constants, bars, to = (self.address(f, x) for x in ("constants", "total bar constants", "numbersbar"))
+        f.call(PROLOGUE[REVERSE], self.member_address(f, "numbers", member), constants, bars, to)
+        for name, place, count in (
+            ("numbersbar", "numbersbar", self.code.number_count),
+            ("qbar", "bar iterate q", self.n),
+            ("vbar", "bar iterate v", self.n),
+        ):
+            to = self.result_address(f, name, member, count)
+            with f.each(count) as i:
+                f.store(self.entry(f, place, i), to, i)

@@ -1,0 +1,1 @@
+"""Derivatives of runs: tangents in forward mode, and walking back along a record in reverse mode."""

@@ -1,0 +1,292 @@
+"""Derivatives of a trajectory in reverse mode: the recorded steps (record.py) are walked back.
+
+A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are collected
+from the last to the first: those of an output go through its projection and through the interpolation to the four points that it
+lies on; those of a point through its accelerations and its projection to the end of the step that led there, and through the sums
+
+    q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
+
+of its stages, the last first, to the point before. The stages are evaluated again on the way, with what the derivatives need to
+know of them; the transposed programs are those of expressions/differential.py.
+
+Members walk back side by side, in lanes; the next ones follow when all are back.
+"""
+
+from collections.abc import Sequence
+
+from udkjax.equations.differentiable_programs import REVERSE
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
+from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.base.samples import ARGUMENTS, count_breakpoints, numbers_of_row
+from udkjax.native.base.steps import DONE, POINTS
+from udkjax.native.derivatives.record import Recorded
+from udkjax.native.run.dense_output import write_differences_back
+from udkjax.native.run.runge_kutta import stage_state
+
+
+class Reverse(Recorded):
+    """A trajectory that is walked back, with cotangents of its outputs and its end; or not, where these have no members."""
+
+    inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
+    outputs = ("numbersbar", "qbar", "vbar", "record")
+    mode = REVERSE
+
+    def __init__(self, plan: Plan, active: tuple[bool, ...]):
+        super().__init__(plan, active)
+        if plan.sampled:
+            self.outputs = (*self.outputs[:-1], "samplesbar", self.outputs[-1])
+        p, n = self.places, self.n
+        for name in ("before", "any"):
+            p.add(name)
+        p.add("total bar constants", self.count)
+        p.add("bar constants", self.count)
+        for name in ("bar state q", "bar state v", "bar result q", "bar result v"):
+            p.add(name, n)
+        for k in range(POINTS):
+            for x in "qva":
+                p.add(f"bar point{k} {x}", n)
+        for j in range(plan.method.stages):
+            p.add(f"bar stage{j} a", n)
+        for k in range(3 * POINTS):
+            p.add(f"bar difference{k}", n)
+
+    def write_derivatives(self):
+        for each in self._linearizations:
+            each.reverse()
+        if self.count:
+            write_prologue_derivative(self, self.active, REVERSE)
+        write_differences_back(self)
+        self._write_step_back()
+        self._write_leave_row()
+        if self.plan.sampled:
+            self._write_find_rows()
+        self._write_backpropagate()
+
+    # --- the way back
+
+    def _accumulate_constants(self, f: Function, mask: Value):
+        """Add the cotangents of the constants that a program has found to those of lanes in question."""
+        with f.each(self.count) as i:
+            total, more = (self.entry(f, name, i) for name in ("total bar constants", "bar constants"))
+            self.put_entry(f, "total bar constants", i, f.select(mask, total + more, total))
+
+    def _pull_projection(self, f: Function, mask: Value):
+        """Pull `bar result` through the projection that led to the state, which has been evaluated, to `bar state`."""
+        if self.of_projection:
+            f.call("reverse_projection", f.given["work"], self.address(f, "projection linearization"), f.given["work"])
+            self._accumulate_constants(f, mask)
+        else:
+            with f.each(self.rowcount) as r:
+                for x in "qv":
+                    self.put(f, f"bar state {x}", r, self.vector(f, f"bar result {x}", r))
+
+    def _pull_accelerations(self, f: Function, stored: str, bar: str, mask: Value):
+        """Pull cotangents of accelerations through the equations at the state, to `bar state`."""
+        f.call("reverse", f.given["work"], self.address(f, stored), self.address(f, bar))
+        self._accumulate_constants(f, mask)
+
+    def _write_step_back(self):
+        """Write `step_back`: from the cotangents of point 3 to those of point 2, of lanes that are not yet back (`at`)."""
+        f, s = self.function("step_back")
+        active = s.at > 0.5
+        step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
+        h, last = self.broadcast(f, step), self.last
+        stages = range(1, last)
+        steps = f.any_of(active & (s.begin < 0.5))  # where runs only begin there are no stages
+        with f.if_(steps):
+            for i in stages:
+                stage_state(self, f, s, i, "point2", step)
+                self.evaluate_stage(f, i)
+        setattr(s, "state t", s.point3_t)
+        with f.each(self.rowcount) as r:
+            for x in "qv":
+                self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
+        self._evaluate_end(f)
+        self._pull_accelerations(f, f"stage{last} linearization", "bar point3 a", active)
+        with f.each(self.rowcount) as r:
+            for x in "qv":
+                self.put(f, f"bar result {x}", r, self.vector(f, f"bar point3 {x}", r) + self.vector(f, f"bar state {x}", r))
+        self._pull_projection(f, active)
+        self._accumulate_stage(f, h, last, range(last), active, first=True)
+        with f.if_(steps):
+            for i in reversed(stages):
+                stage_state(self, f, s, i, "point2", step)
+                self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", active)
+                self._accumulate_stage(f, h, i, range(i), active)
+        with f.each(self.rowcount) as r:
+            old = self.vector(f, "bar point2 a", r)
+            self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))
+
+    def _accumulate_stage(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
+        """Add `bar state` of stage i to the cotangents of the point before and of the stages that it is made of."""
+        method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
+        with f.each(self.rowcount) as r:
+            of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
+            hq = h * of_q
+            for x, more in (("q", of_q), ("v", f.fma(hq, float(method.nodes[i]), of_v))):
+                old = self.vector(f, f"bar point2 {x}", r)
+                self.put(f, f"bar point2 {x}", r, f.select(active, old + more, old))
+            hhq, hv = h * hq, h * of_v
+            for j in stages:
+                a2, a = float(method.q[i][j]), float(method.v[i][j])
+                total = zero if first else self.vector(f, f"bar stage{j} a", r)
+                total = f.fma(hhq, a2, total) if a2 else total
+                total = f.fma(hv, a, total) if a else total
+                if first or a2 or a:
+                    self.put(f, f"bar stage{j} a", r, total)
+
+    def _write_backpropagate(self):
+        """Walk back all members that are `ready`, and write the cotangents of what they began with."""
+        f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
+        call, yes = f.given["call"], f.const(1.0, DOUBLE, f.width)
+        self._begin_walk(f, s)
+
+        def due() -> Value:
+            s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
+            return f.any_of(s.due > 0.5)
+
+        with f.while_(lambda: f.any_of(s.at > 0.5)):
+            if self.plan.sampled:
+                f.call("find_rows", f.given["work"], call)
+            s.any = f.const(0.0, DOUBLE, f.width)
+            with f.while_(due):
+                s.any = yes
+                self._pull_output(f, s)
+            with f.if_(f.any_of(s.any > 0.5)):
+                f.call("differences_back", f.given["work"])
+            f.call("step_back", f.given["work"])
+            self._move_back(f, s)
+        # The remaining cotangent is that of the first state as it was given, which is the first output, too.
+        with self.each_lane(f, s.ready > 0.5) as k:
+            self._add_output(f, k, f.const(0, INT), "bar point3")
+            for x in "qv":
+                self.copy_lane(f, self._result(f, f"{x}bar", k, self.n), 0, f"bar point3 {x}", k)
+            if self.count:
+                f.call("leave_row", f.given["work"], call, k)
+            self.free_record(f, k)
+        s.ready = f.const(0.0, DOUBLE, f.width)
+
+    def _add_state(self, f: Function, k: Value, bars: Value, to: str):
+        """Add cotangents of a state at an address to arrays of lane k."""
+        for x, offset in (("q", 0), ("v", self.n)):
+            with f.each(self.n) as i:
+                self.put_lane_entry(f, f"{to} {x}", k, self.lane_entry(f, f"{to} {x}", k, i) + f.load(bars, i + offset), i)
+
+    def _add_output(self, f: Function, k: Value, number: Value, to: str):
+        """Add the cotangents of an output of the member in lane k to arrays of that lane."""
+        start = self.member_address(f, "ysbar", self.lane_entry(f, "member", k))
+        self._add_state(f, k, f.at(start, number * (2 * self.n)), to)
+
+    def _begin_walk(self, f: Function, s: Lane):
+        """Clear all cotangents, and load the last points of the members that are `ready`, with the cotangents of their ends."""
+        n, times = self.n, self.field(f, "times")
+        s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
+        zeros = [f"bar point{k} {x}" for k in range(POINTS) for x in "qva"] + [f"bar difference{k}" for k in range(3 * POINTS)]
+        for names, length in ((zeros, n), (["total bar constants"], self.count)):
+            with f.each(length) as i:
+                for name in names:
+                    self.put_entry(f, name, i, 0.0)
+        with self.each_lane(f, s.ready > 0.5) as k:
+            self._add_state(f, k, self.member_address(f, "endbar", self.lane_entry(f, "member", k)), "bar point3")
+            with f.if_(self.lane_entry(f, "code", k).is_(float(DONE))):
+                self._add_output(f, k, times - 1, "bar point3")
+            for j in range(POINTS):
+                self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
+            self._load_head(f, k)
+        cleared = [("numbersbar", f.const(self.code.number_count, INT))]
+        if self.plan.sampled:
+            cleared.append(("samplesbar", (self.field(f, "knots") + 1) * len(self.plan.sampled)))
+        with self.each_lane(f, s.ready > 0.5) as k:
+            for name, length in cleared:
+                to = self._result(f, name, k, length)
+                with f.each(length) as i:
+                    f.store(0.0, to, i)
+
+    def _pull_output(self, f: Function, s: Lane):
+        """Pull the cotangents of the outputs that are `due` through projection and interpolation, to `bar difference`.
+
+        q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the differences N_k and the products pi_k of differences of times.
+        """
+        n, mask = self.n, s.due > 0.5
+        with f.each(n) as i:
+            for x in "qv":
+                self.put_entry(f, f"bar result {x}", i, 0.0)
+        with self.each_lane(f, mask) as k:
+            number, member = self.to_int(f, self.lane_entry(f, "written", k)), self.lane_entry(f, "member", k)
+            self.put_lane_entry(f, "next", k, self.input_number(f, "ts", member, number))
+            self._add_output(f, k, number, "bar result")
+            for x in "qv":
+                state = f.at(self.member_address(f, f"given {x}s", member), number * n)
+                with f.each(n) as i:
+                    self.put_lane_entry(f, f"state {x}", k, f.load(state, i), i)
+        setattr(s, "state t", s.next)
+        self._evaluate_projection(f)
+        self._pull_projection(f, mask)
+        ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+        with f.each(self.rowcount) as r:
+            of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
+            product, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
+            for k in range(3 * POINTS):
+                old = self.vector(f, f"bar difference{k}", r)
+                new = f.fma(product, of_q, f.fma(slope, of_v, old))
+                self.put(f, f"bar difference{k}", r, f.select(mask, new, old))
+                slope = f.fma(slope, ahead[k // 3], product)
+                product = product * ahead[k // 3]
+        s.where(mask, written=s.written - 1.0)
+
+    def _move_back(self, f: Function, s: Lane):
+        """Shift points and their cotangents by one, and load the point that comes in at the other end."""
+        active, zero = s.at > 0.5, f.const(0.0, DOUBLE, self.plan.vector)
+        with f.each(self.rowcount) as r:
+            for name in ("bar point", "point"):
+                for k in reversed(range(0 if name == "bar point" else 1, POINTS)):
+                    for x in "qva":
+                        new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
+                        self.put(f, f"{name}{k} {x}", r, f.select(active, new, self.vector(f, f"{name}{k} {x}", r)))
+        for k in reversed(range(1, POINTS)):
+            s.where(active, **{f"point{k}_t": getattr(s, f"point{k - 1}_t")})
+        s.where(active, at=s.at - 1.0)
+        with self.each_lane(f, active) as k:
+            self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1), "point0")
+            self._load_head(f, k)
+
+    def _write_find_rows(self):
+        """`find_rows(work, call)`: the rows of samples that hold where lanes are, each with its constants."""
+        f, s = self.function("find_rows", ARGUMENTS[:2])
+        work, call = f.given["work"], f.given["call"]
+        with self.each_lane(f, s.at > 0.5) as k:
+            knot = count_breakpoints(self, f, self.to_int(f, self.lane_entry(f, "member", k)), self.lane_entry(f, "point3_t", k))
+            self.put_lane_entry(f, "knot", k, knot)
+            with f.if_(self.lane_entry(f, "knot", k).is_not(self.lane_entry(f, "row", k))):
+                if self.count:
+                    f.call("leave_row", work, call, k)
+                f.call("enter", work, call, k)
+
+    def _write_leave_row(self):
+        """`leave_row(work, call, lane)`: the cotangents of a lane's constants, to those of the numbers and of the samples."""
+        if not self.count:
+            return
+        f, _ = self.function("leave_row", ARGUMENTS)
+        k, count = f.given["lane"], self.code.number_count
+        constants, bars, found = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count))
+        self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
+        self.copy_lane(f, bars, 0, "total bar constants", k, count=self.count)
+        member, row = self.to_int(f, self.lane_entry(f, "member", k)), self.lane_entry(f, "row", k)
+        sampled = self.plan.sampled
+        numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, "numbers", member)
+        f.call(PROLOGUE[REVERSE], numbers, constants, bars, found)
+        if sampled:
+            rows = (self.field(f, "knots") + 1) * len(sampled)
+            to = f.at(self._result(f, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))
+            for column, place in self.active_samples.items():
+                f.store(f.load(to, column) + f.load(found, place), to, column)
+        to = self._result(f, "numbersbar", k, count)
+        with f.each(count) as i:
+            f.store(f.load(to, i) + f.load(found, i), to, i)
+        with f.each(self.count) as i:
+            self.put_lane_entry(f, "total bar constants", k, 0.0, i)
+
+    def _result(self, f: Function, name: str, k: Value, length: Operand) -> Value:
+        """Return the address of an output of the member in lane k, of `length` numbers for each member."""
+        return self.result_address(f, name, self.to_int(f, self.lane_entry(f, "member", k)), length)

@@ -1,0 +1,144 @@
+"""The record of a trajectory, from which reverse mode walks back: its accepted states, and what led to each of them.
+
+A first call of the code runs, and leaves the record of each member among its outputs. A second one, with cotangents, is given the
+record and walks back at once; a member whose record was too long for its place is run again.
+"""
+
+from collections.abc import Callable
+
+from udkjax.native.base.ir import POINTER, Function, Value
+from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.derivatives.differentiated import Differentiated
+
+FIRST = 32  # points that a record has room for while a member runs, before it grows
+STORED = 200  # points up to which a record is given to the second call: as much memory as 300 outputs
+PER_BREAKPOINT = 3  # further points for each breakpoint: where a run begins anew, and two steps
+TITLE = 3  # numbers of a record before its points: how many points, how the run ended, how many outputs it wrote
+HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
+
+
+def record_length(n: int, points: int) -> int:
+    """Return the length of the record of a member, of n coordinates and so many points."""
+    return TITLE + points * (HEAD + 3 * n)
+
+
+class Recorded(Differentiated):
+    """A trajectory that leaves a record, or walks back from one."""
+
+    lengths = ("given record", "record")
+
+    def __init__(self, plan: Plan, active: tuple[bool, ...]):
+        super().__init__(plan, active)
+        for name in ("record", "capacity", "points", "at", "ready", "given"):
+            self.places.add(name)
+        self.row = HEAD + 3 * self.n
+
+    def walks_back(self, f: Function) -> Value:
+        """Return whether there are cotangents."""
+        return self.field(f, "directions") > 0
+
+    def _leaves_record(self, f: Function) -> Value:
+        return self.field(f, "record length") > 0
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        self.put_lane_entry(f, "given", lane, 0.0)
+        with f.if_(self.field(f, "given record length") > 0):
+            given = self.member_address(f, "given record", member)
+            with f.if_(f.load(given) > 0.0):
+                for k, name in enumerate(("points", "code", "written")):
+                    self.put_lane_entry(f, name, lane, f.load(given, k))
+                self.put_lane_entry(f, "record", lane, f.at(given, TITLE), base=POINTER)
+                for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
+                    self.put_lane_entry(f, name, lane, x)
+        with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.walks_back(f) | self._leaves_record(f))):
+            self._new_record(f, lane)
+
+    def record_step(self, f: Function, s: Lane, accept: Value):
+        with f.if_(self.walks_back(f) | self._leaves_record(f)), self.each_lane(f, accept) as k:
+            self._store_point(f, s, k)
+
+    def end_members(self, f: Function, s: Lane):
+        with f.if_(self.walks_back(f)):
+            s.where(s.due > 0.5, ready=1.0)
+        with f.if_(self._leaves_record(f)), self.each_lane(f, s.due) as k:
+            self._leave_record(f, k)
+
+    def _leave_record(self, f: Function, k: Value):
+        """Write the record of lane k, or none where it is too long: no points."""
+        length = self.field(f, "record length")
+        to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
+        points, record = self.lane_entry(f, "points", k), self._record(f, k)
+        count = self.to_int(f, points) * self.row
+        fits = count + TITLE <= length
+        for j, x in enumerate((f.select(fits, points, 0.0), self.lane_entry(f, "code", k), self.lane_entry(f, "written", k))):
+            f.store(x, to, j)
+        with f.if_(fits), f.each(count) as i:
+            f.store(f.load(record, i), to, i + TITLE)
+        f.line(f"call void @free(ptr {record.name})")
+
+    def free_record(self, f: Function, k: Value):
+        """Free the memory of lane k's record."""
+        with f.if_(self.lane_entry(f, "given", k) < 0.5):
+            f.line(f"call void @free(ptr {self._record(f, k).name})")
+
+    # --- which members are next
+
+    def goes_on(self, f: Function, s: Lane) -> Value:
+        return f.any_of(s.active > 0.5) | f.any_of(s.ready > 0.5)
+
+    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        with f.if_(~self.walks_back(f)):
+            fill()
+
+    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Walk back with the members in the lanes side by side when all have run; the next ones follow."""
+        with f.if_(f.any_of(s.active > 0.5)):
+            super().step_all(f, s, fill)
+        with f.if_(self.walks_back(f) & ~f.any_of(s.active > 0.5)):
+            f.call("walk", f.given["work"], f.given["call"])
+            fill()
+
+    # --- its points
+
+    def _new_record(self, f: Function, lane: Value):
+        s = Lane(f, self.places)
+        record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
+        self.put_lane_entry(f, "record", lane, record, base=POINTER)
+        self.put_lane_entry(f, "capacity", lane, float(FIRST))
+        self.put_lane_entry(f, "points", lane, 0.0)
+        self._store_point(f, s, lane)
+
+    def _record(self, f: Function, k: Value) -> Value:
+        """Return the address of the record of lane k."""
+        return self.lane_entry(f, "record", k, base=POINTER)
+
+    def _store_point(self, f: Function, s: Lane, k: Value):
+        """Append point 3 to the record of lane k."""
+        points, capacity = self.lane_entry(f, "points", k), self.lane_entry(f, "capacity", k)
+        with f.if_(points >= capacity):
+            self.put_lane_entry(f, "capacity", k, capacity * 2.0)
+            size = self.to_int(f, capacity * 2.0) * (self.row * 8)
+            old = self._record(f, k)
+            new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
+            f.declared.add("declare ptr @realloc(ptr, i64)")
+            self.put_lane_entry(f, "record", k, new, base=POINTER)
+        row = f.at(self._record(f, k), self.to_int(f, points) * self.row)
+        for j, name in enumerate(("point3_t", "written", "begin")):
+            f.store(self.lane_entry(f, name, k), row, j)
+        for j, x in enumerate("qva"):
+            self.copy_lane(f, row, HEAD + j * self.n, f"point3 {x}", k)
+        self.put_lane_entry(f, "points", k, points + 1.0)
+
+    def _load_point(self, f: Function, k: Value, number: Value, point: str):
+        """Load a point of lane k from its record; before the first one there is the first."""
+        row = f.at(self._record(f, k), self.to_int(f, f.max(number, 0.0)) * self.row)
+        self.put_lane_entry(f, f"{point}_t", k, f.load(row, 0))
+        for j, x in enumerate("qva"):
+            with f.each(self.n) as i:
+                self.put_lane_entry(f, f"{point} {x}", k, f.load(row, i + (HEAD + j * self.n)), i)
+
+    def _load_head(self, f: Function, k: Value):
+        """Load the head of lane k's point: outputs written `before` its step, and `begin`."""
+        row = f.at(self._record(f, k), self.to_int(f, self.lane_entry(f, "at", k)) * self.row)
+        self.put_lane_entry(f, "before", k, f.load(row, 1))
+        self.put_lane_entry(f, "begin", k, f.load(row, 2))

@@ -1,0 +1,287 @@
+"""Derivatives of a trajectory in forward mode: along directions, in the same code, step by step.
+
+Where a run goes is a function of the constants of a scene and of the initial state. Steps are taken as they are: no derivative is
+taken of their sizes. Along a direction, the states of the stages change by the same sums that they are made of,
+
+    dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
+
+and the accelerations, the end of a step and the outputs, which are projected, by the programs of their own derivatives
+(expressions/differential.py), with what those know of the state from its own evaluation. Interpolation is linear.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from udkjax.equations.differentiable_programs import FORWARD, TWICE
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import Lane, Layout, Plan
+from udkjax.native.base.program_derivative import GIVEN, WAYS
+from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.base.samples import row_address
+from udkjax.native.base.steps import POINTS
+from udkjax.native.derivatives.differentiated import Differentiated
+from udkjax.native.run.dense_output import write_between, write_differences
+
+
+class Forward(Differentiated):
+    """A trajectory with its changes along directions.
+
+    Directions come in groups, each with memory of its own, a `tangent`: one direction for all members, or, of a single member, as
+    many directions side by side as there are lanes. Where changes are taken along pairs of directions, a group has a tangent for
+    each of them and one for both, one behind the other.
+    """
+
+    accelerate_stage = Differentiated.evaluate_stage  # in each step, since its changes follow at once
+    mode = FORWARD
+    ways = ("d",)  # of the tangents of a direction: the changes that each holds, prefixes of inputs
+    outputs = ("dys", "dend")
+    directions_in = 1
+
+    def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
+        super().__init__(plan, active)
+        given = [way for way in self.ways if way in GIVEN]
+        names = [f"{way}samples" for way in given if plan.sampled] + [f"{way}{x}" for way in given for x in ("numbers", "q", "v")]
+        self.inputs = (*self.inputs, *names)
+        self.tangents = w = Layout(lanes, plan.vector)
+        self.group = lanes // plan.width  # directions of a tangent
+        w.add("constants", self.count)
+        for name in ("state q", "state v", "result q", "result v"):
+            w.add(name, self.n)
+        for k in range(POINTS):
+            for x in "qva":
+                w.add(f"point{k} {x}", self.n)
+        for i in range(1, plan.method.stages):
+            w.add(f"stage{i} a", self.n)
+        for k in range(3 * POINTS):
+            w.add(f"difference{k}", self.n)
+
+    def write_derivatives(self):
+        for each in self._linearizations:
+            each.forward()
+        if self.count:
+            write_prologue_derivative(self, self.active, self.mode)
+        w = self.tangents
+        write_differences(self, "tangent_differences", ("tangent", w))
+        write_between(self, "tangent_between", ("tangent", w))
+
+    @contextmanager
+    def _each_group(self, f: Function) -> Iterator[Value]:
+        """Run the block for every group of directions, with `tangent` where its memory is."""
+        with self._each_tangent(f, len(self.ways)) as p:
+            yield p
+
+    @contextmanager
+    def _each_tangent(self, f: Function, step: int = 1) -> Iterator[Value]:
+        """Run the block for every tangent of every group, or for the first of so many."""
+        first = f.load(f.given["work"], self.start("tangents", "work"), base=POINTER)
+        with f.each(self._groups(f) * (len(self.ways) // step)) as p:
+            f.given["tangent"] = f.at(first, p * (step * self.tangents.size * self.tangents.width))
+            yield p
+
+    @contextmanager
+    def _each_direction(self, f: Function, p: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
+        """Run the block for every direction of a group, of the member in a lane: its number, and its lane in a tangent."""
+        with f.each(self.group) as j:
+            direction = p * self.group + j
+            with f.if_(direction < self.field(f, "directions")):
+                yield direction, lane if self.group == 1 else j
+
+    def _way(self, f: Function, way: str) -> Value:
+        """Return the address of one of the tangents of a group."""
+        return f.at(f.given["tangent"], self.ways.index(way) * self.tangents.size * self.tangents.width)
+
+    def _groups(self, f: Function) -> Value:
+        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
+
+    def _along(self, f: Function, name: str, stored: str, out: Value | None = None):
+        tangent = f.given["tangent"]
+        f.call(name, f.given["work"], self.address(f, stored), tangent, out or tangent)
+
+    def _project_tangent(self, f: Function):
+        """Compute `result` of a tangent: its `state` once projected, at the state, which is on the manifold."""
+        if self.of_projection:
+            self._along(f, f"{self.mode}_projection", "projection linearization")
+        else:
+            group = f.given["tangent"]
+            for way in self.ways:
+                f.given["tangent"] = f.at(group, self.ways.index(way) * self.tangents.size * self.tangents.width)
+                with f.each(self.registers("tangent")) as r:
+                    for x in "qv":
+                        self.put(f, f"result {x}", r, self.vector(f, f"state {x}", r, "tangent"), "tangent")
+            f.given["tangent"] = group
+
+    def record_stage(self, f: Function, s: Lane, i: int):
+        """Compute the changes of the stage's accelerations."""
+        h = self.broadcast(f, s.step)
+        with self._each_tangent(f):
+            self._change_stage(f, i, h, "point3")
+        with self._each_group(f):
+            self._along(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
+
+    def record_step(self, f: Function, s: Lane, accept: Value):
+        with f.if_(f.any_of(accept)):
+            self._change_end(f, s, accept)
+
+    def _change_end(self, f: Function, s: Lane, accept: Value):
+        """Compute the changes of point 3, from those of point 2, where the step began."""
+        step = f.select(s.begin > 0.5, 0.0, s.t1 - s.point2_t)
+        h, begin = self.broadcast(f, step), s.begin > 0.5
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
+            for k in range(POINTS - 1):
+                for x in "qva":
+                    mine, other = (self.vector(f, f"point{j} {x}", r, "tangent") for j in (k, k + 1))
+                    self.put(f, f"point{k} {x}", r, f.select(accept, other, mine), "tangent")
+        setattr(s, "state t", s.point3_t)
+        with f.each(self.rowcount) as r:
+            for x in "qv":
+                self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
+        self._evaluate_end(f)
+        with self._each_tangent(f):
+            self._change_stage(f, self.last, h, "point2")
+            with f.each(self.registers("tangent")) as r:
+                for x in "qv":
+                    new = f.select(begin, self.vector(f, f"point2 {x}", r, "tangent"), self.vector(f, f"state {x}", r, "tangent"))
+                    self.put(f, f"state {x}", r, new, "tangent")
+        self._project_end(f, begin)
+        with self._each_group(f):
+            self._along(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
+            for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
+                old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
+                self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
+
+    def _project_end(self, f: Function, begin: Value):
+        """Project the changes of the state at the end of a step."""
+        del begin
+        with self._each_group(f):
+            self._project_tangent(f)
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
+            for x in "qv":
+                self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
+
+    def _change_stage(self, f: Function, i: int, h: Value, start: str):
+        """Compute the change of the state of stage i in a tangent, of the step from a point."""
+        node, names = float(self.method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
+        with f.each(self.registers("tangent")) as r:
+            q, v = self.vector(f, f"{start} q", r, "tangent"), self.vector(f, f"{start} v", r, "tangent")
+            sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "tangent") for row in (self.method.q, self.method.v))
+            slope = v * node if sum_q is None else f.fma(h, sum_q, v * node)
+            self.put(f, "state q", r, f.fma(h, slope, q), "tangent")
+            self.put(f, "state v", r, v if sum_v is None else f.fma(h, sum_v, v), "tangent")
+
+    def _tangent_address(self, f: Function, name: str) -> Value:
+        return f.at(f.given["tangent"], self.start(name, "tangent"))
+
+    def record_output(self, f: Function, s: Lane):
+        with f.each(self.rowcount) as r:
+            self.put(f, "state v", r, self.vector(f, "result v", r))  # the programs look for states there
+        self._evaluate_projection(f)
+        with self._each_tangent(f):
+            f.call("tangent_differences", f.given["work"], f.given["tangent"])
+            f.call("tangent_between", f.given["work"], f.given["tangent"])
+        with self._each_group(f) as p:
+            self._project_tangent(f)
+            f.given["tangent"] = self._way(f, self.ways[-1])
+            with self.each_lane(f, s.due) as k:
+                self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "result q", "result v")
+
+    def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
+        """Write the changes of a state of the member in lane k along the directions of group p, of the last tangent of each."""
+        member, times = self.to_int(f, f.lane(s.member, k)), self.field(f, "times")
+        with self._each_direction(f, p, k) as (direction, lane):
+            row = (member * self.field(f, "directions") + direction) * times + number
+            to = self.result_address(f, "dys", row, 2 * self.n)
+            self.copy_lane(f, to, 0, q, lane, "tangent")
+            self.copy_lane(f, to, self.n, v, lane, "tangent")
+
+    def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
+        """Compute the changes of the constants along all directions."""
+        if not self.count:
+            return
+        found = [Value(f, f.reserve(DOUBLE, self.count), POINTER) for _ in self.ways]
+        none = Value(f, f.reserve(DOUBLE, self.code.number_count), POINTER)  # along both of two directions numbers do not change
+        if len(self.ways) > 1:
+            with f.each(self.code.number_count) as i:
+                f.store(0.0, none, i)
+        with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, place):
+            given = [self._changes_of_numbers(f, way, member, direction) if way in GIVEN else none for way in self.ways]
+            f.call(PROLOGUE[self.mode], numbers, constants, *given, *found)
+            for way, changes in zip(self.ways, found, strict=True):
+                with f.each(self.count) as i:
+                    f.store(f.load(changes, i), self._way(f, way), place + self.place("constants", i, "tangent"))
+
+    def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
+        """Return the address of the changes of a member's numbers along a direction; of samples, those of their row."""
+        count = self.code.number_count
+        given = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
+        places = self.active_samples
+        if not places:
+            return given
+        copy = Value(f, f.reserve(DOUBLE, count), POINTER)
+        with f.each(count) as i:
+            f.store(f.load(given, i), copy, i)
+        rows, row = self.field(f, "knots") + 1, self.lane_entry(f, "row", f.given["lane"])
+        samples = f.at(row_address(self, f, f"{way}samples", member, row), direction * rows * len(self.plan.sampled))
+        for k, place in places.items():
+            f.store(f.load(samples, k), copy, place)
+        return copy
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, place):
+            for way in self.ways:
+                tangent = self._way(f, way)
+                self._read_state(f, way, member, direction, tangent, place, [f"point{k}" for k in range(POINTS)])
+                with f.each(self.n) as i:
+                    for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.last))):
+                        f.store(0.0, tangent, place + self.place(name, i, "tangent"))
+
+    def _read_state(
+        self, f: Function, way: str, member: Value, direction: Value, tangent: Value, place: Value, to: Sequence[str]
+    ):
+        """Read the change of the first state of a member along a direction, into a lane of arrays of a tangent."""
+        for x in "qv":
+            start = self.member_address(f, f"{way}{x}", member) if way in GIVEN else None
+            with f.each(self.n) as i:
+                change = f.load(start, direction * self.n + i) if start else f.const(0.0)
+                for array in to:
+                    f.store(change, tangent, place + self.place(f"{array} {x}", i, "tangent"))
+
+    def end_members(self, f: Function, s: Lane):
+        """Write the changes of the first state, which is taken as it is given, and of the last."""
+        way, times = self.ways[-1], self.field(f, "times")
+        with self._each_group(f) as p, self.each_lane(f, s.due) as k:
+            f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))
+            with self._each_direction(f, p, k) as (direction, lane):
+                self._read_state(f, way, member, direction, f.given["tangent"], lane, ["state"])
+                to = self.result_address(f, "dend", member * self.field(f, "directions") + direction, 2 * self.n)
+                self.copy_lane(f, to, 0, "point3 q", lane, "tangent")
+                self.copy_lane(f, to, self.n, "point3 v", lane, "tangent")
+            self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
+            self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
+
+    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+        """Memory for all directions."""
+        size = self._groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
+        block, start = self.allocate(f, size)
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
+        return [block]
+
+
+class ForwardTwice(Forward):
+    """A trajectory with its second derivatives along pairs of directions: the changes of its changes.
+
+    Of the sums of the stages, of the ends of steps and of outputs they are the same sums, and the programs of accelerations and
+    projections find them beside the changes along either direction.
+    """
+
+    mode = TWICE
+    ways = WAYS
+
+    def _project_end(self, f: Function, begin: Value):
+        # Newton's step from a state beside the manifold is right to first order, two are to second: only a first state may be
+        # moved off it.
+        super()._project_end(f, begin)
+        with f.if_(f.any_of(begin)):
+            super()._project_end(f, begin)

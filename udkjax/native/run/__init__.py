@@ -1,0 +1,1 @@
+"""Runs: steps of a Runge-Kutta method, their control, projection, dense output and fallback, for members in lanes."""

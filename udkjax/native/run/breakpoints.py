@@ -1,0 +1,68 @@
+"""The end of the next step: the end of the run, a breakpoint, or the time that was planned."""
+
+import numpy as np
+
+from udkjax.native.base.ir import DOUBLE, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
+
+
+def aim(module: Module, f: Function, s: Lane):
+    """`t1`, `step`, `begin`, `last` and `lands` of the next step of each lane (breakpoints.py)."""
+    where, yes = f.select, f.const(1.0, DOUBLE, f.width)
+    begin = (s.steps if module.plan.breaks else s.tried) < 0.0
+    t1 = s.point3_t + s.h
+    last = (t1 >= s.end - s.smallest) & ~begin
+    if not module.plan.breaks:
+        t1 = where(last, s.end, halve(f, s, t1, begin | last))
+        s.lands = f.const(0.0, DOUBLE, f.width)
+    else:
+        start = s.point3_t
+        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), start
+        next_breakpoint(module, f, s, start)
+        end = s.t1
+        crossing = s.crossing if module.pieces else f.const(np.inf, DOUBLE, f.width)
+        stop = f.min(end, crossing)
+        rest = f.min(stop, s.end) - start
+        parts = f.max(float(POINTS - 1) - s.steps, 1.0)
+        share = start + rest / parts
+        several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
+        several = several & (s.next < stop - s.smallest)  # for the sake of outputs in between
+        if module.pieces:
+            several = several & s.aim.is_not(float(AIM_ACROSS))
+        t1 = where(several, share, t1 if module.pieces else halve(f, s, t1, begin | last | several))
+        reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
+        last = last & ~reaches & ~several
+        final = s.end - f.max(s.end - end, 0.0)
+        t1 = where(reaches, stop, where(last, final, t1))
+        t1 = where(begin, s.behind, t1)
+        s.lands = where(reaches & (end <= crossing), yes, 0.0)
+    t1 = where(begin, s.behind if module.plan.breaks else s.point3_t, t1)
+    s.t1 = t1
+    s.step = where((s.stepping > 0.5) & ~begin, t1 - s.point3_t, 0.0)
+    s.begin = where(begin, yes, 0.0)
+    s.last = where(last, yes, 0.0)
+
+
+def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
+    """Return the end of a step: in the middle of what is left, where little would be left behind it."""
+    short = (s.end - t1 < s.h * SHORTEST_LAST) & ~otherwise
+    return f.select(short, s.point3_t + (s.end - s.point3_t) * 0.5, t1)
+
+
+def next_breakpoint(module: Module, f: Function, s: Lane, here: Value):
+    """Set t1 just before the next breakpoint, and behind just behind all of those that are here."""
+    work, call = f.given["work"], f.given["call"]
+    f.call("next_breakpoint", work, call)
+    with f.while_(lambda: f.any_of(s.due <= here + s.smallest)):
+        here_too = s.due <= here + s.smallest
+        s.where(here_too, knot=s.knot + 1.0, passed=s.due)
+        f.call("next_breakpoint", work, call)
+    s.t1 = s.due - s.smallest * ENDS_BEFORE
+    s.behind = f.max(s.passed + s.smallest * BEGINS_BEHIND, here)
+    if module.plan.sampled:
+        with f.each(f.width) as k:
+            stale = (s.active > 0.5) & s.row.is_not(s.knot)
+            with f.if_(f.lane(f.select(stale, f.const(1.0, DOUBLE, f.width), 0.0), k) > 0.5):
+                f.call("enter", work, call, k)

@@ -1,0 +1,169 @@
+"""The step controller: whether a step counts, and how long the next one is."""
+
+from typing import Any
+
+import numpy as np
+
+from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.power import power
+from udkjax.native.base.steps import (
+    DONE,
+    EXPECTED,
+    GAP,
+    GROW,
+    LOST,
+    LOST_TOL,
+    NEAREST_STAGE,
+    POINTS,
+    RESTART_FACTOR,
+    RETRIES,
+    RUNNING,
+    SAFETY,
+    SHRINK,
+    STEP_LIMIT,
+    STEP_TOO_SMALL,
+    SURE,
+)
+from udkjax.native.run.manifold import largest_violation, velocity_tolerance
+from udkjax.native.run.singular import is_clear, step_around, time_to_singularity
+
+
+def write_decide(module: Module):
+    """Accept or reject the step of lanes that are `stepping`, and choose the next one; `until`: outputs up to there are due."""
+    f, s = module.function("decide")
+    where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
+    stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
+    bad = stepping & ~(error < np.inf)
+    dodge, repeats, left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
+    if module.falls_back:
+        stepping, dodge, left = _retry_or_fall_back(module, f, s, bad)
+    else:
+        s.fallback_due = f.const(0.0, DOUBLE, f.width)
+    tried = where(stepping, s.tried + 1.0, s.tried)
+    if module.pieces:
+        s.again = where(stepping, yes, 0.0)
+        f.call("leave", f.given["work"])
+        repeats = s.again > 0.5
+    accept = stepping & (error < 1.0) & ~dodge & ~repeats
+    stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
+    factor, rate = _step_factor(module, f, s, accept, step)
+    h = where(stepping, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
+    h = where(repeats, s.h, h)
+    if module.falls_back:
+        h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, left, step, h), h)
+    s.behind = h
+    with f.if_(f.any_of(begun)):
+        s.behind = where(begun, first_step(module, f, s), s.behind)
+    h = s.behind
+    code = where(stepping & (h < s.smallest), f.const(STEP_TOO_SMALL, DOUBLE, f.width), s.code)
+    code = where(code.is_(float(RUNNING)) & stepping & (tried >= s.max_steps), STEP_LIMIT, code)
+    code = where(stepping & bad & begin & ~accept, where(code.is_(float(RUNNING)), STEP_TOO_SMALL, code), code)
+    code = where(accept & (s.last > 0.5), DONE, code)
+    lost = _accept_step(module, f, s, accept)
+    code = where((lost > 0.5) & code.is_(float(RUNNING)), LOST, code)
+    s.where(accept & stepped, rate=rate)
+    if module.plan.breaks:
+        h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
+        h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)
+        s.where(begun, rate=inf, distance0=inf, distance1=inf)
+        s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
+        s.where(accept & (s.lands > 0.5), steps=-1.0)
+    cost = where(begin, f.const(1.0, DOUBLE, f.width), float(module.method.stages))
+    cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
+    s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
+    s.until = _due_until(module, f, s, accept, stepping & begin)
+    s.where(accept, accepted=s.accepted + 1.0)
+
+
+def _retry_or_fall_back(module: Module, f: Function, s: Lane, bad: Value) -> tuple[Value, Value, Value]:
+    """Try a step that met a pivot too small to be trusted a little shorter, or leave it to the fallback.
+
+    Returns:
+        The lanes whose step counts, those that try it shorter, and the time that is left until the singular configuration.
+    """
+    where, stepping, fallback, error = f.select, s.stepping > 0.5, s.fallback > 0.5, s.error
+    fallback_due = bad & ~fallback
+    far_from_here = is_clear(module, f, s, s.distance2)
+    beside = stepping & ~fallback & (error < 1.0) & ~is_clear(module, f, s, s.distance) & (s.last < 0.5)
+    left = time_to_singularity(module, f, s)
+    past = (left > 0.0) & (left < s.h * SURE) & (s.distance * left > s.distance2 * EXPECTED * (s.h - left))
+    beside = beside & ~(past & (s.distance > NEAREST_STAGE))
+    dodge = (fallback_due | beside) & far_from_here & (s.retries < float(RETRIES)) & (s.begin < 0.5)
+    s.where(stepping, retries=where(dodge, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
+    fallback_due = fallback_due & ~dodge
+    s.fallback_due = where(fallback_due, f.const(1.0, DOUBLE, f.width), 0.0)
+    return stepping & ~fallback_due, dodge, left
+
+
+def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
+    """Return the next step over this one, and the error over the length to the power of the order."""
+    where, order, error = f.select, module.method.order, s.error
+    # Errors below the one that lets a step grow as far as it may count as that one: they may be rounding and say nothing.
+    size = where(f.is_finite(error), f.max(error, GROW ** -float(order)), 1e30)
+    rate = size / power(f, step, float(int(order)), whole=True)
+    foreseen = size * (rate / s.rate)  # the error of a step as long, where errors grow as they did (Gustafsson 1994)
+    steep = accept & (foreseen > 1.0)
+    factor = power(f, where(steep, foreseen, size), -1.0 / order) * SAFETY
+    factor = f.max(factor, where(accept & ~steep, f.const(1.0, DOUBLE, f.width), SHRINK))
+    return f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY)), rate
+
+
+def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
+    """Make the end of a step the latest point; return one in lanes in which that is off the constraint manifold."""
+    lost = f.variable(0.0)
+    with f.if_(f.any_of(accept)):
+        for k in range(POINTS - 1):
+            module.copy_point(f, accept, f"point{k + 1}", f"point{k}")
+            s.where(accept, **{f"point{k}_t": getattr(s, f"point{k + 1}_t")})
+        module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{POINTS - 1}")
+        s.where(accept, point3_t=s.t1)
+        s.where(accept, distance0=s.distance1)
+        s.where(accept, distance1=s.distance2)
+        s.where(accept, distance2=s.distance)
+        if module.m and module.plan.projected:
+            module.invoke(f, "psi")
+            is_lost = accept & (largest_violation(module, f) > LOST_TOL)
+            lost.value = f.select(is_lost, f.const(1.0, DOUBLE, f.width), 0.0)
+        if module.m:
+            s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))
+        module.record_step(f, s, accept)
+    return lost.value
+
+
+def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:
+    """Return the time up to which outputs are due."""
+    begin = s.begin > 0.5
+    ready = accept & ((s.accepted > 0.0) | (~begin & (s.last > 0.5)))
+    # The last step may end a little before a breakpoint at the end of the run: outputs there are due, too.
+    until = f.select(ready, f.select(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
+    if module.plan.breaks:
+        enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
+        until = f.select(enough, until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
+    return until
+
+
+def first_step(module: Module, f: Function, s: Lane) -> Value:
+    """Return the first step as given, or one over which the state changes by a hundredth of itself, or of its unit.
+
+    It is that of `first_step` of integrate/diffrax_engine.py.
+    """
+    rtol, atol, omega = (module.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
+
+    def relative(of_q: str, of_v: str, least: float) -> Any:
+        def both(r: Value) -> list[Value]:
+            per_unit, found = module.vector(f, "inverse unit", r), []
+            for name, y, per in ((of_q, "state q", per_unit), (of_v, "result v", per_unit / omega)):
+                floor = f.select(per > 0.0, f.const(least, DOUBLE, module.plan.vector), 0.0)  # none of what fills up a register
+                x = f.max(f.abs(module.vector(f, name, r)) * per, floor)
+                found.append(x / f.fma(rtol, f.abs(module.vector(f, y, r)) * per, atol))
+            return found
+
+        return both
+
+    size, rate = module.largest(f, relative("state q", "result v", 1.0)), module.largest(f, relative("result v", "result a", 0.0))
+    span = s.end - s.start
+    ordinary = f.is_finite(rate) & (rate > 0.0)
+    chosen = f.select(ordinary, f.min(size / f.select(ordinary, rate, 1.0) * 0.01, span), span * 1e-4)
+    return f.select(s.first > 0.0, f.min(s.first, span), chosen)

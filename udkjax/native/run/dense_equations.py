@@ -1,0 +1,113 @@
+"""The equations of a scene solved by a dense pseudoinverse of all rows, in place of elimination.
+
+With D = W Psi_q M^(-1/2), W the weights of the rows, and a method of pseudoinverses/,
+
+    a = a_F + M^(-1/2) D^+ W b,        q - M^(-1/2) D^+ W Psi,        v - M^(-1/2) D^+ W Psi_dot,
+
+and the part of a small change within the manifold, dq - M^(-1/2) D^+ W Psi_q dq. The functions have the names and results of the
+scene's programs by elimination. Systems of one state are solved by the same factors.
+"""
+
+from collections.abc import Callable
+
+from udkjax.native.base.ir import DOUBLE, POINTER, Function
+from udkjax.native.base.module import Module
+from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.native.pseudoinverses.dense import DenseMethod, MatrixRow
+
+
+class DenseEquations:
+    """The functions of a module whose method is dense."""
+
+    def __init__(self, module: Module, method: DenseMethod):
+        self._in, self._rows = module, WeightedRows(module, method)
+        module.places.add("saved", module.n)
+
+    def write(self):
+        """Write the functions that the module calls in place of programs."""
+        module = self._in
+        self._rows.write()
+        for name, write in self._functions.items():
+            if name in module.solving:
+                f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
+                s.safe = f.const(1.0, DOUBLE, f.width)
+                write(f)
+
+    @property
+    def _functions(self) -> dict[str, Callable[[Function], None]]:
+        return {
+            "accelerations": self._accelerate,
+            "newton_q": self._correct_position,
+            "newton_v_and_psi": self._correct_velocity,
+            "project": self._project,
+            "project_and_accelerate": self._project_and_accelerate,
+            "end_of_step": self._end_step,
+            "tangent_part": self._tangent_part,
+        }
+
+    def _correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):
+        """Write `start` plus or minus M^(-1/2) x; `to` is an array, or `out`."""
+        place = 0 if to == "out" else self._in.start(to, "work")
+        with f.each(self._in.n) as i:
+            change, old = self._rows.array(f, "root", i) * x.entry(i), self._rows.array(f, start, i)
+            pointer = f.given["out" if to == "out" else "work"]
+            f.store(old + change if sign > 0 else old - change, pointer, i * f.width + place, f.width)
+
+    # --- the programs
+
+    def _accelerate(self, f: Function):
+        self._in.invoke(f, "dense_accelerations")
+        self._rows.factor(f)
+        self._correct(f, self._rows.solve(f, "terms", self._in.n), "terms", "out", 1.0)
+
+    def _correct_position(self, f: Function):
+        self._in.invoke(f, "dense_newton_q")
+        self._rows.factor(f)
+        self._correct(f, self._rows.solve(f, "psi"), "state q", "corrected q")
+
+    def _factor_and_correct_velocity(self, f: Function):
+        self._in.invoke(f, "dense_newton_v")
+        self._rows.factor(f)
+        self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+
+    def _correct_velocity(self, f: Function):
+        self._factor_and_correct_velocity(f)
+        self._in.invoke(f, "psi")
+
+    def _at(self, f: Function, name: str, other: str, do: Callable[[], None]):
+        """Do something with another array in place of one."""
+        module = self._in
+        module.copy(f, name, "saved")
+        module.copy(f, other, name)
+        do()
+        module.copy(f, "saved", name)
+
+    def _project(self, f: Function):
+        module = self._in
+        self._correct_position(f)
+
+        def correct_velocity():
+            module.invoke(f, "psi_dot")
+            self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+            module.invoke(f, "psi")
+
+        self._at(f, "state q", "corrected q", correct_velocity)
+
+    def _project_and_accelerate(self, f: Function):
+        module = self._in
+        self._factor_and_correct_velocity(f)
+        self._at(f, "state v", "result v", lambda: module.invoke(f, "equation_terms"))
+        self._correct(f, self._rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
+
+    def _end_step(self, f: Function):
+        self._project_and_accelerate(f)
+        self._correct_changes(f)
+
+    def _tangent_part(self, f: Function):
+        self._in.invoke(f, "dense_newton_q")
+        self._rows.factor(f)
+        self._correct_changes(f)
+
+    def _correct_changes(self, f: Function):
+        for x in ("dq", "dv"):
+            self._correct(f, self._rows.solve_rates(f, f"state {x}"), f"state {x}", f"result {x}")

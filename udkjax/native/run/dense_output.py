@@ -1,0 +1,117 @@
+"""States between steps: Newton's divided differences of the last four states with their velocities and accelerations."""
+
+from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.base.layout import Lane, Layout
+from udkjax.native.base.module import Module
+from udkjax.native.base.steps import POINTS, STRETCH
+from udkjax.native.run.manifold import project_output
+
+
+def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
+    """Newton's divided differences of the last points, the latest first: of their states, or of changes of these."""
+    pointer = to[0] if to else "work"
+    f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
+    inverse, used = _spacing(module, f, s)
+    with f.each(module.registers(pointer)) as r:
+        known = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
+        column = [x for x in known["q"] for _ in range(3)]
+        given = {1: known["v"], 2: [a * 0.5 for a in known["a"]]}
+        module.put(f, "difference0", r, column[0], pointer)
+        for degree in range(1, 3 * POINTS):
+            following = []
+            for i in range(3 * POINTS - degree):
+                one, two = i // 3, (i + degree) // 3
+                following.append(given[degree][one] if one == two else (column[i + 1] - column[i]) * inverse[one, two])
+            column = following
+            mask = used[degree // 3]
+            module.put(f, f"difference{degree}", r, column[0] if mask is None else f.select(mask, column[0], 0.0), pointer)
+
+
+def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int], Value], list[Value | None]]:
+    """Return one over the time between each two points, and whether the polynomial goes through each (None: always)."""
+    times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
+    step = times[0] - times[1]
+    inverse: dict[tuple[int, int], Value] = {}
+    for i in range(POINTS):
+        for j in range(i + 1, POINTS):
+            d = times[j] - times[i]
+            inverse[i, j] = module.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
+    used: list[Value | None] = [None, None]
+    sofar: Value | None = None
+    for k in range(1, POINTS - 1):
+        near = (times[k] - times[k + 1]) * STRETCH >= step
+        sofar = near if sofar is None else sofar & near
+        used.append(sofar)
+    return inverse, used
+
+
+def write_differences_back(module: Module):
+    """Write `differences_back`: from cotangents of divided differences, which are cleared, to those of the points."""
+    f, s = module.function("differences_back")
+    active, (inverse, used) = s.at > 0.5, _spacing(module, f, s)
+    zero, count = f.const(0.0, DOUBLE, module.plan.vector), 3 * POINTS
+    with f.each(module.rowcount) as r:
+        bars: dict[str, list[Value]] = {x: [zero] * POINTS for x in "qva"}
+        column: list[Value] = []
+        for degree in reversed(range(count)):
+            mine, mask = module.vector(f, f"bar difference{degree}", r), used[degree // 3]
+            mine = mine if mask is None else f.select(mask, mine, 0.0)
+            here = [zero] * (count - degree)
+            for i, bar in enumerate(column):  # of the column after this one
+                one, two = i // 3, (i + degree + 1) // 3
+                if one == two:
+                    x, share = ("v", bar) if degree == 0 else ("a", bar * 0.5)
+                    bars[x][one] = bars[x][one] + share
+                else:
+                    part = bar * inverse[one, two]
+                    here[i + 1] = here[i + 1] + part
+                    here[i] = here[i] - part
+            here[0] = here[0] + mine
+            column = here
+            module.put(f, f"bar difference{degree}", r, zero)
+        for i, bar in enumerate(column):
+            bars["q"][i // 3] = bars["q"][i // 3] + bar
+        for k in range(POINTS):
+            for x in "qva":
+                name = f"bar point{POINTS - 1 - k} {x}"
+                old = module.vector(f, name, r)
+                module.put(f, name, r, f.select(active, old + bars[x][k], old))
+
+
+def write_between(module: Module, name: str = "between", to: tuple[str, Layout] | None = None):
+    """Write the polynomial at the time `next`."""
+    pointer = to[0] if to else "work"
+    f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
+    ahead = [module.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+    if not to:
+        setattr(s, "state t", s.next)
+    with f.each(module.registers(pointer)) as r:
+        q, v = module.vector(f, f"difference{3 * POINTS - 1}", r, pointer), f.const(0.0, DOUBLE, module.plan.vector)
+        for k in reversed(range(3 * POINTS - 1)):
+            d = ahead[k // 3]
+            v = f.fma(v, d, q)
+            q = f.fma(q, d, module.vector(f, f"difference{k}", r, pointer))
+        module.put(f, "state q", r, q, pointer)
+        module.put(f, "state v", r, v, pointer)
+
+
+def write_outputs(module: Module):
+    """Write the states at output times up to `until`."""
+    f, s = module.function("outputs", [(POINTER, "work"), (POINTER, "call")])
+    inner = module.field(f, "times") - 1
+
+    def due() -> Value:
+        s.due = f.select((s.next <= s.until) & (s.written + 1.0 < inner), f.const(1.0, DOUBLE, f.width), 0.0)
+        return f.any_of(s.due > 0.5)
+
+    with f.if_(due()):
+        f.call("differences", f.given["work"])
+        with f.while_(due):
+            f.call("between", f.given["work"])
+            project_output(module, f, s, "due")
+            module.record_output(f, s)
+            with module.each_lane(f, s.due) as k:
+                number = module.to_int(f, f.lane(s.written, k)) + 1
+                module.write_state(f, s, k, number, "state q", "result v")
+                module.put_lane_entry(f, "next", k, module.input_number(f, "ts", f.lane(s.member, k), number + 1))
+            s.where(s.due > 0.5, written=s.written + 1.0)

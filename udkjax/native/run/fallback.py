@@ -1,0 +1,116 @@
+"""Fallback steps: where elimination must not trust a pivot, a rank-revealing method on all rows takes its place.
+
+It has two functions of `work`, for the lanes that are `wanted`, at their state:
+
+    fallback                 accelerations a, and q and v after a Newton step each, in arrays of their own
+    fallback_tangent_part    the parts of `state dq` and `state dv` within the manifold, in arrays of their own
+
+For small scenes the method is the pseudoinverse by singular values, lane by lane; for large ones elimination
+of all rows, without those that depend on others, which near singular configurations has about half as many digits.
+"""
+
+import numpy as np
+
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.steps import ROUNDING_PIVOT
+from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.native.pseudoinverses.dense import MatrixRow
+from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.native.run.manifold import iterate_newton, with_threshold
+
+
+def write_fallback(module: Module):
+    """Write what a fallback step does besides: accelerations, the end of a step, outputs that elimination leaves open."""
+    (_write_singular_values if module.written_out else _write_elimination)(module)
+
+    def invoke(f: Function, s: Lane, mask: Value, name: str = "fallback"):
+        s.wanted = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+        module.invoke(f, name)
+
+    def close_position(f: Function, s: Lane, mask: Value):
+        def closer(active: Value):
+            invoke(f, s, active)
+            module.copy(f, "fallback q", "corrected q")
+
+        iterate_newton(module, f, s, mask, closer)
+
+    # The accelerations of lanes whose pivots were not safe.
+    f, s = module.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
+    mask = (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)
+    invoke(f, s, mask)
+    module.copy(f, "fallback a", "out", mask)
+    # The end of a fallback step: Newton's method in position, velocities and accelerations there where the pivots are
+    # not safe; and, whether they are or not, what projection leaves of the errors.
+    f, s = module.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
+    fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
+    unsafe = fallback & (s.ok < 0.5)
+    close_position(f, s, unsafe)
+    with f.if_(f.any_of(unsafe)):
+        invoke(f, s, unsafe)
+        for to in ("state v", "result v"):
+            module.copy(f, "fallback v", to, unsafe)
+        invoke(f, s, unsafe)
+        module.copy(f, "fallback a", "result a", unsafe)
+    invoke(f, s, fallback, "fallback_tangent_part")
+    for x in ("dq", "dv"):
+        module.copy(f, f"fallback {x}", f"result {x}", fallback)
+    # An output that elimination leaves open.
+    f, s = module.function("close_output")
+    close_position(f, s, s.open > 0.5)
+    invoke(f, s, s.open > 0.5)
+    module.copy(f, "fallback v", "result v", s.open > 0.5)
+    module.invoke(f, "psi")
+
+
+def _write_elimination(module: Module):
+    """Write `fallback` and `fallback_tangent_part` by elimination, with constants of their own: another threshold."""
+    every = module.code.with_all_rows
+    at = module.arrays | {x: ("work", module.places[f"fallback {x}"]) for x in (*every.scratch, "constants", "a")}
+    at |= {f"{x}1": ("work", module.places[f"fallback {x}"]) for x in ("q", "v", "dq", "dv")}
+    at |= dict.fromkeys(("safe", "distance"), ("work", module.places["rank"]))
+    module.loops.write(every.corrections_and_accelerations, "fallback", ("work", "out"), at)
+    module.loops.write(every.tangent_part, "tangent_part_of_all_rows", ("work", "out"), at)
+    module.write_prologue("fallback_prologue", None)
+    f, _ = module.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
+    place = module.places["fallback constants"] + module.code.drop_tol_index
+    threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
+    with_threshold(f, place, threshold, lambda: module.invoke(f, "tangent_part_of_all_rows"))
+
+
+def _write_singular_values(module: Module):
+    """Write `fallback` and `fallback_tangent_part` by singular values."""
+    rows = WeightedRows(module, SVDCode(relative=True), by_lane=True)
+    rows.write()
+    of_lane = [(POINTER, "work"), (INT, "lane")]
+
+    def put(f: Function, x: str, start: str, change: MatrixRow, sign: float):
+        with f.each(module.n) as i:
+            part = rows.array(f, "root", i) * change.entry(i) * sign
+            rows.put(f, f"fallback {x}", i, rows.array(f, start, i) + part)
+
+    f = module.new_function("fallback_of_lane", of_lane, 1)
+    rows.factor(f)
+    for x, right, place, start, sign in (
+        ("a", "terms", module.n, "terms", 1.0),
+        ("q", "psi", 0, "state q", -1.0),
+        ("v", "psi_dot", 0, "state v", -1.0),
+    ):
+        put(f, x, start, rows.solve(f, right, place), sign)
+    f = module.new_function("fallback_tangent_part_of_lane", of_lane, 1)
+    rows.factor(f)
+    for x in ("dq", "dv"):
+        put(f, x, f"state {x}", rows.solve_rates(f, f"state {x}"), -1.0)
+    for name, threshold in (("fallback", None), ("fallback_tangent_part", np.sqrt(ROUNDING_PIVOT))):
+        f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
+        module.invoke(f, "rows_and_loads")
+
+        def each_lane(f: Function = f, s: Lane = s, name: str = name):
+            with module.each_lane(f, s.wanted) as k:
+                f.call(f"{name}_of_lane", f.given["work"], k)
+
+        if threshold is None:
+            each_lane()
+        else:
+            with_threshold(f, module.places["fallback_tol"], f.const(threshold, DOUBLE, f.width), each_lane)

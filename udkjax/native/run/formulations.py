@@ -1,0 +1,252 @@
+"""Accelerations by other formulations (`udkjax.equations.formulations`) as machine code, in place of the Udwadia-Kalaba equation.
+
+Of the unconstrained accelerations a_F, and the change x that the constraints make, with A = Psi_q,
+
+    M x + A^T lambda = 0,        A x = b,        a = a_F + x,
+
+all in the scene's own units, in which coordinates, rows and masses are of order one. Projection is that of the pseudoinverse.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
+from udkjax.equations.scale_program import RANK_TOL
+from udkjax.native.base.ir import INT, POINTER, Function, Operand, Value
+from udkjax.native.base.layout import FORMULATION_SETTINGS
+from udkjax.native.base.module import Module
+from udkjax.native.base.weighted_rows import RowEntries
+from udkjax.native.pseudoinverses import dense_method
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
+from udkjax.native.pseudoinverses.lu import LUCode
+from udkjax.native.pseudoinverses.one_of import OneOfCode
+from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
+from udkjax.native.pseudoinverses.svd import SVDCode
+
+TOL, MASS = FORMULATION_SETTINGS
+FORMULATE = "formulate"
+
+
+@dataclass(frozen=True)
+class FormulationCode(ABC):
+    """A formulation as machine code."""
+
+    @abstractmethod
+    def prepare(self, module: Module) -> "FormulatedAccelerations":
+        """Return the writer of a module's code, which has laid out its matrices."""
+
+
+class FormulatedAccelerations(ABC):
+    """The accelerations of a module by a formulation."""
+
+    def __init__(self, module: Module, layout: DenseLayout):
+        self._in, self._layout, self._entries = module, layout, RowEntries(module)
+
+    def write(self):
+        """Write `formulate(work, out)`: a of the state."""
+        module = self._in
+        f, _ = module.function(FORMULATE, [(POINTER, "work"), (POINTER, "out")])
+        module.invoke(f, "dense_accelerations")
+        x = self.solve(DenseMatrices(self._layout, f))
+        with f.each(module.n) as i:
+            a = f.fma(self._unit(f, i), x.entry(i), self._array(f, "terms", i))
+            f.store(a, f.given["out"], i * f.width, f.width)
+
+    @abstractmethod
+    def solve(self, d: DenseMatrices) -> MatrixRow:
+        """Write how x is found of Psi_q, M^(-1/2) and b at hand; return the row that holds it."""
+
+    def _array(self, f: Function, name: str, i: Operand = 0) -> Value:
+        """Return one number of an array, in all lanes."""
+        return self._in.entry(f, name, i)
+
+    def _unit(self, f: Function, i: Operand) -> Value:
+        return 1.0 / self._array(f, "inverse unit", i)
+
+    def mass(self, f: Function, i: Operand) -> Value:
+        """Return an entry of M."""
+        share = self._unit(f, i) / (self._array(f, "root", i) * self._array(f, "length"))
+        return share * share / self._array(f, MASS)
+
+    def each_entry(self, f: Function) -> Iterator[tuple[Value, Value, Value]]:
+        """Run the block for each entry of A: its row, its column and its value."""
+        for row, column, place, factor in self._entries.entries(f):
+            value = self._array(f, "psi_q", place) * factor * self._unit(f, column)
+            yield row, column, value / self._array(f, "rows", row)
+
+    def right(self, f: Function, i: Value) -> Value:
+        """Return a number of b."""
+        return self._array(f, "terms", i + self._in.n) / self._array(f, "rows", i)
+
+
+@dataclass(frozen=True)
+class AugmentedCode(FormulationCode):
+    """x and lambda at once (`Augmented`)."""
+
+    method: DenseMethod
+
+    def prepare(self, module: Module) -> FormulatedAccelerations:
+        return AugmentedAccelerations(module, self.method)
+
+
+class AugmentedAccelerations(FormulatedAccelerations):
+    """[M A^T; A 0] [x; lambda] = [0; b]."""
+
+    def __init__(self, module: Module, method: DenseMethod):
+        size, self._method = module.n + module.m, method
+        super().__init__(module, DenseLayout(module, method.matrices(size, size), (size, size), "augmented", TOL))
+
+    def solve(self, d: DenseMatrices) -> MatrixRow:
+        f, n, b = d.f, self._in.n, d.row("b")
+        b.clear()
+        with f.each(d.m) as i:
+            d.row("D", i).clear()
+        with f.each(n) as i:
+            d.row("D", i).put(i, self.mass(f, i))
+        for row, column, value in self.each_entry(f):
+            d.row("D", row + n).put(column, value)
+            d.row("D", column).put(row + n, value)
+        with f.each(self._in.m) as i:
+            b.put(i + n, self.right(f, i))
+        self._method.factor(d)
+        self._method.solve(d)
+        return d.row("x")
+
+
+@dataclass(frozen=True)
+class NullSpaceCode(FormulationCode):
+    """x = x_p + N z, with A x_p = b and A N = 0 (`NullSpaceQR`, `NullSpaceSVD`)."""
+
+    by_singular_values: bool
+
+    def prepare(self, module: Module) -> FormulatedAccelerations:
+        return (NullSpaceSVDAccelerations if self.by_singular_values else NullSpaceQRAccelerations)(module)
+
+
+class NullSpaceAccelerations(FormulatedAccelerations):
+    """By the pivoted QR of vectors that span the rows of A, as columns: reflections of the other coordinates are N.
+
+    The columns of N are made orthonormal in the metric of M, n_k, and x = x_p - sum_k n_k (n_k^T M x_p).
+    """
+
+    def __init__(self, module: Module, columns: int):
+        n = module.n
+        extra = {"basis": (n, n), "weighted": (n, n), "mass": (1, n)}
+        super().__init__(module, DenseLayout(module, qr_matrices(n, columns) | extra, (n, columns), "null space", TOL))
+
+    @abstractmethod
+    def solve_rows(self, d: DenseMatrices):
+        """Write the QR of the rows, and x_p as the row `b`."""
+
+    def solve(self, d: DenseMatrices) -> MatrixRow:
+        self.solve_rows(d)
+        f, x, mass = d.f, d.row("b"), d.row("mass")
+        mass.clear()
+        with f.each(d.m) as i:
+            mass.put(i, self.mass(f, i))
+        free = d.wide(float(d.m)) - d.row("rank").entry(0)
+        count = f.variable(d.whole(free if f.width == 1 else f.reduce("fmax", free)), INT, 1)
+        with f.each(count.value) as k:
+            vector, weighted = d.row("basis", k), d.row("weighted", k)
+            place = d.row("rank").entry(0) + d.number(k)
+            is_there = place < float(d.m)
+            vector.clear()
+            vector.put_at(d.whole(f.select(is_there, place, 0.0)), f.select(is_there, d.wide(1.0), 0.0))
+            apply_q(d, "basis", k)
+            with f.each(k) as j:
+                d.axpy(-d.dot(d.row("weighted", j), vector), d.row("basis", j), vector)
+
+            def weigh(r: Operand):
+                weighted[r] = mass[r] * vector[r]
+
+            d.over_registers(vector.registers, weigh)
+            square = d.dot(weighted, vector)
+            counts = is_there & (square > 0.0)
+            scale = d.spread(f.select(counts, 1.0 / d.sqrt(f.select(counts, square, 1.0)), 0.0))
+
+            def normalize(r: Operand):
+                vector[r] = vector[r] * scale
+                weighted[r] = weighted[r] * scale
+
+            d.over_registers(vector.registers, normalize)
+            d.axpy(-d.dot(weighted, x), vector, x)
+        return x
+
+
+class NullSpaceQRAccelerations(NullSpaceAccelerations):
+    """A^T = Q R with pivoting: x_p = Q_1 R_1^(-T) b."""
+
+    def __init__(self, module: Module):
+        super().__init__(module, module.m)
+
+    def solve_rows(self, d: DenseMatrices):
+        f, x, tol = d.f, d.row("b"), d.tol
+        with f.each(d.m) as i:
+            d.row("D", i).clear()
+        for row, column, value in self.each_entry(f):
+            d.row("D", column).put(row, value)
+        pivoted_qr(d, lambda scale: tol * tol * scale)
+        right = d.row("product")  # of as many entries as there are rows of A
+        right.clear()
+        with f.each(d.n) as i:
+            right.put(i, self.right(f, i))
+        x.clear()
+        with f.each(d.steps) as k:
+            counts = d.number(k) < d.row("rank").entry(0)
+            place = d.whole(d.row("order").entry(k))
+            left = f.variable(right.at(place))
+            with f.each(k) as i:
+                left.value = left.value - d.row("D", i).at(place) * x.entry(i)
+            end = d.row("diagonal").entry(k)
+            x.put(k, f.select(counts, left.value / f.select(counts, end, 1.0), 0.0))
+        apply_q(d)
+
+
+class NullSpaceSVDAccelerations(NullSpaceAccelerations):
+    """x_p = A^+ b by singular values; the right singular vectors of those that count span the rows."""
+
+    def __init__(self, module: Module):
+        m, n = module.m, module.n
+        super().__init__(module, min(m, n))
+        self._method = SVDCode(relative=True)
+        self._rows = DenseLayout(module, self._method.matrices(m, n), (m, n), "null space rows", TOL)
+
+    def solve_rows(self, d: DenseMatrices):
+        f, of = d.f, DenseMatrices(self._rows, d.f)
+        of.row("b").clear()
+        with f.each(of.m) as i:
+            of.row("D", i).clear()
+            of.row("b").put(i, self.right(f, i))
+        for row, column, value in self.each_entry(f):
+            of.row("D", row).put(column, value)
+        self._method.factor(of)
+        self._method.solve(of)
+        with f.each(d.m) as i:
+            row = d.row("D", i)
+            row.clear()
+            with f.each(of.steps) as j:
+                row.put(j, of.row("D", j).entry(i) * d.sqrt(of.row("lengths").entry(j)))
+        pivoted_qr(d, lambda _: d.wide(0.25))  # lengths are one, or zero of those that do not count
+        d.row("b").clear()
+        with f.each(d.m) as i:
+            d.row("b").put(i, of.row("x").entry(i))
+
+
+def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
+    """Return the machine code of a formulation; None where there is none."""
+    if isinstance(formulation, NullSpaceQR | NullSpaceSVD):
+        return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
+    if not isinstance(formulation, Augmented):
+        return None
+    method = LUCode(relative=True) if formulation.method is None else dense_method(formulation.method)
+    return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one number
+
+
+def formulation_tol(formulation: Any) -> Any:
+    """Return the threshold of the rank of a formulation."""
+    if not isinstance(formulation, Augmented):
+        return formulation.rank_tol
+    given = None if formulation.method is None else formulation.method.rank_tol
+    return RANK_TOL**2 if given is None else given

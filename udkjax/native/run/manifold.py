@@ -1,0 +1,102 @@
+"""Projection: Newton's method that returns positions and velocities to the constraint manifold."""
+
+from collections.abc import Callable
+
+from udkjax.native.base.ir import DOUBLE, INT, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
+
+
+def newton(module: Module, f: Function, s: Lane):
+    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until they move nothing but rounding errors."""
+
+    def closer(active: Value):
+        module.invoke(f, "newton_q")
+        s.where(active & (s.safe < 0.5), ok=0.0)
+
+    iterate_newton(module, f, s, s.stepping > 0.5, closer)
+
+
+def iterate_newton(module: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
+    """Take Newton steps in some lanes: `closer` leaves `corrected q`, nearer to the manifold than `state q`."""
+    s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+    k = f.variable(0, INT, 1)
+    with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
+        active = s.iterating > 0.5
+        closer(active)
+        change = take_newton_step(module, f, active)
+        s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
+        k.value = k.value + 1
+
+
+def take_newton_step(module: Module, f: Function, active: Value) -> Value:
+    """Take `state q` from `corrected q` in lanes that move; return the largest change, in the scene's own units."""
+
+    def change(r: Value) -> list[Value]:
+        old, new = module.vector(f, "state q", r), module.vector(f, "corrected q", r)
+        module.put(f, "state q", r, f.select(active, new, old))
+        return [f.abs(new - old) * module.vector(f, "inverse unit", r)]
+
+    return module.largest(f, change)
+
+
+def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
+    """Do something with another threshold of pivots, which lies at a place; at none where no pivot is looked at."""
+    if place is None:
+        do()
+        return
+    before = f.load(f.given["work"], place * f.width, f.width)
+    f.store(threshold, f.given["work"], place * f.width, f.width)
+    do()
+    f.store(before, f.given["work"], place * f.width, f.width)
+
+
+def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value:
+    """Return the tolerance of the fastest velocity, in its unit."""
+    fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])
+    return f.fma(s.rtol, fastest / s.omega, s.atol)
+
+
+def project_output(module: Module, f: Function, s: Lane, which: str):
+    """Project the state, as `state q` and `result v`; `violated` is its distance from the manifold before."""
+    mask = getattr(s, which) > 0.5
+
+    def iterate(lanes: Value):
+        iterate_newton(module, f, s, lanes, lambda _: module.invoke(f, "newton_q"), OUTPUT_STEPS)
+        module.invoke(f, "newton_v_and_psi")
+
+    def project():
+        module.invoke(f, "project")
+        s.violated = largest_violation(module, f)
+        far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
+        with f.if_(f.any_of(far)):
+            with f.each(module.rowcount) as r:  # no lane depends on its neighbours: others keep what they have
+                module.put(f, "result dv", r, module.vector(f, "result v", r))
+            iterate(far)
+            with f.each(module.rowcount) as r:
+                module.put(f, "result v", r, f.select(far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
+            s.where(far, violated=largest_violation(module, f))
+        if module.falls_back:  # a row that was left out, and a pivot that is small: nothing holds what they do
+            s.open = f.select(mask & (s.violated > OPEN_OUTPUT), f.const(1.0, DOUBLE, f.width), 0.0)
+            with f.if_(f.any_of(s.open > 0.5)):
+                f.call("close_output", f.given["work"])
+                s.where(s.open > 0.5, violated=largest_violation(module, f))
+
+    if module.plan.projected:
+        threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
+        with_threshold(f, module.drop_tol_place if module.falls_back else None, threshold, project)
+        return
+    module.invoke(f, "psi")
+    with f.each(module.rowcount) as r:
+        module.put(f, "result v", r, module.vector(f, "state v", r))
+    s.violated = largest_violation(module, f)
+
+
+def largest_violation(module: Module, f: Function) -> Value:
+    """Return the largest of Psi, each row over its scale; not a number where a row is none."""
+    worst = f.variable(0.0)
+    with f.each(module.m) as i:
+        x = f.abs(module.entry(f, "psi", i)) / module.entry(f, "rows", i)
+        worst.value = f.select((x > worst.value) | x.is_not(x), x, worst.value)
+    return worst.value

@@ -1,0 +1,182 @@
+"""Members and lanes: a lane takes a member, steps it to its end, writes what it found, and takes the next one."""
+
+from typing import Any
+
+import numpy as np
+
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.samples import enter_first_row, write_enter
+from udkjax.native.base.steps import CROSSED, DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
+from udkjax.native.run.manifold import largest_violation, project_output
+
+
+def write_begin(module: Module):
+    """Take a member into a lane."""
+    write_enter(module)
+    arguments = [(POINTER, "work"), (POINTER, "call"), (INT, "lane"), (INT, "member")]
+    f, _ = module.function("begin", arguments)
+    call, k, member = f.given["call"], f.given["lane"], f.given["member"]
+    work = f.given["work"]
+
+    def put(name: str, value: Any, i: Any = 0):
+        module.put_lane_entry(f, name, k, value, i)
+
+    for name in LANE_NUMBERS:
+        if name not in SETTINGS and name not in ("stepping", "call", "tangents"):
+            put(name, 0.0)
+    given = module.member_address(f, "settings", member)
+    settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given, j) for j, name in enumerate(module.settings)}
+    for name, value in settings.items():
+        put(name, value)
+    q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
+    with f.each(module.n) as i:
+        angle = f.arithmetic("sub", i, f.arithmetic("div", i, 3) * 3).is_(2)
+        unit = f.select(angle, f.const(1.0), settings["length"])
+        put("inverse unit", 1.0 / unit, i)
+        put("scale q", settings["atol"] * unit, i)
+        put("scale v", settings["atol"] * unit * settings["omega"], i)
+        for j in range(POINTS):
+            put(f"point{j} q", f.load(q, i), i)
+            put(f"point{j} v", f.load(v, i), i)
+            put(f"point{j} a", 0.0, i)
+    if module.m:
+        rows = module.member_address(f, "rows", member)
+        with f.each(module.m) as i:
+            put("rows", f.load(rows, i), i)
+        module.begin_rows(f, k, settings["length"])
+    ts = module.member_address(f, "ts", member)
+    times = module.field(f, "times")
+    start, end = f.load(ts), f.load(ts, times - 1)
+    first = {
+        "start": start,
+        "end": end,
+        "next": f.load(ts, 1),
+        "rate": np.inf,
+        "crossing": np.inf,
+        "passed": -np.inf,
+        "lost": np.inf,
+    }
+    for name, value in first.items():
+        put(name, value)
+    for j in range(POINTS):
+        put(f"point{j}_t", start)
+    for name in (f"distance{j}" for j in range(POINTS - 1)):
+        put(name, np.inf)
+    for name in ("tried", "accepted", "steps"):
+        put(name, -1.0)
+    put("active", 1.0)
+    put("tolerance", settings["atol"])
+    put("member", f.op(f"sitofp i64 {member.name} to double", DOUBLE))
+    if module.plan.breaks:
+        enter_first_row(module, f, k, member)
+    else:
+        f.call("enter", work, call, k)
+    module.begin_member(f, k, member)
+
+
+def write_finish(module: Module):
+    """Write what is left of the members whose lanes are marked in `due`: their first and last states, and how they ended."""
+    f, s = module.function("finish_members", [(POINTER, "work"), (POINTER, "call")])
+    times = module.field(f, "times")
+    _find_cause(module, f, s)
+    # The last state, once more to the manifold; and then the first, which is taken as it is.
+    with f.each(module.rowcount) as r:
+        for x in "qv":
+            module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
+    setattr(s, "state t", s.point3_t)
+    project_output(module, f, s, "due")
+    with module.each_lane(f, s.due) as k:
+        member = module.to_int(f, f.lane(s.member, k))
+        with f.if_(f.lane(s.code, k).is_(float(DONE))):
+            module.write_state(f, s, k, times - 1, "state q", "result v")
+        q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
+        with f.each(module.n) as i:
+            for name, x in (("state q", q), ("result v", v)):
+                module.put_lane_entry(f, name, k, f.load(x, i), i)
+        if module.plan.sampled:
+            enter_first_row(module, f, k, member)
+    setattr(s, "state t", s.start)
+    with f.each(module.rowcount) as r:
+        module.put(f, "state v", r, module.vector(f, "result v", r))
+    module.invoke(f, "psi")
+    s.violated = largest_violation(module, f)
+    with module.each_lane(f, s.due) as k:
+        module.write_state(f, s, k, f.const(0, INT), "state q", "result v")
+        info = module.result_address(f, "info", module.to_int(f, f.lane(s.member, k)), len(INFO) + 2 * module.n)
+        for j, name in enumerate(INFO):
+            f.store(f.lane(s.point3_t if name == "t" else getattr(s, name), k), info, j)
+        module.copy_lane(f, info, len(INFO), "point3 q", k)
+        module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
+        _clear_outputs(module, f, s, k)
+    module.end_members(f, s)
+
+
+def _find_cause(module: Module, f: Function, s: Lane):
+    """Find out why steps fell to nothing: by a number that is not finite, at the end of the run or right ahead, or otherwise."""
+    stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT)) & (s.code < float(CROSSED))
+    with f.if_(f.any_of(stopped)):
+        for share in (0.0, LOOK_AHEAD):
+            later = (s.end - s.start) * share
+            setattr(s, "state t", s.point3_t + later)
+            with f.each(module.rowcount) as r:
+                v = module.vector(f, "point3 v", r)
+                module.put(f, "state q", r, f.fma(module.broadcast(f, later), v, module.vector(f, "point3 q", r)))
+                module.put(f, "state v", r, v)
+            module.invoke(f, "equation_terms")
+            total = f.variable(0.0)
+            with f.each(module.code.term_count) as i:
+                total.value = f.fma(module.entry(f, "terms", i), 0.0, total.value)
+            if module.is_formulated:
+                module.accelerate(f, "result a")
+                with f.each(module.n) as i:
+                    total.value = f.fma(module.entry(f, "result a", i), 0.0, total.value)
+            s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
+
+
+def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
+    """Clear the outputs of lane k that its run did not reach, and those behind the first lost one: they are no numbers."""
+    times, nan = module.field(f, "times"), f.const(np.nan)
+    is_done = f.lane(s.code, k).is_(float(DONE))
+    reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)
+    kept = module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
+    row = module.to_int(f, f.lane(s.member, k)) * times + kept
+    to = [module.result_address(f, name, row, module.n) for name in ("qs", "vs")]
+    with f.each((times - kept) * module.n) as i:
+        for address in to:
+            f.store(nan, address, i)
+
+
+def write_run(module: Module):
+    """`run(call)`: members one after another, until there are none left."""
+    f = Function("run", [(POINTER, "call")], module.plan.width)
+    module.functions.append(f)
+    call, width = f.given["call"], module.plan.width
+    size = module.places.size * width + 2 * module.plan.vector
+    block, work = module.allocate(f, f.const(size, INT))
+    f.given["work"], s = work, Lane(f, module.places)
+    with f.each(size) as i:
+        f.store(0.0, work, i)
+    f.store(call, work, module.start("call", "work"), base=POINTER)
+    module.begin_memory(f)
+    blocks = [block, *module.allocate_memory(f, call)]
+    for name in ("length", "omega", "rtol", "atol", "smallest"):  # of lanes that stay empty
+        setattr(s, name, f.const(1.0, DOUBLE, width))
+    with f.each(-(-module.n // max(module.plan.vector // width, 1)) * max(module.plan.vector // width, 1)) as i:
+        for name in ("scale q", "scale v"):
+            module.put_entry(f, name, i, 1.0)
+    members, following = module.field(f, "members"), module.field(f, "next", POINTER)
+
+    def fill():
+        with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
+            # Members are taken in order, by whoever comes first: threads share the count.
+            member = f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
+            with f.if_(member < members):
+                f.call("begin", work, call, k, member)
+
+    fill()
+    with f.while_(lambda: module.goes_on(f, s)):
+        module.step_all(f, s, fill)
+    for block in blocks:
+        f.line(f"call void @free(ptr {block.name})")

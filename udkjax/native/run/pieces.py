@@ -1,0 +1,97 @@
+"""Steps that leave the piece of the state in which the motion is smooth (a cubic of a cam's profile)."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.base.module import Module
+from udkjax.native.base.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
+
+
+def write_leave(module: Module):
+    """Write `leave`: for lanes in `again`, whether a step that ends in another piece of the motion lands there.
+
+    Else it is taken `again`, to end just before the piece does. The next step is a tiny one across,
+    behind which the run starts anew: so also what is known of accelerations at the ends of steps belongs to one piece.
+    """
+    f, s = module.function("leave")
+    where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
+
+    def find_pieces(time: Value, state: Callable[[Value], tuple[Value, Value]]):
+        setattr(s, "state t", time)
+        with f.each(module.rowcount) as r:
+            for x, value in zip("qv", state(r), strict=True):
+                module.put(f, f"state {x}", r, value)
+        module.invoke(f, "pieces")
+
+    def moved() -> Value:
+        found = f.variable(f.const(False, BOOL, f.width), BOOL)
+        with f.each(module.pieces) as k:
+            one, other = (module.entry(f, x, k) for x in ("pieces", "pieces before"))
+            found.value = found.value | one.is_not(other)
+        return found.value
+
+    with f.each(module.rowcount) as r:
+        module.put(f, "corrected q", r, module.vector(f, "state q", r))
+    find_pieces(s.point3_t, lambda r: (module.vector(f, "point3 q", r), module.vector(f, "point3 v", r)))
+    with f.each(module.pieces) as k:
+        module.put_entry(f, "pieces before", k, module.entry(f, "pieces", k))
+    find_pieces(s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
+    stepping, step = s.again > 0.5, s.t1 - s.point3_t
+    leaves = stepping & (s.begin < 0.5) & moved() & f.is_finite(s.error)
+    s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
+    with f.if_(f.any_of(leaves)), f.each(HALVINGS):
+        middle = (s.low + s.share) * 0.5
+        s.behind = middle
+        find_pieces(f.fma(middle, step, s.point3_t), lambda r: interpolate_step(module, f, s.behind, step, r))
+        other = moved()
+        s.where(leaves & other, share=s.behind)
+        s.where(leaves & ~other, low=s.behind)
+    setattr(s, "state t", s.t1)
+    with f.each(module.rowcount) as r:
+        module.put(f, "state q", r, module.vector(f, "corrected q", r))
+        module.put(f, "state v", r, module.vector(f, "result v", r))
+    share, aim, good = s.share, s.aim, s.error < 1.0
+    repeats = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
+    exact = f.min(share, yes - share) <= NEAR_END
+    s.where(leaves & ~repeats, lands=1.0)
+    short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
+    reached = stepping & good & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
+    across = reached | (repeats & (share <= EDGE))
+    before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
+    aim = where(repeats, where(exact, before, beyond), where(short, aim, beyond))
+    expected = f.fma(where(exact, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
+    crossing = where(repeats, expected, where(short, s.crossing, inf))
+    crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
+    tries = where(repeats, s.tries + 1.0, where(good, 0.0, s.tries))
+    s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
+    s.again = where(repeats, yes, 0.0)
+
+
+def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
+    """Return q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
+    x, h = module.broadcast(f, share), module.broadcast(f, step)
+
+    def along(*coefficients: float) -> Value:
+        total = f.const(coefficients[-1], DOUBLE, module.plan.vector)
+        for c in reversed(coefficients[:-1]):
+            total = f.fma(total, x, c)
+        return total
+
+    ends = [module.vector(f, name, r) for name in ("point3 q", "corrected q", "point3 v", "result v", "point3 a", "result a")]
+    weights = [
+        (1.0, 0.0, 0.0, -10.0, 15.0, -6.0),
+        (0.0, 0.0, 0.0, 10.0, -15.0, 6.0),
+        (0.0, 1.0, 0.0, -6.0, 8.0, -3.0),
+        (0.0, 0.0, 0.0, -4.0, 7.0, -3.0),
+        (0.0, 0.0, 0.5, -1.5, 1.5, -0.5),
+        (0.0, 0.0, 0.0, 0.5, -1.0, 0.5),
+    ]
+    scales = (None, None, h, h, h * h, h * h)
+    q = v = f.const(0.0, DOUBLE, module.plan.vector)
+    for end, c, scale in zip(ends, weights, scales, strict=True):
+        scaled = end if scale is None else end * scale
+        q = f.fma(along(*c), scaled, q)
+        v = f.fma(along(*(k * c[k] for k in range(1, 6))), scaled, v)
+    return q, v / h

@@ -1,0 +1,114 @@
+"""Machine code that finds which rows of Psi are independent, for mechanisms whose numbers are known only when they run.
+
+Rows that depend on others everywhere have to be distinguished from those that do so at the initial position alone, in a singular
+configuration. So a mechanism takes one step aside, along its velocity or, at rest, along some direction that its constraints
+allow, with its drivers a little ahead; it is closed there by Newton's method, and rows are marked that elimination does not leave
+out. Where it does not close, or is led back, as at rest where two branches of its motion meet, all rows are marked: elimination
+then meets pivots that it must not trust, and every step is taken by the method that reveals the rank.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
+from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.module import Module
+from udkjax.native.base.tableau import EULER
+from udkjax.native.run.manifold import iterate_newton, largest_violation
+from udkjax.native.run.members import write_begin, write_run
+
+# Of the scene's units: how far the step goes. A row that depends on others only where the step begins has behind it a pivot of
+# about the square, relative to its diagonal entry: far above the threshold of dependence, and Newton's method closes from there.
+STEP = 0.03
+STAYS = 0.5  # of the step: where branches meet, Newton's method leads a position on neither of them back to where it began
+CORRECTIONS = 6  # of Newton's method, which doubles the digits in each: four are usual
+FREE = 1e-6  # of a direction or a velocity, in the scene's units: anything less is rounding, and constraints allow no motion
+
+
+class RowMarks(Module):
+    """The text of a module whose `run` marks the independent rows of members, near their positions q at the time ts[0]."""
+
+    settings = ("length", "omega")
+    results = ("marks",)
+
+    def __init__(self, code: ScenePrograms, width: int, vector: int):
+        plan = Plan(
+            code, EULER, projected=False, breaks=False, width=width, vector=vector, written_out=code.is_small, steps=False
+        )
+        super().__init__(plan)
+        self.places.add("independent", self.m)
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        self.write_programs()
+        write_begin(self)
+        self._find()
+        write_run(self)
+        return self.module_text()
+
+    def program_names(self) -> list[str]:
+        return ["tangent_part", "newton_q", "psi", "independent_rows"]
+
+    @property
+    def arrays(self):
+        return super().arrays | {"independent": ("work", self.places["independent"])}
+
+    def _find(self):
+        """`find(work, call)`: the members in all lanes."""
+        f, s = self.function("find", [(POINTER, "work"), (POINTER, "call")])
+        width = self.plan.width
+        direction = np.random.default_rng(0).uniform(-1.0, 1.0, self.n)
+        self.loops.globals.append(
+            f"@direction = private constant [{self.n} x double] [{', '.join(f'double {x!r}' for x in direction.tolist())}]"
+        )
+
+        setattr(s, "state t", s.start)
+        with f.each(self.n) as i:
+            self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
+            zero = f.const(0.0, DOUBLE, width)
+            self.put_entry(f, "state v", i, zero)
+            self.put_entry(f, "state dv", i, zero)
+            self.put_entry(f, "state dq", i, self.entry(f, "point3 v", i))
+        rate = self.largest(f, lambda r: [f.abs(self.vector(f, "state dq", r)) * self.vector(f, "inverse unit", r)])
+        moves = f.like(rate > s.omega * FREE, BOOL, width)
+        with f.each(self.n) as i:
+            along = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / self.entry(f, "inverse unit", i)
+            self.put_entry(f, "state dq", i, f.select(moves, self.entry(f, "state dq", i) / s.omega, along))
+        self.invoke(f, "tangent_part")
+        size = self.largest(f, lambda r: [f.abs(self.vector(f, "result dq", r)) * self.vector(f, "inverse unit", r)])
+        is_free = size > FREE
+        scale = f.select(is_free, STEP / f.select(is_free, size, 1.0), 0.0)
+        scale = f.like(scale, DOUBLE, width)
+        with f.each(self.n) as i:
+            self.put_entry(f, "state q", i, f.fma(self.entry(f, "result dq", i), scale, self.entry(f, "state q", i)))
+        setattr(s, "state t", s.start + STEP / s.omega)
+        everyone = s.active > 0.5
+        iterate_newton(self, f, s, everyone, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
+        self.invoke(f, "psi")
+        closed = largest_violation(self, f) < CLOSED_TOL
+        distance = self.largest(f, self._distance(f))
+        closed = closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
+        self.invoke(f, "independent_rows")
+        with f.each(self.m) as i:
+            self.put_entry(f, "independent", i, f.select(closed, self.entry(f, "independent", i), 1.0))
+        with self.each_lane(f, s.active) as k:
+            to = self.result_address(f, "marks", self.to_int(f, f.lane(s.member, k)), self.m)
+            self.copy_lane(f, to, 0, "independent", k, count=self.m)
+
+    def _distance(self, f: Function) -> Callable[[Value], list[Value]]:
+        """Return the distance of each coordinate from the initial position, in its unit."""
+
+        def of_register(r: Value) -> list[Value]:
+            moved = self.vector(f, "state q", r) - self.vector(f, "point3 q", r)
+            return [f.abs(moved) * self.vector(f, "inverse unit", r)]
+
+        return of_register
+
+    def step_all(self, f: Function, s: Lane, fill):
+        """Find the marks of the members in all lanes, and take the next."""
+        f.call("find", f.given["work"], f.given["call"])
+        s.active = f.const(0.0, DOUBLE, f.width)
+        fill()

@@ -1,0 +1,136 @@
+"""One step of an explicit Runge-Kutta method, with the estimate of its error."""
+
+import numpy as np
+
+from udkjax.native.base.ir import DOUBLE, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.steps import NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT
+from udkjax.native.run.manifold import newton, with_threshold
+
+
+def write_attempt(module: Module):
+    """Write `attempt`: from point 3 by `step` to `t1`, of lanes that are `stepping`.
+
+    It leaves the state there as `state q`, `result v` and `result a`, with its `error` and `distance`.
+    """
+    f, s = module.function("attempt")
+    method, stages = module.method, module.method.stages
+    one = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
+    s.ok = one()
+    s.distance = f.const(np.inf, DOUBLE, f.width)
+    begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
+
+    def take_stages():
+        for i in range(1, stages):
+            stage_state(module, f, s, i)
+            module.accelerate_stage(f, i)
+            check_pivots(module, f, s, f"stage{i} a")
+            module.record_stage(f, s, i)
+
+    def clear_stages():
+        # They may hold what is no number, of a member that failed: no time at all would still multiply that.
+        with f.each(module.rowcount) as r:
+            for i in range(1, stages):
+                module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
+
+    f.choose(begins, clear_stages, take_stages)
+    stage_state(module, f, s, stages)
+    setattr(s, "state t", s.t1)
+    if not module.plan.projected:
+        module.accelerate(f, "result a")
+        check_pivots(module, f, s, "result a")
+        with f.each(module.rowcount) as r:
+            module.put(f, "result v", r, module.vector(f, "state v", r))
+        estimate_errors(module, f, s, "result a", "result dq", "result dv")
+        with f.each(module.rowcount) as r:
+            for d in ("dq", "dv"):
+                module.put(f, f"state {d}", r, module.vector(f, f"result {d}", r))
+    else:
+        if not method.ends:
+            estimate_errors(module, f, s, None, "state dq", "state dv")
+        newton(module, f, s)
+        module.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
+        module.accelerate_end(f)
+        unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
+        if module.falls_back:
+            s.where(unsafe, ok=0.0)
+        if method.ends:
+            estimate_errors(module, f, s, "result a", "state dq", "state dv")
+            threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
+            with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
+        if module.falls_back:
+            repeats = (s.stepping > 0.5) & (s.fallback > 0.5)
+            with f.if_(f.any_of(repeats)):
+                module.invoke(f, "finish_by_fallback")
+                module.accelerate_end(f)
+                s.where(repeats, ok=1.0)
+    _measure_error(module, f, s)
+
+
+def _measure_error(module: Module, f: Function, s: Lane):
+    """Compute `error`, the largest of all coordinates over its tolerance: not a number where any of them is none."""
+    q0, v0, q1, v1 = "point3 q", "point3 v", "state q", "result v"
+    rtol = module.broadcast(f, s.rtol)
+    weight = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
+
+    def relative(r: Value) -> list[Value]:
+        found = []
+        for d, scale, y0, y1 in (("dq", "scale q", q0, q1), ("dv", "scale v", v0, v1)):
+            left = module.vector(f, f"result {d}", r)
+            if weight:
+                left = f.fma(module.vector(f, f"state {d}", r) - left, weight, left)
+            size = f.max(f.abs(module.vector(f, y0, r)), f.abs(module.vector(f, y1, r)))
+            found.append(f.abs(left) / f.fma(rtol, size, module.vector(f, scale, r)))
+        return found
+
+    # A number that is not finite is the largest of no comparison: zero times it is looked for instead.
+    check = f.variable(0.0, width=module.plan.vector)
+    with f.each(module.rowcount) as r:
+        for x in (*relative(r), module.vector(f, "result a", r)):
+            check.value = f.fma(x, 0.0, check.value)
+    total = check.value if module.plan.width > 1 else f.total(check.value)
+    s.error = module.largest(f, relative)
+    s.where((s.ok < 0.5) | total.is_not(0.0), error=np.nan)
+    s.where(~(s.distance >= 0.0), distance=0.0)
+
+
+def stage_state(module: Module, f: Function, s: Lane, i: int, start: str = "point3", step: Value | None = None):
+    """Compute the state of stage i, of the step from a point."""
+    step = s.step if step is None else step
+    method, h, names = module.method, module.broadcast(f, step), [f"{start} a", *module.stage_accelerations[1:]]
+    setattr(s, "state t", f.fma(step, float(method.nodes[i]), getattr(s, f"{start}_t")))
+    with f.each(module.rowcount) as r:
+        q, v = module.vector(f, f"{start} q", r), module.vector(f, f"{start} v", r)
+        sum_q, sum_v = module.weighted_sum(f, method.q[i], r, names), module.weighted_sum(f, method.v[i], r, names)
+        slope = v * float(method.nodes[i]) if sum_q is None else f.fma(h, sum_q, v * float(method.nodes[i]))
+        module.put(f, "state q", r, f.fma(h, slope, q))
+        module.put(f, "state v", r, v if sum_v is None else f.fma(h, sum_v, v))
+
+
+def check_pivots(module: Module, f: Function, s: Lane, name: str):
+    """Compute accelerations whose pivots are too small to be trusted by the fallback, or give the attempt up."""
+    if not module.falls_back or module.is_formulated:
+        return
+    unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
+    with f.if_(f.any_of(unsafe)):
+        f.choose(
+            f.any_of(unsafe & (s.fallback > 0.5)),
+            lambda: module.invoke(f, "accelerate_by_fallback", name),
+            lambda: s.where(unsafe, ok=0.0),
+        )
+
+
+def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
+    """Of q and v, from the accelerations of all stages; `end`: those at the end, where they are the last stage's."""
+    h = module.broadcast(f, s.step)
+    names = list(module.stage_accelerations)
+    if module.method.ends and end:
+        names[-1] = end
+    saved, module.stage_accelerations = module.stage_accelerations, names
+    with f.each(module.rowcount) as r:
+        error_q, error_v = module.weighted_sum(f, module.method.error_q, r), module.weighted_sum(f, module.method.error_v, r)
+        zero = f.const(0.0, DOUBLE, module.plan.vector)
+        module.put(f, to_q, r, zero if error_q is None else h * (h * error_q))
+        module.put(f, to_v, r, zero if error_v is None else h * error_v)
+    module.stage_accelerations = saved

@@ -1,0 +1,1 @@
+"""Runs that watch conditions, and end where one of them crosses zero."""

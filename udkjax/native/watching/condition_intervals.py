@@ -1,0 +1,144 @@
+"""Intervals between nodes at which conditions are known: what becomes of them (watching.py)."""
+
+from itertools import pairwise
+
+from udkjax.native.base.ir import DOUBLE, Function, Value, Variable
+from udkjax.native.base.layout import Lane
+from udkjax.native.watching.conditions import (
+    FAR,
+    FINER,
+    FINEST,
+    MIDDLE,
+    MISS,
+    MOST_JUMPS,
+    MOST_STUCK,
+    RESOLVED,
+    SECOND,
+    SHORT_PAIR,
+    SHORTEST_SPAN,
+    UNDEFINED,
+    VARIES_FAST,
+)
+from udkjax.native.watching.watch_memory import WatchMemory
+
+
+def write_judge(module: WatchMemory):
+    """`judge(work)`: in lanes where `low` is one, what becomes of the two intervals whose last node was looked at."""
+    f, s = module.function("judge")
+    mask, length = s.low > 0.5, s.look - s.first_t
+    unsure = [f.variable(0.0), f.variable(0.0)]
+    hits = [f.variable(0.0), f.variable(0.0)]
+    steps = (s.middle_t - s.first_t, s.look - s.middle_t)
+    x = steps[0] / length
+    with f.each(module.conditions.count) as c:
+        g = [module.condition(f, name, c) for name in ("g0", "g1", "g")]
+        rate = [module.condition(f, name, c) for name in ("rate0", "rate1", "rate")]
+        finite = f.is_finite(g[1]) & f.is_finite(g[2]) & f.is_finite(g[0])
+        smooth = f.is_finite(rate[0]) & f.is_finite(rate[1]) & f.is_finite(rate[2])
+        error = _error(f, g, rate, length, x)
+        side, on, floor = module.condition(f, "side", c), module.condition(f, "on", c) > 0.5, module.condition(f, "floor", c)
+        for k in range(2):
+            after = f.select(f.abs(g[k + 1]) <= floor, side, _sign(f, g[k + 1]))
+            hit, sure = _judge_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)
+            bad = on & ~(sure & smooth)
+            direction = module.condition(f, "direction", c)
+            counts = hit & on & (direction.is_(0.0) | direction.is_(after))
+            fault = f.select(finite, f.select(bad, f.const(VARIES_FAST, DOUBLE, f.width), 0.0), UNDEFINED)
+            unsure[k].value = f.max(fault, unsure[k].value)
+            hits[k].value = f.select(counts, f.const(1.0, DOUBLE, f.width), hits[k].value)
+            module.put_condition(f, f"hit{k + 1}", c, f.select(counts, after, f.const(0.0, DOUBLE, f.width)))
+            module.put_condition(f, f"side{k + 1}", c, after)
+            side = after
+    _advance(module, f, s, mask, unsure, hits)
+
+
+def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unsure: list[Variable], hits: list[Variable]):
+    """Go on behind the intervals that are sure; locate what crosses in them; look closer at others, or stop."""
+    one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
+    behind_break = s.fresh > s.first_t  # the polynomial is that of another piece of the motion
+    span = s.look - s.first_t
+    length, jumps = span * s.omega, f.variable(0.0)
+    may_jump = (length <= SHORT_PAIR) & (s.jumps < float(MOST_JUMPS)) & (s.stuck < float(MOST_STUCK))
+    is_finest = (length <= FINEST) | (span <= s.smallest * SHORTEST_SPAN)
+    s.stops, s.seeks = zero, zero
+    s.low, s.high = s.first_t, s.middle_t
+    for k, states in enumerate((("middle q", "middle v"), ("state q", "result v"))):
+        fault = unsure[k].value
+        is_jump = mask & fault.is_(VARIES_FAST) & may_jump
+        jumps.value = f.select(is_jump, one, jumps.value)
+        unclear = mask & (fault > 0.0) & ~is_jump
+        finer = unclear & ~(is_finest | (fault.is_(VARIES_FAST) & (length <= SHORT_PAIR)))
+        is_hit = mask & (hits[k].value > 0.5) & ~unclear
+        stops = (unclear & ~finer) | (is_hit & behind_break)
+        seeks = is_hit & ~stops
+        s.where(stops, stops=one)
+        s.where(seeks, seeks=one)
+        module.move_conditions(f, seeks, **{f"hit{k + 1}": "hit"})
+        _refine(module, f, s, finer, span, k)
+        mask = mask & ~stops & ~seeks & ~finer
+        s.where(mask & ~is_jump, stuck=0.0)
+        module.copy_state(f, mask, states, "sure")
+        module.move_conditions(f, mask, **{f"side{k + 1}": "side"})
+        if k == 0:
+            s.where(mask, sure_t=s.middle_t, low=s.middle_t, high=s.look)
+    s.where(mask, jumps=f.select(jumps.value > 0.5, s.jumps + 1.0, f.select(s.share >= 1.0, zero, s.jumps)))
+    s.where(mask, share=f.min(s.share * 2.0, one))
+    with f.if_(f.any_of(mask)):
+        module.begin_intervals(f, s, mask)
+
+
+def _refine(module: WatchMemory, f: Function, s: Lane, mask: Value, span: Value, k: int):
+    """Look again at two intervals, from the first node or the one in the middle on, at nodes that are closer."""
+    with f.if_(f.any_of(mask)):
+        if k == 1:
+            module.move_conditions(f, mask, g1="g0", rate1="rate0")
+            s.where(mask, first_t=s.middle_t)
+        span = span * (1 / FINER)
+        s.where(mask, share=s.share * (1 / FINER), which=float(SECOND), stuck=s.stuck + 1.0)
+        s.where(mask, node=f.fma(span, MIDDLE, s.first_t), behind_middle=s.first_t + span)
+
+
+def _sign(f: Function, x: Value) -> Value:
+    one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
+    return f.select(x > 0.0, one, f.select(x < 0.0, -one, zero))
+
+
+def _error(f: Function, g: list[Value], rate: list[Value], length: Value, x: Value) -> Value:
+    """Return by how much Hermite's cubic over two intervals misses the condition, or its rate, in between."""
+    a, da, b, db = g[0], rate[0] * length, g[2], rate[2] * length
+    square, cube = (b - a) * 3.0 - da * 2.0 - db, (a - b) * 2.0 + da + db
+    value = a + x * (da + x * (square + x * cube))
+    slope = da + x * (square * 2.0 + x * cube * 3.0)
+    of_value, of_rate = f.abs(g[1] - value), f.abs(rate[1] * length - slope) * MISS
+    return f.select(of_value > of_rate, of_value, of_rate)
+
+
+def _judge_interval(
+    f: Function,
+    ends: tuple[Value, Value, Value, Value],
+    step: Value,
+    error: Value,
+    before: Value,
+    after: Value,
+    floor: Value,
+) -> tuple[Value, Value]:
+    """Tell whether a condition, of values and rates at both ends, changes its side in an interval, and whether that is sure."""
+    hit = after * before < 0.0
+    side = f.select(before.is_(0.0), after, before)
+    a, b = ends[0] * side, ends[2] * side
+    one, two = a + ends[1] * side * step * (1 / 3), b - ends[3] * side * step * (1 / 3)
+    second, fourth, middle, e = (a + one * 3.0) * 0.25, (two * 3.0 + b) * 0.25, (one + two) * 0.5, error * (8 / 3)
+    low, high = f.min(f.min(a, b), f.min(second, fourth)), f.max(f.max(a, b), f.max(second, fourth))
+    low, high = f.min(low, middle - e), f.max(high, middle + e)
+    resolved = error <= (high - low) * RESOLVED
+    away = (low >= -floor) & (resolved | (low >= error * FAR - floor))
+
+    def changes_once(x: Value) -> Value:
+        signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]
+        found = ~signs[-1]
+        for now, later in pairwise(signs):
+            found = found & (now | ~later)
+        return found
+
+    single = changes_once(middle - e) & changes_once(middle + e) & resolved
+    return hit, (hit & single) | (~hit & away)

@@ -1,0 +1,87 @@
+"""Machine code of what an event needs to know of single states: accelerations, conditions, and what impulses do.
+
+Of a state (t, q, v) it returns, one behind another:
+
+    a                        the accelerations (n,)
+    g, g_dot, g_ddot         conditions with first and second rates along the motion (E,) each
+    g_t, g_q, g_v            their derivatives (E,), (E, n), (E, n)
+    d                        directions of impulses along g_q (E, n), of impacts alone
+
+A direction d = P M^(-1) g_q^T is the velocity that a unit impulse along g_q gives, with P the part that the constraints leave, so
+that W_ij = g_q,i d_j.
+"""
+
+from udkjax.native.base.ir import Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.program import write
+from udkjax.native.run.state_functions import StateAccelerations, StateTangentPart
+from udkjax.native.watching.conditions import Conditions
+
+
+class EventStates(StateTangentPart, StateAccelerations):
+    """The text of a module that evaluates conditions and directions of impulses at states.
+
+    Its further input holds the numbers of the conditions, and one over the mass of each coordinate.
+    """
+
+    inputs = ("event_numbers",)
+    found = ()
+
+    def __init__(
+        self, code, conditions: Conditions, impacts: tuple[int, ...], pseudoinverse, formulation, width: int, vector: int
+    ):
+        self.conditions, self.impacts = conditions, impacts
+        super().__init__(code, pseudoinverse, formulation, width, vector)
+        self.places.add("event numbers", conditions.number_count)
+        self.places.add("event values", len(conditions.at_state.outputs))
+        self.places.add("inverse mass", self.n)
+        self.places.add("directions", len(impacts) * self.n)
+
+    @property
+    def solving(self) -> list[str]:
+        return ["accelerations", *(["tangent_part"] if self.impacts else [])]
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        given = self.member_address(f, "event_numbers", member)
+        for name, start, count in (
+            ("event numbers", 0, self.conditions.number_count),
+            ("inverse mass", self.conditions.number_count, self.n),
+        ):
+            with f.each(count) as i:
+                self.put_lane_entry(f, name, lane, f.load(given, i + start), i)
+
+    def write_programs(self):
+        super().write_programs()
+        n, p, program = self.n, self.places, self.conditions.at_state
+        inputs = [("work", p["state t"])]
+        for name in ("state q", "state v", "result a"):
+            inputs += [("work", p[name] + i) for i in range(n)]
+        inputs += [("work", p["event numbers"] + i) for i in range(self.conditions.number_count)]
+        outputs = [("work", p["event values"] + k) for k in range(len(program.outputs))]
+        self.functions.append(write(program, "conditions", self.plan.width, ("work",), inputs, outputs))
+
+    def _evaluate(self, f: Function, s: Lane):
+        StateAccelerations._evaluate(self, f, s)
+        f.call("conditions", f.given["work"])
+        count = self.conditions.own_count
+        for k, event in enumerate(self.impacts):
+            with f.each(self.n) as i:
+                normal = self.entry(f, "event values", i + (4 * count + event * self.n))
+                self.put_entry(f, "state dq", i, normal * self.entry(f, "inverse mass", i))
+                self.put_entry(f, "state dv", i, 0.0)
+            StateTangentPart._evaluate(self, f, s)
+            with f.each(self.n) as i:
+                self.put_entry(f, "directions", i + k * self.n, self.entry(f, "result dq", i))
+
+    def write_found(self, f: Function, s: Lane):
+        counts = {
+            "result a": self.n,
+            "event values": len(self.conditions.at_state.outputs),
+            "directions": len(self.impacts) * self.n,
+        }
+        with self.each_lane(f, s.active) as k:
+            to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))
+            start = 0
+            for name, count in counts.items():
+                self.copy_lane(f, to, start, name, k, count=count)
+                start += count

@@ -1,0 +1,87 @@
+"""Crossings of zero of conditions that a run watches: located on the polynomial of outputs, and by a step that ends there."""
+
+from udkjax.native.base.ir import DOUBLE, Value
+from udkjax.native.base.steps import POINTS, RUNNING, UNIT
+from udkjax.native.watching.conditions import LAST_CHANGE, LEAST_STEP, MOST_LANDINGS, UNDER_WAY, WANTED
+from udkjax.native.watching.watch_memory import WatchMemory
+
+
+def write_locate(module: WatchMemory):
+    """`locate(work)`: the crossing between `low` and `high` of lanes that seek one, by bisection."""
+    f, s = module.function("locate")
+    work, one, zero = f.given["work"], f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
+
+    def crossed() -> Value:
+        """The first condition beyond zero, or -1."""
+        found = f.variable(-1.0)
+        with f.each(module.conditions.count) as c:
+            beyond = (module.condition(f, "hit", c) * module.condition(f, "g", c) > 0.0) & (found.value < 0.0)
+            found.value = f.select(beyond, f.like(c, DOUBLE, f.width), found.value)
+        return found.value
+
+    def wide() -> Value:
+        middle = (s.low + s.high) * 0.5
+        s.due = f.select((s.seeks > 0.5) & (s.high - s.low > s.smallest * UNIT) & (middle > s.low) & (middle < s.high), one, zero)
+        return f.any_of(s.due > 0.5)
+
+    with f.while_(wide):
+        s.look = (s.low + s.high) * 0.5
+        f.call("look", work)
+        due, is_behind = s.due > 0.5, crossed() >= 0.0
+        s.where(due & is_behind, high=s.look)
+        s.where(due & ~is_behind, low=s.look)
+    s.look, s.due = s.high, s.seeks
+    f.call("look", work)
+    event, seeks = crossed(), s.seeks > 0.5
+    is_found = seeks & (event >= 0.0)
+    lands = is_found & (s.high - s.point0_t > s.smallest * LEAST_STEP)
+    s.where(seeks, stops=f.select(lands, zero, one), seeks=zero)
+    s.where(is_found, event=event, sure_t=s.high, target=s.high)
+    s.where(lands, landing=float(WANTED))
+    module.copy_state(f, is_found, ("state q", "result v"), "sure")
+
+
+def write_approach(module: WatchMemory):
+    """`approach(work)`: a step to the target, from the last point before it, of lanes that are landing."""
+    f, s = module.function("approach")
+    wanted, zero = s.landing.is_(float(WANTED)), f.const(0.0, DOUBLE, f.width)
+    for k in range(POINTS):  # the latest of those that are early enough
+        early = wanted & (s.target - getattr(s, f"point{k}_t") > s.smallest * LEAST_STEP)
+        module.copy_point(f, early, f"point{k}", "before")
+        s.where(early, low=getattr(s, f"point{k}_t"))
+    module.copy_point(f, wanted, "before", f"point{POINTS - 1}")
+    s.where(wanted, point3_t=s.low, landing=float(UNDER_WAY))
+    lands, t1 = s.landing > 0.5, s.point3_t + s.h
+    t1 = f.select(t1 > s.target - s.smallest * LEAST_STEP, s.target, t1)
+    s.where(lands, t1=t1, step=f.select(s.stepping > 0.5, t1 - s.point3_t, zero), begin=zero, last=zero, lands=zero)
+
+
+def write_land(module: WatchMemory):
+    """`land(work)`: what becomes of lanes whose step has ended at its target."""
+    f, s = module.function("land")
+    arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(RUNNING))
+    one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
+    setattr(s, "state t", s.point3_t)
+    for source, to in (("point3 q", "state q"), ("point3 v", "result v"), ("point3 a", "node a")):
+        module.copy(f, source, to)
+    f.call("conditions", f.given["work"])
+    g, rate = f.variable(0.0), f.variable(0.0)
+    with f.each(module.conditions.count) as c:
+        own = s.event.is_(f.like(c, DOUBLE, f.width))
+        g.where(own, module.condition(f, "g", c))
+        rate.where(own, module.condition(f, "rate", c))
+    change = -(g.value / f.select(rate.value.is_(0.0), one, rate.value))
+    is_small = f.abs(change) * s.omega <= LAST_CHANGE
+    goes_on = arrived & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
+    s.where(goes_on, landing=float(WANTED), target=s.target + change, landings=s.landings + 1.0)
+    done, change = arrived & ~goes_on, f.select(is_small, change, zero)
+    ahead = module.broadcast(f, change)
+    exact = done & is_small
+    s.where(exact, sure_t=s.point3_t + change)
+    with f.each(module.rowcount) as r:
+        q, v, a = (module.vector(f, f"point3 {x}", r) for x in "qva")
+        module.put(f, "state q", r, f.fma(f.fma(a, ahead * 0.5, v), ahead, q))
+        module.put(f, "result v", r, f.fma(a, ahead, v))
+    module.copy_state(f, exact, ("state q", "result v"), "sure")
+    s.where(done, stops=one)
+    module.stop(f, s)

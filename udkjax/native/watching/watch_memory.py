@@ -1,0 +1,128 @@
+"""The memory of runs that watch conditions (watching.py): what goes in and comes out, and how far the intervals go."""
+
+from udkjax.native.base.ir import DOUBLE, Function, Value
+from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.steps import CROSSED, UNIT, UNSURE
+from udkjax.native.run.trajectory import Trajectory
+from udkjax.native.watching.conditions import HEAD, MIDDLE, PER_TIME, SECOND, TURN, VARIES, Conditions
+
+LANE_NUMBERS = {
+    "node": "the next node (s); infinite where there is none",
+    "which": "which of three it is",
+    "first_t": "the first of the three (s)",
+    "middle_t": "the one in the middle (s)",
+    "behind_middle": "the last of the three (s)",
+    "sure_t": "the time up to which all is certain (s)",
+    "turn": "by which intervals vary",
+    "share": "of an ordinary interval, that they take",
+    "jumps": "how many there were since they were ordinary",
+    "stuck": "how often they became finer since one was clear",
+    "fresh": "the time at which the run began anew (s)",
+    "event": "the condition that crosses, or -1",
+    "slowest": "rate of the scene (1/s)",
+    "worst": "the largest violation of Psi at a node",
+    "look": "the time to look at (s)",
+    "low": "of a crossing: the time before it (s)",
+    "high": "the time behind it (s)",
+    "seeks": "whether a crossing is being located",
+    "landing": "whether a step is to end at a crossing",
+    "landings": "how many have",
+    "target": "the end of that step (s)",
+    "stops": "whether the run ends here, as something may happen",
+}
+
+
+class WatchMemory(Trajectory):
+    """A trajectory with memory for the conditions that it watches."""
+
+    outputs = ("crossing",)
+
+    def __init__(self, plan: Plan, conditions: Conditions):
+        self.conditions = conditions
+        super().__init__(plan)
+        self.inputs = (*self.inputs, "watch")
+        for name in LANE_NUMBERS:
+            self.places.add(name)
+        self.places.add("condition numbers", conditions.number_count)
+        for name in ("side", "on", "floor", "direction", "g", "rate", "g0", "rate0", "g1", "rate1", "side1", "side2", "hit"):
+            self.places.add(f"condition {name}", conditions.count)
+        for name in ("hit1", "hit2"):
+            self.places.add(f"condition {name}", conditions.count)
+        if conditions.rows:
+            self.places.add("multipliers", self.m)
+        for name in ("force q", "sure q", "sure v", "middle q", "middle v", "node a", "before q", "before v", "before a"):
+            self.places.add(name, self.n)
+
+    # --- what goes in and comes out
+
+    def begin_member(self, f: Function, lane: Value, member: Value):
+        given, start = self.member_address(f, "watch", member), 0
+        counts = {"numbers": self.conditions.number_count}
+        counts |= dict.fromkeys(("side", "on", "floor", "direction"), self.conditions.count)
+        for name, count in counts.items():
+            with f.each(count) as i:
+                self.put_lane_entry(f, f"condition {name}", lane, f.load(given, i + start), i)
+            start += count
+        for name in LANE_NUMBERS:
+            self.put_lane_entry(f, name, lane, f.const(0.0))
+        first = self.lane_entry(f, "start", lane)
+        for name in ("node", "sure_t", "fresh"):
+            self.put_lane_entry(f, name, lane, first)
+        self.put_lane_entry(f, "event", lane, f.const(-1.0))
+        self.put_lane_entry(f, "share", lane, f.const(1.0))
+        self.put_lane_entry(f, "slowest", lane, f.load(given, start))
+        for x in "qv":
+            with f.each(self.n) as i:
+                self.put_lane_entry(f, f"sure {x}", lane, self.lane_entry(f, f"point3 {x}", lane, i), i)
+
+    def end_members(self, f: Function, s: Lane):
+        with self.each_lane(f, s.due) as k:
+            member = self.to_int(f, f.lane(s.member, k))
+            to = self.result_address(f, "crossing", member, self.conditions.output_count(self.n))
+            for j, x in enumerate((s.event, s.sure_t, s.worst)):
+                f.store(f.lane(x, k), to, j)
+            self.copy_lane(f, to, HEAD, "condition side", k, count=self.conditions.count)
+            for j, x in enumerate("qv"):
+                self.copy_lane(f, to, HEAD + self.conditions.count + j * self.n, f"sure {x}", k)
+
+    # --- arrays of conditions, and states
+
+    def condition(self, f: Function, name: str, c: Value) -> Value:
+        return self.entry(f, f"condition {name}", c)
+
+    def put_condition(self, f: Function, name: str, c: Value, x: Value, mask: Value | None = None):
+        x = x if mask is None else f.select(mask, x, self.condition(f, name, c))
+        self.put_entry(f, f"condition {name}", c, x)
+
+    def move_conditions(self, f: Function, mask: Value, **names: str):
+        """Copy arrays of conditions to others, in some lanes."""
+        with f.each(self.conditions.count) as c:
+            for source, to in names.items():
+                self.put_condition(f, to, c, self.condition(f, source, c), mask)
+
+    def copy_state(self, f: Function, mask: Value, sources: tuple[str, str], to: str):
+        for source, x in zip(sources, "qv", strict=True):
+            self.copy(f, source, f"{to} {x}", mask)
+
+    def stop(self, f: Function, s: Lane):
+        """End the runs of lanes that stop."""
+        stops = s.stops > 0.5
+        s.where(stops, code=f.select(s.event >= 0.0, f.const(float(CROSSED), DOUBLE, f.width), float(UNSURE)))
+        s.where(stops, until=f.min(s.until, s.sure_t), stops=0.0, landing=0.0)
+
+    def begin_intervals(self, f: Function, s: Lane, mask: Value):
+        """Take the node that was looked at for the first of two intervals."""
+        self.move_conditions(f, mask, g="g0", rate="rate0")
+        fastest = self.largest(f, lambda r: [f.abs(self.vector(f, "result v", r)) * self.vector(f, "inverse unit", r)])
+        start, rest = s.look, s.end - s.look
+        turn = s.turn + TURN
+        turn = turn - f.intrinsic("floor", turn)
+        span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / PER_TIME) * s.share / f.max(fastest, s.slowest)
+        # No farther than the next step: whoever looks closer at them later needs the points that the first node lies between.
+        span = f.min(span, s.h)
+        span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))
+        inf = f.const(float("inf"), DOUBLE, f.width)
+        goes_on = rest > s.smallest * (4 * UNIT)
+        middle = f.select(goes_on, f.fma(span, MIDDLE, start), inf)
+        s.where(mask, first_t=start, sure_t=start, turn=turn, which=float(SECOND), node=middle)
+        s.where(mask, behind_middle=f.select(span < rest, start + span, s.end))

@@ -1,0 +1,149 @@
+"""Runs that watch conditions: they end at the first crossing of zero, or where one cannot be ruled out.
+
+Conditions g(t, q, v) are programs, as accelerations are. They are looked at, with their rates along the motion, at nodes behind
+the accepted steps, two intervals at a time. Between two nodes a condition is Hermite's cubic up to E, by which the cubic over
+both intervals misses the value, or the rate, at the node in between: of one it is a sixteenth, so E is on the safe side. Where
+Bernstein's coefficients of the cubic plus and minus E do not change their sign, there is no crossing; where they change it once,
+there is one, which bisection finds on the polynomial that outputs lie on; a step is then taken to end there, and the last change
+of the time, by Newton's method, is a step of Taylor's. All else is looked at again, an eighth as far at a time; conditions that
+still vary then have a jump or a kink. Where there is one after another, or no number, the run ends: whoever called looks on.
+"""
+
+from udkjax.native.base.ir import DOUBLE, INT, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.program import write
+from udkjax.native.base.steps import DONE, POINTS, RUNNING
+from udkjax.native.run.manifold import project_output
+from udkjax.native.watching.condition_intervals import write_judge
+from udkjax.native.watching.conditions import FIRST, FORCE_STEP, SECOND, THIRD, WANTED
+from udkjax.native.watching.locating import write_approach, write_land, write_locate
+from udkjax.native.watching.watch_memory import WatchMemory
+
+
+class Watching(WatchMemory):
+    """The code of a trajectory that watches conditions."""
+
+    def write_derivatives(self):
+        self._write_conditions()
+        self._write_look()
+        write_judge(self)
+        write_locate(self)
+        write_land(self)
+        write_approach(self)
+        self._write_watch()
+
+    def before_step(self, f: Function, s: Lane):
+        with f.if_(f.any_of(s.landing > 0.5)):
+            f.call("approach", f.given["work"])
+
+    def after_step(self, f: Function, s: Lane):
+        f.call("watch", f.given["work"])
+        with f.if_(f.any_of(s.landing > WANTED + 0.5)):
+            f.call("land", f.given["work"])
+
+    def record_step(self, f: Function, s: Lane, accept: Value):
+        s.where(accept & (s.begin > 0.5), fresh=s.t1)
+
+    def program_names(self) -> list[str]:
+        return [*super().program_names(), *(["multipliers"] if self.conditions.rows else [])]
+
+    @property
+    def arrays(self):
+        return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.rows else {})
+
+    def _write_conditions(self):
+        """`conditions(work)`: all that is watched, and its rates, at `state t`, `state q`, `result v` and `node a`."""
+        n, conditions, p = self.n, self.conditions, self.places
+        inputs = [("work", p["state t"])]
+        for name in ("state q", "result v", "node a"):
+            inputs += [("work", p[name] + i) for i in range(n)]
+        inputs += [("work", p["condition numbers"] + i) for i in range(conditions.number_count)]
+        outputs = [("work", p[f"condition {name}"] + c) for name in ("g", "rate") for c in range(conditions.own_count)]
+        self.functions.append(write(conditions.program, "own_conditions", self.plan.width, ("work",), inputs, outputs))
+        f, s = self.function("conditions")
+        f.call("own_conditions", f.given["work"])
+        if conditions.rows:
+            self._write_forces(f, s)
+
+    def _write_forces(self, f: Function, s: Lane):
+        """The forces of contacts at rest, no numbers where a pivot is not to be trusted, and their rates, by differences."""
+        self.copy(f, "state q", "force q")
+        self.copy(f, "result v", "state v")
+        step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
+        ahead, nan = self.broadcast(f, step), f.const(float("nan"), DOUBLE, f.width)
+        for name in ("g", "rate"):
+            self.invoke(f, "multipliers")
+            for k, row in enumerate(self.conditions.rows):
+                place, c = f.like(row, INT, 1) + self.places["multipliers"], f.like(self.conditions.own_count + k, INT, 1)
+                force = f.select(s.safe > 0.5, -f.load(f.given["work"], place * f.width, f.width), nan)
+                self.put_condition(f, name, c, force if name == "g" else (force - self.condition(f, "g", c)) / step)
+            if name == "g":
+                setattr(s, "state t", before + step)
+                with f.each(self.rowcount) as r:
+                    q, v, a = (self.vector(f, x, r) for x in ("state q", "state v", "result a"))
+                    self.put(f, "state q", r, f.fma(f.fma(a, ahead * 0.5, v), ahead, q))
+                    self.put(f, "state v", r, f.fma(a, ahead, v))
+        setattr(s, "state t", before)
+        self.copy(f, "force q", "state q")
+
+    def _write_look(self):
+        """`look(work)`: the state at the time `look`, projected in lanes that are `due`, and the conditions there."""
+        program = self.conditions.program
+        f, s = self.function("look")
+        work, following = f.given["work"], s.next
+        s.next = s.look
+        f.call("between", work)
+        if any(program.uses(x) for x in program.inputs[1 + 2 * self.n : 1 + 3 * self.n]):
+            self._accelerate_between(f, s)
+        s.next = following
+        project_output(self, f, s, "due")
+        f.call("conditions", work)
+        s.where((s.due > 0.5) & ~(s.violated <= s.worst), worst=s.violated)
+
+    def _accelerate_between(self, f: Function, s: Lane):
+        """`node a`: the second derivative of the polynomial at the time `next`."""
+        ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+        with f.each(self.rowcount) as r:
+            q, zero = self.vector(f, f"difference{3 * POINTS - 1}", r), f.const(0.0, DOUBLE, self.plan.vector)
+            v = a = zero
+            for k in reversed(range(3 * POINTS - 1)):
+                d = ahead[k // 3]
+                a = f.fma(a, d, v * 2.0)
+                v = f.fma(v, d, q)
+                q = f.fma(q, d, self.vector(f, f"difference{k}", r))
+            self.put(f, "node a", r, a)
+
+    def _write_watch(self):
+        """`watch(work)`: look at all nodes behind the steps that were accepted."""
+        f, s = self.function("watch")
+        work, one = f.given["work"], f.const(1.0, DOUBLE, f.width)
+
+        s.where(s.landing > 0.5, until=-float("inf"))
+
+        def due() -> Value:
+            goes_on = s.code.is_(float(RUNNING)) | s.code.is_(float(DONE))
+            s.due = f.select((s.active > 0.5) & goes_on & (s.node <= s.until), one, 0.0)
+            return f.any_of(s.due > 0.5)
+
+        with f.if_(due()):
+            f.call("differences", work)
+            with f.while_(due):
+                s.look = s.node
+                f.call("look", work)
+                now = s.due > 0.5
+                first, middle, last = (now & s.which.is_(float(k)) for k in (FIRST, SECOND, THIRD))
+                with f.if_(f.any_of(middle)):
+                    self.move_conditions(f, middle, g="g1", rate="rate1")
+                    self.copy_state(f, middle, ("state q", "result v"), "middle")
+                    s.where(middle, middle_t=s.node, which=float(THIRD), node=s.behind_middle)
+                with f.if_(f.any_of(last)):
+                    s.low = f.select(last, one, 0.0)
+                    f.call("judge", work)
+                with f.if_(f.any_of(first)):
+                    self.begin_intervals(f, s, first)
+                with f.if_(f.any_of(s.seeks > 0.5)):
+                    f.call("locate", work)
+                self.stop(f, s)
+                # Outputs before the crossing lie on the polynomial that is still known.
+                wanted = s.landing.is_(float(WANTED))
+                s.where(wanted, until=f.min(s.until, s.sure_t), code=float(RUNNING), node=float("inf"))
