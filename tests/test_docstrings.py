@@ -10,18 +10,15 @@ from pathlib import Path
 import pytest
 
 import udkjax
-from udkjax import equations, expressions, pinv, scene
+from udkjax.equations import evaluate
 
-FLOORS = scene, pinv, expressions, equations
 NO_SUBJECT = re.compile("(What|Whatever|Whether|Which|Who|Whose|How|Where|When|As|Those|That)\\b")
 OBJECT = re.compile("(?:Return|Iterate over) (what|whatever|who|how many|how far|how much|how often|where)\\b")  # likewise
 CLAUSE = re.compile("(what|whatever|which|who|whose|how|that|those)\\b", re.IGNORECASE)  # begins no description, and no comment
-FUNCTIONS = {
-    f"{floor.__name__}.{name}": found
-    for floor in FLOORS
-    for name, found in vars(floor).items()
-    if inspect.isfunction(found) and not name.startswith("_") and found.__module__.startswith(floor.__name__)
-}
+PUBLIC = {f"udkjax.{name}": getattr(udkjax, name) for name in udkjax.__all__}
+PUBLIC |= {f"udkjax.equations.{name}": found for name, found in vars(evaluate).items() if hasattr(found, "__wrapped__")}
+FLOORS = tuple(f"udkjax.{floor}" for floor in ("scene", "pinv", "equations"))
+FUNCTIONS = {name: x for name, x in PUBLIC.items() if inspect.isfunction(x) and x.__module__.startswith(FLOORS)}
 
 
 def described(doc: str, section: str) -> set[str]:

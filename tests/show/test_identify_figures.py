@@ -8,7 +8,7 @@ import xarray
 
 from udkjax.show import identify_figures
 from udkjax.show.fit_figures import fit, residuals
-from udkjax.show.identify_figures import pictures, save_pictures
+from udkjax.show.identify_figures import pictures, save_fit_pictures
 
 N, NOISE = 60, 0.02
 KINDS = ("angle", "omega")
@@ -149,5 +149,5 @@ def test_single_samples_and_exact_fits_can_be_drawn(tmp_path):
     assert shown(pictures(data)["fit"])[0].get_title(loc="left") == "body.link0.angle"
     exact = made()
     exact["residual"], exact["noise"] = 0.0 * exact["residual"], np.nan * exact["noise"]
-    assert list(save_pictures(exact, tmp_path)) == ["fit.png", "residuals.png", "convergence.png", "correlation.png"]
+    assert list(save_fit_pictures(exact, tmp_path)) == ["fit.png", "residuals.png", "convergence.png", "correlation.png"]
     assert (tmp_path / "residuals.png").read_bytes().startswith(b"\x89PNG")

@@ -8,7 +8,7 @@ import xarray
 from matplotlib.colors import LogNorm
 
 from udkjax.integrate import Result
-from udkjax.show.sweep_figures import pictures, save_pictures
+from udkjax.show.sweep_figures import pictures, save_sweep_pictures
 
 TOLS, MASSES = 10.0 ** np.arange(-10, -6), np.array([1.0, 2.0, 4.0])
 COORDS = {"rtol": TOLS, "method": ["SVD", "Varga"], "mass": MASSES, "start": [-0.8, 0.2]}
@@ -122,5 +122,5 @@ def test_members_of_a_design_with_choices_have_a_panel_for_each():
 
 
 def test_pictures_are_written(tmp_path):
-    assert list(save_pictures(made("rtol", "mass"), tmp_path)) == ["result.png", "violation.png"]
+    assert list(save_sweep_pictures(made("rtol", "mass"), tmp_path)) == ["result.png", "violation.png"]
     assert (tmp_path / "result.png").read_bytes().startswith(b"\x89PNG")

@@ -116,7 +116,7 @@ def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], result
 
     import udkjax as udk
     from udkjax.scene.wording import plain
-    from udkjax.show.identify_figures import save_pictures
+    from udkjax.show.identify_figures import save_fit_pictures
     from udkjax.study.identify.estimate import Row
 
     out.mkdir(exist_ok=True)
@@ -126,4 +126,4 @@ def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], result
         csv.writer(file).writerows([Row._fields, *estimate.rows()])
     dataset = estimate.to_xarray(profiles)
     dataset.to_netcdf(out / "fit.nc", engine="h5netcdf")
-    return ["identified.toml", "estimate.json", "estimate.csv", "fit.nc", *save_pictures(dataset, out)]
+    return ["identified.toml", "estimate.json", "estimate.csv", "fit.nc", *save_fit_pictures(dataset, out)]

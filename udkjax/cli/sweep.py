@@ -91,7 +91,7 @@ def _estimate(mech: "Mechanism", arguments: dict[str, Any], memory: int, json: b
 
 def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, json: bool, choices: dict[str, Any]) -> None:
     import udkjax as udk
-    from udkjax.show.sweep_figures import save_pictures
+    from udkjax.show.sweep_figures import save_sweep_pictures
     from udkjax.show.sweep_summary import sweep_results, sweep_summary
 
     begun = time.perf_counter()
@@ -101,6 +101,6 @@ def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, j
     unfinished = out / ".sweep.nc"
     data.to_netcdf(unfinished, engine="h5netcdf")
     unfinished.replace(out / "sweep.nc")
-    files = ["sweep.nc", *save_pictures(data, out)]
+    files = ["sweep.nc", *save_sweep_pictures(data, out)]
     results = {**sweep_results(data), "seconds": seconds, "folder": out, "files": files}
     show(results, f"{sweep_summary(data, seconds)}\nwrote {', '.join(files)} to {out}", json)

@@ -21,3 +21,7 @@ How the code of a run is made, and where to look:
    the rules of differentiation.
 9. `wasm` compiles the same text for pages, where `evaluation` finds accelerations and energies at single states.
 """
+
+from udkjax.lazy_names import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]

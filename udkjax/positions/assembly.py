@@ -21,8 +21,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import Numbers, Scalar
+from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.element_programs import has_rheonomic_joints
 from udkjax.equations.position_closure import is_closed
@@ -209,7 +209,7 @@ def check(mechanism: Mechanism) -> Check:
     of all bodies, angles that look like degrees, bodies without a joint.
     """
     closure = close(mechanism)
-    before = psi(mechanism, 0.0, mechanism.q0)
+    before = constraints.psi(mechanism, 0.0, mechanism.q0)
     rows = len(before)
     closed = bool(closure.is_closed)
     found = analyse(mechanism)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.constraints import gamma, psi
+from udkjax.equations import constraints
 from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import ROUNDING_UNITS
@@ -142,7 +142,7 @@ class Curve(AbstractCurve):
 
     def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
         x = X * self.units
-        return self.weights * psi(self.mechanism, x[-1], x[:-1])
+        return self.weights * constraints.psi(self.mechanism, x[-1], x[:-1])
 
     def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
         return jax.jacfwd(self.residual)(X)
@@ -156,7 +156,7 @@ class Curve(AbstractCurve):
         return factors.inverse
 
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
-        return gamma(self.mechanism, s, q, v)
+        return constraints.gamma(self.mechanism, s, q, v)
 
 
 @dataclass(frozen=True)

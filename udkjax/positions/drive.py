@@ -16,8 +16,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.annotations import Scalar
+from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.constraints import psi
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
 from udkjax.equations.redundancy import kinematic_rows, ordinary_position, owners_of_row
 from udkjax.pinv.row_spaces import null_space
@@ -102,7 +102,7 @@ class Driven(NamedTuple):
     def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
         """Return the value of the coordinate (rad, m) in a position: of NumPy, where all is known."""
         if is_traced((self.mechanism, q)):
-            return psi(self.mechanism, 0.0, q)[self.row]
+            return constraints.psi(self.mechanism, 0.0, q)[self.row]
         return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
 
 

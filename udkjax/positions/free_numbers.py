@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.equations.constraints import psi
+from udkjax.equations import constraints
 from udkjax.positions.drive import Drive, drive
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
@@ -107,7 +107,7 @@ def position_model(
         zero = jnp.zeros(()) if origin is None else origin(mechanism)
         zero = zero + x[free.count] if shifted else zero
         return {
-            "psi": psi(driven.mechanism, s + zero, q),
+            "psi": constraints.psi(driven.mechanism, s + zero, q),
             "q0": jnp.ravel(mechanism.q0),
             "s0": driven.value(mechanism.q0) - zero,
             "measures": jnp.ravel(measures(mechanism, x, q.reshape(-1, 3), data)),

@@ -1,4 +1,4 @@
-"""Machine code of the positions of batches (native/closing/positions.py) for models of mechanisms, with errors that name the scene."""
+"""Machine code of positions of batches (native/closing/positions.py) for models of mechanisms; errors name the scene."""
 
 from typing import Any
 

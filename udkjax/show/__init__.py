@@ -1,1 +1,5 @@
 """Pictures and tables, for people."""
+
+from udkjax.lazy_names import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -31,7 +31,7 @@ def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
     return found | ({"profiles": profiles(data)} if "profile" in data else {})
 
 
-def save_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
+def save_fit_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
     """Write each picture to the folder, and iterate over the names of the files."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)

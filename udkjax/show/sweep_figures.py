@@ -261,7 +261,7 @@ def _result(code: int) -> str:
     return Result(code).name.replace("_", " ") if code in list(Result) else OTHER_RESULT
 
 
-def save_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
+def save_sweep_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
     """Write each picture to the folder, and iterate over the names of the files."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)

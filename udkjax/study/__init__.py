@@ -1,1 +1,5 @@
 """Questions asked of trajectories."""
+
+from udkjax.lazy_names import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from udkjax.equations import constraints, loads
+from udkjax.equations import constraints, determinacy, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.determinacy import left_null_space, uniqueness
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD
 from udkjax.positions.assembly import State, assemble
@@ -93,8 +92,8 @@ def _symbols(
         "b": uk.b(mechanism, t, q, v, baumgarte, w),
         "a": uk.accelerations(mechanism, t, q, v, method, baumgarte, w),
         "multipliers": uk.multipliers(mechanism, t, q, v, method, baumgarte, w),
-        "unique": uniqueness(mechanism, t, q, analysis).unique,
-        "null_rows": left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None],
+        "unique": determinacy.uniqueness(mechanism, t, q, analysis).unique,
+        "null_rows": determinacy.left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None],
     }
 
 

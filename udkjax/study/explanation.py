@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udkjax.equations.determinacy import unique_direction
+from udkjax.equations import determinacy
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.wording import plain, plural, row_label
@@ -194,7 +194,7 @@ def _directions(e: Explanation) -> list[tuple[str, float]]:
     found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
     for name, joint in e.mechanism.joints.items():
         own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
-        angle = unique_direction(null_rows[own]) if isinstance(joint, Revolute) else None
+        angle = determinacy.unique_direction(null_rows[own]) if isinstance(joint, Revolute) else None
         found += [] if angle is None else [(name, angle)]
     return found
 

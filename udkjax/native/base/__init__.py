@@ -1,1 +1,1 @@
-"""What all machine code stands on: the text, its memory and its modules, and the way from text to an operation of XLA."""
+"""The foundation of all machine code: its text, memory and modules, and the way from text to an operation of XLA."""

@@ -9,8 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from udkjax.equations import Analysis, analyse, efforts, energy, reactions, singular_values, unique_reactions, violation
-from udkjax.equations.determinacy import STATIC_RANK_TOL
+from udkjax.equations import (
+    Analysis,
+    analyse,
+    determinacy,
+    efforts,
+    energy,
+    reactions,
+    singular_values,
+    unique_reactions,
+    violation,
+)
 from udkjax.programs.deferred import deferred
 from udkjax.scene import GROUND, Mechanism
 from udkjax.study.accuracy import conserves_energy
@@ -80,10 +89,10 @@ def singular_values_over_time(mechanism: Mechanism, solution: ShownMotion) -> Fl
 
 
 def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return the number of singular values above `STATIC_RANK_TOL` of the largest, in each row; nan where there are none."""
+    """Return the number of singular values above `STATIC_RANK_TOL` times the largest, in each row; NaN if there are none."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
-    count = (values > STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
+    count = (values > determinacy.STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
     return np.where(np.isfinite(values[:, 0]), count, np.nan)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, unique_direction
+from udkjax.equations import determinacy
 from udkjax.equations.redundancy import choose_dispensable
 from udkjax.positions.assembly import State, close, require_closed
 from udkjax.positions.channels import StateHistory
@@ -26,7 +26,7 @@ def diagnose(
     state: State | None = None,
     solution: StateHistory | None = None,
     t: float = 0.0,
-    rank_tol: float = STATIC_RANK_TOL,
+    rank_tol: float = determinacy.STATIC_RANK_TOL,
     time_tol: float | None = None,
     fixes: bool = True,
     walk: bool = True,
@@ -107,7 +107,7 @@ def _dependencies(
     spared = choose_dispensable([best.left])
     N = here.left
     for row in spared:
-        if np.linalg.norm(N[row]) > UNIQUE_TOL:
+        if np.linalg.norm(N[row]) > determinacy.UNIQUE_TOL:
             N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
     return permanent, dependencies(N, owners, attached)
 
@@ -151,6 +151,6 @@ def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dic
         share = np.linalg.norm(N, axis=1)
         direction = None
         if isinstance(element, Revolute | Weld):
-            direction = unique_direction(N[:2])
-        found[name] = JointForces(tuple((share <= UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
+            direction = determinacy.unique_direction(N[:2])
+        found[name] = JointForces(tuple((share <= determinacy.UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
     return found

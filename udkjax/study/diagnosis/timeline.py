@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.interpolate import BPoly
 
+from udkjax.equations import determinacy
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.determinacy import singular_values
 from udkjax.equations.quantities import equations_of
 from udkjax.integrate import simulate
 from udkjax.integrate.solution import Solution
@@ -154,7 +154,7 @@ class _Path:
 
 @deferred
 def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Array:
-    return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
+    return jax.vmap(lambda t, q: determinacy.singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
 @deferred

@@ -1,0 +1,120 @@
+"""Doors: what floors import of each other is listed in the `__init__.pyi` of the folder it comes from, and nothing else is."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import udkjax
+from tests.fresh_process import python
+
+ROOT = Path(udkjax.__file__).parent
+Name = tuple[str, str]  # the module, and the name in it
+# At most so many names of a floor are used by floors above.
+MOST_NAMES = {"scene": 127, "equations": 110, "native": 78}
+
+
+def imported_names(file: Path) -> list[Name]:
+    """Every name that a file imports from the package, wherever in the file it does so."""
+    nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+    froms = [n for n in nodes if isinstance(n, ast.ImportFrom) and (n.module or "").split(".")[0] == "udkjax"]
+    return [(n.module or "", name.name) for n in froms for name in n.names]
+
+
+def door(root: Path, floor: str) -> set[Name]:
+    """The names in the stub of a floor, each in its module, and in the face of the floor."""
+    names = imported_names(root / floor / "__init__.pyi")
+    return {*names, *((f"udkjax.{floor}", name) for _, name in names)}
+
+
+def floors(root: Path) -> list[str]:
+    return sorted(x.parent.name for x in root.glob("*/__init__.pyi"))
+
+
+def used_names(root: Path) -> dict[str, dict[Name, list[str]]]:
+    """Of each floor with a door: the names that other floors import, and the files that do."""
+    found: dict[str, dict[Name, list[str]]] = {floor: {} for floor in floors(root)}
+    for file in sorted(root.rglob("*.py")):
+        place = file.relative_to(root)
+        if place.name == "__init__.py" and len(place.parts) == 1:
+            continue
+        for module, name in imported_names(file):
+            parts = module.split(".")
+            floor = parts[1] if len(parts) > 1 else name
+            if floor in found and floor != place.parts[0]:
+                found[floor].setdefault((module, name), []).append(str(place))
+    return found
+
+
+def violations(root: Path) -> list[str]:
+    return [
+        f"{places[0]}: {module}.{name}"
+        for floor, names in used_names(root).items()
+        for (module, name), places in names.items()
+        if (module, name) not in door(root, floor)
+    ]
+
+
+def test_floors_import_only_what_stands_in_a_door():
+    assert violations(ROOT) == []
+
+
+def test_an_import_past_the_door_is_caught(tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "__init__.pyi").write_text("from udkjax.scene.bodies import Body as Body")
+    (tmp_path / "show").mkdir()
+    for line in ("from udkjax.scene.bodies import Body", "from udkjax.scene import Body"):
+        (tmp_path / "show" / "plots.py").write_text(line)
+        assert violations(tmp_path) == []
+    for line in ("from udkjax.scene.bodies import secret", "def late():\n    from udkjax.scene import bodies"):
+        (tmp_path / "show" / "plots.py").write_text(line)
+        assert violations(tmp_path)
+
+
+@pytest.mark.parametrize("floor", floors(ROOT))
+def test_a_door_lists_nothing_that_nobody_takes(floor):
+    used = {name for _, name in used_names(ROOT)[floor]} | {name for _, name in imported_names(ROOT / "__init__.pyi")}
+    listed = {name for _, name in imported_names(ROOT / floor / "__init__.pyi")}
+    assert listed - used <= OFFERED.get(floor, set())
+
+
+# Names that no floor takes, but users do.
+OFFERED = {
+    "equations": {
+        "TextbookEquations",
+        "Uniqueness",
+        "force",
+        "gamma",
+        "kinetic_energy",
+        "mass",
+        "potential_energy",
+        "prepare",
+        "psi",
+    }
+    | {"psi_dot", "psi_q"},
+    "pinv": {"LeastSquaresSolution"},
+}
+
+
+@pytest.mark.parametrize("floor", sorted(MOST_NAMES))
+def test_doors_are_narrow(floor):
+    assert len(used_names(ROOT)[floor]) <= MOST_NAMES[floor]
+
+
+WING = """
+import sys
+import udkjax as udk
+mech = udk.library.slider_crank() if hasattr(udk.library, "slider_crank") else udk.library.parallelogram()
+udk.kinematics, udk.design, udk.design_all, udk.equilibrium, udk.modes, udk.travel, udk.PositionBatch, udk.assemble
+print(sorted(m for m in sys.modules if m.startswith(("udkjax.integrate", "udkjax.study", "diffrax"))))
+"""
+
+
+def test_positions_statics_and_synthesis_load_nothing_that_integrates():
+    assert python(WING) == "[]"
+
+
+def test_kinematics_loads_no_floor_beside_positions():
+    loaded = "[m for m in sys.modules if m.startswith('udkjax.') and m.split('.')[1] in beside and m.count('.') > 1]"
+    beside = "beside = ('statics', 'synthesis', 'integrate', 'study')"
+    assert python(f"import sys, udkjax; udkjax.kinematics; {beside}; print({loaded})") == "[]"

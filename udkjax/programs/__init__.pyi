@@ -1,0 +1,17 @@
+"""The door of `programs`: the names that floors above import, each from the module that it is in."""
+
+from udkjax.programs.deferred import deferred as deferred
+from udkjax.programs.deferred import deferred_if_traced as deferred_if_traced
+from udkjax.programs.deferred import deferred_p as deferred_p
+from udkjax.programs.deferred import trace_once as trace_once
+from udkjax.programs.numpy_program import Meter as Meter
+from udkjax.programs.numpy_program import TooLongError as TooLongError
+from udkjax.programs.numpy_program import evaluate_as as evaluate_as
+from udkjax.programs.numpy_program import expand_as as expand_as
+from udkjax.programs.numpy_program import has_rules as has_rules
+from udkjax.programs.numpy_program import numpy_program as numpy_program
+from udkjax.programs.varying_axes import result_type as result_type
+from udkjax.programs.varying_axes import vary_together as vary_together
+from udkjax.programs.varying_axes import zero_of as zero_of
+
+__all__: list[str]

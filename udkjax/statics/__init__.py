@@ -1,0 +1,5 @@
+"""Equilibria, vibrations about them, and forces at rest."""
+
+from udkjax.lazy_names import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(__name__)  # pyright: ignore[reportUnsupportedDunderAll]

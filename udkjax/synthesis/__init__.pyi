@@ -1,0 +1,23 @@
+"""The door of `synthesis`: the names that floors above import, each from the module that it is in."""
+
+from udkjax.synthesis.complete import CompleteDesign as CompleteDesign
+from udkjax.synthesis.complete import CompleteDesigns as CompleteDesigns
+from udkjax.synthesis.complete import design_all as design_all
+from udkjax.synthesis.complete.complete_design import CompleteSearch as CompleteSearch
+from udkjax.synthesis.design import DesignSearch as DesignSearch
+from udkjax.synthesis.design import design as design
+from udkjax.synthesis.found import Designs as Designs
+from udkjax.synthesis.found import FoundDesign as FoundDesign
+from udkjax.synthesis.goal_file import read_design as read_design
+from udkjax.synthesis.goals import FunctionGoal as FunctionGoal
+from udkjax.synthesis.goals import PathGoal as PathGoal
+from udkjax.synthesis.goals import PoseGoal as PoseGoal
+from udkjax.synthesis.motion_goals import EnergyGoal as EnergyGoal
+from udkjax.synthesis.motion_goals import FrequencyGoal as FrequencyGoal
+from udkjax.synthesis.motion_goals import LoadGoal as LoadGoal
+from udkjax.synthesis.motion_goals import MotionGoal as MotionGoal
+from udkjax.synthesis.motion_goals import MotionPoint as MotionPoint
+from udkjax.synthesis.motion_goals import ToleranceGoal as ToleranceGoal
+from udkjax.synthesis.motion_goals import TorqueGoal as TorqueGoal
+
+__all__: list[str]
