@@ -1,12 +1,13 @@
 """Programs of JAX by NumPy: the same as by XLA, operation by operation, in loops, branches and under transformations."""
 
+from importlib import import_module
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.programs import deferred as deferred_module
-from udkjax.programs.deferred import deferred, deferred_if_traced
+from udkjax.programs.deferred import WORTH, deferred, deferred_if_traced, deferred_p
 from udkjax.programs.numpy_program import Meter, numpy_program
 
 X = np.random.default_rng(3).uniform(-2.0, 2.0, (4, 5))
@@ -151,8 +152,9 @@ def test_operations_on_shapes_are_those_of_xla(name):
 @pytest.fixture
 def programs(monkeypatch):
     """Count the programs that are compiled because they have been called often."""
-    count, compiled = [], deferred_module._compiled
-    monkeypatch.setattr(deferred_module, "_compiled", lambda program: count.append(program) or compiled(program))
+    module = import_module("udkjax.programs.deferred")  # the package's own name is that of the function
+    count, compiled = [], module._compiled
+    monkeypatch.setattr(module, "_compiled", lambda program: count.append(program) or compiled(program))
     return count
 
 
@@ -173,15 +175,15 @@ def test_derivatives_and_batches_are_those_of_the_function(programs):
     assert not programs
 
 
-@pytest.mark.skipif(deferred_module.deferred_p is None, reason="this JAX compiles what is called once, too")
+@pytest.mark.skipif(deferred_p is None, reason="this JAX compiles what is called once, too")
 def test_what_is_called_often_or_takes_long_is_compiled(programs):
     few = deferred(lambda x: jnp.sin(x) + x)
-    for _ in range(deferred_module.WORTH + 5):
+    for _ in range(WORTH + 5):
         found = few(1.5 * jnp.ones(()))
     assert len({id(p) for p in programs}) == 1
     assert len(programs) == 5
     np.testing.assert_allclose(found, np.sin(1.5) + 1.5, rtol=1e-15)
-    count = deferred_module.WORTH * 4
+    count = WORTH * 4
     long = deferred(lambda x: jax.lax.fori_loop(0, count, lambda i, s: s + 1.0, x))
     assert long(jnp.zeros(())) == count
     assert len(programs) == 6
@@ -195,7 +197,7 @@ def test_static_parts_and_trees_come_through():
     assert found["name"] == "x"
 
 
-@pytest.mark.skipif(deferred_module.deferred_p is None, reason="this JAX evaluates such a function operation by operation")
+@pytest.mark.skipif(deferred_p is None, reason="this JAX evaluates such a function operation by operation")
 def test_what_is_known_beside_traced_numbers_stays_known_and_is_traced_once_for_its_content():
     seen = []
 

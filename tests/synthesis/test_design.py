@@ -11,7 +11,7 @@ from tests.choices import fast
 from udkjax.synthesis.search import loss_of
 from udkjax.synthesis.trials import Trials
 
-DATA = json.loads((Path(__file__).parents[2] / "data" / "path_synthesis.json").read_text())["cases"]
+DATA = json.loads((Path(__file__).parents[1] / "data" / "path_synthesis.json").read_text())["cases"]
 FOUR_BAR = udk.Drawing(
     pins={"O": (0, 0), "A": (3, 4), "B": (12, 9), "P": (6, 12), "C": (10, 0)},
     links={"crank": {"pins": ["O", "A"], "mass": 1.0}, "coupler": {"pins": ["A", "B", "P"], "mass": 1.0}}
@@ -26,7 +26,7 @@ SLIDER_CRANK = udk.Drawing(
     slots=[{"pin": "B", "direction": 0.3}],
     motors={"motor": {"pin": "O", "speed": 1.0}},
 )
-SCENES = Path(__file__).parents[3] / "examples"
+SCENES = Path(__file__).parents[2] / "examples"
 SIX_BAR = udk.load(SCENES / "six_bar.toml")
 GEARED = udk.Drawing(
     pins={"O": (0, 0), "A": (1, 1.5), "B": (4, 5), "C": (8, 1.5), "D": (6, 0), "P": (4.5, 7)},
