@@ -61,17 +61,17 @@ def busy_seconds(client: Any) -> float:
 def made(name: str, folder: Path) -> tuple[dict[str, Any], Path, Any]:
     """Return the size and time of making the page of a scene, the page, and a run by the engine on this processor."""
     mechanism, seen = getattr(udk.library, name)(), []
-    run = native_engine.call_known
+    run = native_engine.call_concrete
 
-    def known(operation: Any, inputs: Any, times: int) -> Any:
+    def counted(operation: Any, inputs: Any, times: int) -> Any:
         seen.append(lambda: run(operation, inputs, times))
         return run(operation, inputs, times)
 
-    native_engine.call_known = known
+    native_engine.call_concrete = counted
     try:
         solution = udk.simulate(mechanism, np.linspace(0.0, SPANS.get(name, SPAN), 401), throw=False)
     finally:
-        native_engine.call_known = run
+        native_engine.call_concrete = run
     start = time.perf_counter()
     animation = udk.animate(mechanism, solution, live=True)
     seconds = time.perf_counter() - start

@@ -14,7 +14,7 @@ from scipy.integrate import ode
 
 from udkjax.equations import Baumgarte
 from udkjax.integrate import Result
-from udkjax.integrate.native_equations import KnownRates
+from udkjax.integrate.native_equations import ConcreteRates
 from udkjax.scene import Mechanism
 
 NAME = "VODE"
@@ -38,7 +38,7 @@ def run(
     mech: Mechanism, method: Callable, first_step: float, max_steps: int, ts, state, tol, rank_tol, number, alpha, beta
 ) -> Run:
     """Integrate with the right-hand side by machine code; `method` is a function of `rank_tol` and of the method's `number`."""
-    rates, calls = KnownRates(mech, method(rank_tol, number), Baumgarte(alpha, beta)), 0
+    rates, calls = ConcreteRates(mech, method(rank_tol, number), Baumgarte(alpha, beta)), 0
 
     def right_hand_side(t: float, y: np.ndarray) -> np.ndarray:
         nonlocal calls

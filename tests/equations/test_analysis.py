@@ -56,7 +56,7 @@ def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
         assert udk.analyse(changed).redundant_rows == udk.analyse(mechanism).redundant_rows
 
 
-def test_a_traced_mechanism_has_the_rows_of_the_known_one_that_it_was_made_from_and_scales_of_its_own():
+def test_a_traced_mechanism_has_the_rows_of_the_concrete_one_that_it_was_made_from_and_scales_of_its_own():
     """By machine code under jit, by NumPy or machine code under vmap alone; `grad` takes them as fixed."""
     mechanism = udk.library.parallelogram()
     heavy = lambda mass: mechanism.with_parameters({"body.coupler.mass": mass, "body.coupler.inertia": mass})  # noqa: E731
@@ -214,7 +214,7 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name
     for kind, mechanism in scenes.items():
         rows = redundancy.redundant_rows(mechanism)
         assert rows is not None and len(rows) == len(expected[kind])
-        own = scales.known_scales(mechanism)
+        own = scales.concrete_scales(mechanism)
         off = mechanism.q0.ravel() + 1e-3 * own.coordinates(3 * len(mechanism.bodies)) * np.cos(np.arange(mechanism.q0.size))
         closer = sparse_rows.SparseRows(mechanism) if large else dense_rows.DenseRows(mechanism, own)
         *_, psi, psi_dot, _ = closer.assemble(0.0, np.asarray(off), np.asarray(mechanism.v0).ravel())

@@ -14,7 +14,7 @@ import udkjax as udk
 from tests.integrate.scenes import TS
 from udkjax.equations.abstract_system import TangentPart
 from udkjax.integrate.constrained import Constrained
-from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, count_evaluations, evaluations
+from udkjax.integrate.solvers.counting import NOT_COUNTED, CountingController, count_evaluations, evaluations
 from udkjax.integrate.solvers.multistep import Multistep, tolerances_from_controller
 
 SAVE = diffrax.SaveAt(t1=True, controller_state=True)
@@ -108,11 +108,11 @@ def test_counting_changes_nothing():
 
 
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno3(), diffrax.HalfSolver(diffrax.Heun())], ids=["implicit", "halved"])
-def test_what_is_not_known_is_not_counted(solver):
+def test_solvers_without_a_tableau_are_not_counted(solver):
     counted = count_evaluations(solver, controller())
     term = diffrax.ODETerm(lambda t, y, args: -y)
     run = diffrax.diffeqsolve(term, counted[0], 0.0, 1.0, 0.1, jnp.array([1.0]), saveat=SAVE, stepsize_controller=counted[1])
-    assert evaluations(run.controller_state) == NOT_KNOWN
+    assert evaluations(run.controller_state) == NOT_COUNTED
 
 
 # --- as the motion of a mechanism is integrated

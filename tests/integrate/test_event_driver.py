@@ -13,13 +13,13 @@ import udkjax as udk
 from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM
 from udkjax.equations.analysis import analyse
 from udkjax.equations.textbook import prepare
-from udkjax.integrate.compiled_mechanism import compile_known
+from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events import simulate_events
 from udkjax.integrate.events.condition_program import watched_conditions
 from udkjax.integrate.events.conditions import frames_of
 from udkjax.integrate.events.event import expand_events
+from udkjax.integrate.events.host_run import concrete_plan, event_arrays
 from udkjax.integrate.events.impacts import contact_rows, rows_of_directions
-from udkjax.integrate.events.known_run import event_arrays, known_plan
 from udkjax.integrate.events.phase_code import PhaseCode
 from udkjax.integrate.events.phases import phases_of
 from udkjax.integrate.prepare import Choices, prepare_run
@@ -89,16 +89,15 @@ def phase_codes(mechanism, events):
     """The machine code of all phases of a mechanism with events, and one over the masses."""
     with jax.ensure_compile_time_eval():
         listed = expand_events(events, mechanism)
-        phases, choices = (
-            phases_of(mechanism, listed, analyse(mechanism)),
-            Choices(1e-8, 1e-8, 1e-6, None, udk.Auto(), Projection()),
-        )
-        compiled = [compile_known(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
+        phases = phases_of(mechanism, listed, analyse(mechanism))
+        choices = Choices(1e-8, 1e-8, 1e-6, None, udk.Auto(), Projection())
+        scenes = zip(phases.mechanisms, phases.analyses, strict=True)
+        compiled = [compile_concrete(m, a, *choices.of_mechanism) for m, a in scenes]
         state = udk.State(mechanism.q0, mechanism.v0)
         run = prepare_run(compiled[0], phases.analyses[0], np.array([0.0, 1.0]), state, None, choices, np)
         conditions = watched_conditions(listed, mechanism)
         assert conditions is not None
-        plan = known_plan(phases, conditions, 1000, 10, *listed, *compiled)
+        plan = concrete_plan(phases, conditions, 1000, 10, *listed, *compiled)
         problems = [replace(run.problem, compiled=x) for x in compiled]
         arrays = event_arrays(plan, listed, phases, problems, np.zeros(()), np.asarray(1e-6), np)
     numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[9:], []

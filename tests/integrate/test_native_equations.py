@@ -15,7 +15,7 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.formulations import Formulation
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
-from udkjax.integrate.native_equations import KnownRates, native_equations
+from udkjax.integrate.native_equations import ConcreteRates, native_equations
 from udkjax.integrate.projection import Projection
 from udkjax.native.primitive import FEW
 
@@ -194,10 +194,13 @@ def test_derivatives_of_a_run_through_an_adjoint():
 
 
 @pytest.mark.parametrize("number, own", [(0, udk.SVD), (3, udk.Householder)])
-def test_rates_of_known_numbers_are_those_of_the_textbook(number, own):
+def test_rates_of_concrete_numbers_are_those_of_the_textbook(number, own):
     """For integrators outside of JAX: (v, a) off the manifold, with gains, at states one after another."""
     linkage, method, gains = udk.library.parallelogram(), udk.OneOf.absolute(0.1, number=number), udk.Baumgarte(3.0, 5.0)
-    rates, textbook = KnownRates(linkage, method, gains), eqx.filter_jit(prepare(linkage, own.absolute(0.1), gains).accelerations)
+    rates, textbook = (
+        ConcreteRates(linkage, method, gains),
+        eqx.filter_jit(prepare(linkage, own.absolute(0.1), gains).accelerations),
+    )
     random, y0 = np.random.default_rng(1), np.concatenate([linkage.q0.ravel(), linkage.v0.ravel()])
     for t in (0.0, 0.4):
         y = y0 + 1e-3 * random.standard_normal(y0.size)
@@ -206,4 +209,4 @@ def test_rates_of_known_numbers_are_those_of_the_textbook(number, own):
 
 def test_rates_without_machine_code_are_refused():
     with pytest.raises(ValueError, match="no machine code for Mine"):
-        KnownRates(udk.library.parallelogram(), type("Mine", (udk.SVD,), {})())
+        ConcreteRates(udk.library.parallelogram(), type("Mine", (udk.SVD,), {})())

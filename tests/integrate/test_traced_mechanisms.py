@@ -13,7 +13,7 @@ import udkjax as udk
 from tests.choices import fast
 from tests.scaling import scaled
 from udkjax.equations.analysis import analyse
-from udkjax.integrate.compiled_mechanism import compile_known
+from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.prepare import AUTO
 from udkjax.integrate.projection import Projection
@@ -34,7 +34,7 @@ def no_warnings():
 def marks(mechanism):
     """The independent rows as a run finds them, and how many there are in general."""
     analysis = analyse(mechanism)
-    compiled = compile_known(mechanism, replace(analysis, redundant_rows=None), AUTO, Projection())
+    compiled = compile_concrete(mechanism, replace(analysis, redundant_rows=None), AUTO, Projection())
     state, scales = udk.assemble(mechanism), analysis.scales
     q, v = np.asarray(state.q).ravel(), np.asarray(state.v).ravel()
     rate = np.asarray(scales.rate) if float(scales.rate) > 0 else np.ones(())

@@ -159,7 +159,7 @@ MORE = [name for name in udk.library.__all__ if name not in SCENES]
 
 
 @pytest.mark.parametrize("name", [*SCENES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)])
-def test_known_numbers_are_closed_as_traced_ones_are(name):
+def test_concrete_numbers_are_closed_as_traced_ones_are(name):
     """To the same branch by the same steps, from guesses that are closed, rough and hopeless, and where it cannot close."""
     mech = getattr(udk.library, name)()
     random = np.random.default_rng(0)
@@ -179,12 +179,12 @@ def test_known_numbers_are_closed_as_traced_ones_are(name):
             assert_allclose(found, value, rtol=1e-7 if known.is_closed else 1e-5, atol=atol)
 
 
-def test_closing_known_numbers_compiles_nothing(linkage, compilations):
+def test_closing_concrete_numbers_compiles_nothing(linkage, compilations):
     guess = udk.State(np.asarray(linkage.q0) + 0.1, np.asarray(linkage.v0))
     assert compilations(lambda: udk.assemble(linkage, 0.0, guess)) == []
 
 
-def test_known_numbers_stay_known_while_others_are_traced(linkage):
+def test_concrete_numbers_stay_concrete_while_others_are_traced(linkage):
     found = []
     jax.jit(lambda x: (found.append(udk.assemble(linkage).q), x)[1])(1.0)
     assert np.asarray(found[0]).shape == (4, 3)

@@ -8,7 +8,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax.positions.continuation import Reached
-from udkjax.positions.curve import KnownCurve
+from udkjax.positions.curve import NumpyCurve
 from udkjax.positions.drive import drive
 from udkjax.positions.march import march, march_at_once
 
@@ -523,7 +523,7 @@ def test_the_side_is_the_sign_of_the_determinant_of_independent_rows(name, numbe
     mech = getattr(udk.library, name)(**numbers)
     driven = drive(mech, driver)
     q = udk.assemble(mech).q.ravel()
-    start, curve = driven.value(q), KnownCurve.of(driven)
+    start, curve = driven.value(q), NumpyCurve.of(driven)
     values = float(start) + np.linspace(0.05, 0.5, 4)
 
     def exact(q, s):

@@ -83,7 +83,7 @@ def _positions_are_traced(name, key, default):
 
 
 @pytest.mark.parametrize("name", MECHANISMS)
-def test_what_a_traced_number_does_not_reach_stays_known(name):
+def test_numbers_that_do_not_depend_on_a_traced_one_stay_concrete(name):
     for key, parameter in inspect.signature(getattr(library, name)).parameters.items():
         if not isinstance(parameter.default, int) and parameter.default is not None:
             assert _positions_are_traced(name, key, parameter.default) == (key in GEOMETRY), key

@@ -88,7 +88,7 @@ def test_the_constants_of_gears_follow_the_initial_guess(everything, psi):
     assert new.joints["prismatic"].angle == everything.joints["prismatic"].angle  # an ordinary parameter since it was made
 
 
-def test_traced_numbers_remember_the_known_ones_that_they_were_made_from(everything):
+def test_traced_numbers_remember_the_concrete_ones_that_they_were_made_from(everything):
     seen = []
 
     @jax.jit
@@ -241,7 +241,7 @@ def _requiring(element):
             yield element, field.name
 
 
-def test_traced_numbers_are_looked_at_as_known_ones_are(everything):
+def test_traced_numbers_are_checked_as_concrete_ones_are(everything):
     """One that must be positive is not; what must increase does not."""
     hold = jax.jit(lambda element: traced_numbers_hold([element]))
     found = [one for element in everything.elements for one in _requiring(element)]

@@ -7,7 +7,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.positions.curve import KnownCurve
+from udkjax.positions.curve import NumpyCurve
 
 LENGTHS, GROUND = (1.0, 2.5, 2.0), 2.5
 STIFFNESS, FREE_LENGTH = 60.0, 1.2
@@ -28,8 +28,8 @@ def test_the_papers_linkage_hanging():
 def test_no_step_is_tried_from_a_position_of_rest(monkeypatch):
     mech, tried = udk.library.parallelogram(-1.3), []
     rest = udk.equilibrium(mech)
-    correct = KnownCurve.correct
-    monkeypatch.setattr(KnownCurve, "correct", lambda *given, **choices: tried.append(1) or correct(*given, **choices))
+    correct = NumpyCurve.correct
+    monkeypatch.setattr(NumpyCurve, "correct", lambda *given, **choices: tried.append(1) or correct(*given, **choices))
     again = udk.equilibrium(mech, rest.state)
     assert not tried and bool(again.balanced)
     assert bool(udk.equilibrium(mech).balanced) and tried

@@ -81,14 +81,14 @@ from udkjax.equations.redundancy import choose_dispensable as choose_dispensable
 from udkjax.equations.redundancy import choose_redundant_rows as choose_redundant_rows
 from udkjax.equations.redundancy import dense as dense
 from udkjax.equations.redundancy import dependent_constraints as dependent_constraints
+from udkjax.equations.redundancy import generic_position as generic_position
 from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
-from udkjax.equations.redundancy import ordinary_position as ordinary_position
 from udkjax.equations.redundancy import owners_of_row as owners_of_row
 from udkjax.equations.redundancy import sample_positions as sample_positions
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
+from udkjax.equations.scales import concrete_scales as concrete_scales
 from udkjax.equations.scales import evaluate_scales as evaluate_scales
-from udkjax.equations.scales import known_scales as known_scales
 from udkjax.equations.scales import mass_of as mass_of
 from udkjax.equations.scales import scales_by_jax as scales_by_jax
 from udkjax.equations.scales import scales_p as scales_p

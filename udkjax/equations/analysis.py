@@ -23,7 +23,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.equations.redundancy import redundant_rows
-from udkjax.equations.scales import Scales, known_scales, traced_scales
+from udkjax.equations.scales import Scales, concrete_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
@@ -124,12 +124,12 @@ def analyse(mechanism: Mechanism) -> Analysis:
             return replace(analyse(mechanism.origin.mechanism), scales=traced_scales(mechanism))
         mechanism = mechanism.without_origin
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
-        return Analysis(traced_scales(mechanism), count, names, _rows_of_known_geometry(mechanism))
-    return _analyse_known(mechanism)
+        return Analysis(traced_scales(mechanism), count, names, _rows_of_concrete_geometry(mechanism))
+    return _analyse_concrete(mechanism)
 
 
 @cached_by_identity
-def _analyse_known(mechanism: Mechanism) -> Analysis:
+def _analyse_concrete(mechanism: Mechanism) -> Analysis:
     mechanism = mechanism.without_origin
     kind = structure(mechanism)
     return _analyses.get((kind, _bytes_of(mechanism)), lambda: _analyse(mechanism, kind))
@@ -164,19 +164,19 @@ _redundant: _Cache[tuple[int, ...] | None] = _Cache()
 
 def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
     with jax.ensure_compile_time_eval():  # while something else is traced, too
-        scales = known_scales(mechanism)
+        scales = concrete_scales(mechanism)
         # Masses and loads decide nothing about rows: mechanisms that differ in them alone share what was found.
         rows = _redundant.get((kind, _bytes_of(_geometry(mechanism))), lambda: redundant_rows(mechanism))
         return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
 
 
-def _rows_of_known_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
+def _rows_of_concrete_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
     """Return the redundant rows of a mechanism whose masses or loads are traced; None where its geometry is, too."""
     with jax.ensure_compile_time_eval():
         if is_traced(_geometry(mechanism)):
             return None
-        known = jax.tree.map(lambda x: np.ones(np.shape(x)) if isinstance(x, Tracer) else x, mechanism)
-        return _analyse(known, structure(mechanism)).redundant_rows
+        concrete = jax.tree.map(lambda x: np.ones(np.shape(x)) if isinstance(x, Tracer) else x, mechanism)
+        return _analyse(concrete, structure(mechanism)).redundant_rows
 
 
 def _geometry(mechanism: Mechanism) -> PyTree[Array]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from udkjax.equations.abstract_system import Time
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import Scales, known_scales, mass_of
+from udkjax.equations.scales import Scales, concrete_scales, mass_of
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.fields import ROUNDING
@@ -163,7 +163,7 @@ class KinematicRows(DenseRows):
     """The rows of a mechanism with known numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
 
     def __init__(self, mechanism: Mechanism):
-        super().__init__(mechanism, known_scales(mechanism))
+        super().__init__(mechanism, concrete_scales(mechanism))
         self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
         self.driver_time_step = driver_time_step(self.scales)
 

@@ -160,7 +160,7 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     return tuple(dict.fromkeys(names))
 
 
-def ordinary_position(mechanism: Mechanism) -> np.ndarray | None:
+def generic_position(mechanism: Mechanism) -> np.ndarray | None:
     """Return a closed position beside the initial guess, which may be singular; None where that cannot be closed.
 
     All numbers are known. The step is random, so that what holds there holds in general.

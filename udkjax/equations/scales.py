@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, known_numbers_joined, numbers_as_vector
+from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, join_concrete_numbers, numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
@@ -70,7 +70,7 @@ class Scales(NamedTuple):
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
 
-def known_scales(mechanism: Mechanism) -> Scales:
+def concrete_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism whose numbers are known, by NumPy."""
     numbers = np.asarray(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))
     return jax.tree.map(number, _unpack(_evaluate(scene_programs(mechanism), numbers, np)))
@@ -78,7 +78,7 @@ def known_scales(mechanism: Mechanism) -> Scales:
 
 def traced_scales(mechanism: Mechanism) -> Scales:
     """Return the same in a trace; without derivatives."""
-    numbers = known_numbers_joined([*mechanism.at(0.0).numbers, *NO_THRESHOLDS])
+    numbers = join_concrete_numbers([*mechanism.at(0.0).numbers, *NO_THRESHOLDS])
     return _traced_scales(jax.lax.stop_gradient(numbers), scene_programs(mechanism))
 
 

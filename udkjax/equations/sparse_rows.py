@@ -21,7 +21,7 @@ from udkjax.equations.abstract_system import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE, RowTerms
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.scales import known_scales, mass_of
+from udkjax.equations.scales import concrete_scales, mass_of
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.fields import ROUNDING
@@ -107,7 +107,7 @@ class SparseRows(RowTerms):
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
         super().__init__(mechanism)
-        self.scales = jax.tree.map(np.asarray, known_scales(mechanism))
+        self.scales = jax.tree.map(np.asarray, concrete_scales(mechanism))
         arm = float(self.scales.arm)
         self.metric = np.tile([arm, arm, 1.0], self.size // 3) if kinematic else 1 / np.sqrt(mass_of(mechanism, np))
         self.driver_time_step = driver_time_step(self.scales)

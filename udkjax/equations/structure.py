@@ -50,13 +50,13 @@ def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
     """Return numbers and arrays as one vector, in order: by NumPy where they are known."""
-    parts = [jnp.ravel(jnp.asarray(x, float)) if isinstance(x, Tracer) else np.asarray(x) for x in known_numbers_joined(numbers)]
+    parts = [jnp.ravel(jnp.asarray(x, float)) if isinstance(x, Tracer) else np.asarray(x) for x in join_concrete_numbers(numbers)]
     if len(parts) < 2:
         return parts[0] if parts else np.zeros(0)
     return jnp.concatenate(parts)
 
 
-def known_numbers_joined(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
+def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
     """Return the same numbers and arrays, with one vector of NumPy for all that are known in a row."""
     parts = []
     for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):

@@ -119,7 +119,7 @@ def compile_mechanism(
 
 
 @cached_by_identity
-def compile_known(system: Mechanism, *choices: Any) -> CompiledMechanism:
+def compile_concrete(system: Mechanism, *choices: Any) -> CompiledMechanism:
     """Return the same of a mechanism of known numbers, as arrays of NumPy: each operation of JAX would be a program."""
     compiled = compile_mechanism(system.without_origin, *choices)
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, compiled)

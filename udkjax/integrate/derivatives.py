@@ -28,7 +28,7 @@ CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the 
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
 
 
-def differentiable(problem: Problem, has_known_times: bool = False) -> IntegratorOutput:
+def differentiable(problem: Problem, has_concrete_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
     None are taken along numbers that do not depend on what is differentiated, nor along those of the step controller: steps are
@@ -36,7 +36,7 @@ def differentiable(problem: Problem, has_known_times: bool = False) -> Integrato
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)
-    moves = isinstance(problem.ts, Tracer) and not has_known_times
+    moves = isinstance(problem.ts, Tracer) and not has_concrete_times
     return run_of_times(_integrate, problem) if moves else _integrate(problem)
 
 

@@ -16,7 +16,7 @@ from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
-from udkjax.integrate.solvers.counting import NOT_KNOWN, CountingController, evaluations
+from udkjax.integrate.solvers.counting import NOT_COUNTED, CountingController, evaluations
 from udkjax.native.base.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
 from udkjax.transforms.gradients import stop_gradients
 
@@ -58,7 +58,7 @@ def integrate_by_diffrax(
     status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
     found = evaluations(run.controller_state)
-    right_hand_sides = jnp.where(found == NOT_KNOWN, NOT_KNOWN, found + (problem.h is None))  # one chooses the first step
+    right_hand_sides = jnp.where(found == NOT_COUNTED, NOT_COUNTED, found + (problem.h is None))  # one chooses the first step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
     output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides)

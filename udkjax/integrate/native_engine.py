@@ -21,7 +21,7 @@ from udkjax.native.base.steps import DONE, FALLBACK_RANK_SHARE
 from udkjax.native.derivatives.record import PER_BREAKPOINT, STORED
 from udkjax.native.operations import MarkRows
 from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
-from udkjax.native.primitive import call_known, native_p
+from udkjax.native.primitive import call_concrete, native_p
 from udkjax.native.run.formulations import formulation_tol
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, OneOf
@@ -35,10 +35,10 @@ def packed(problem: Problem) -> list[np.ndarray]:
     return run_inputs(problem, _operation(problem), np)
 
 
-def integrate_known(problem: Problem) -> IntegratorOutput:
+def integrate_concrete(problem: Problem) -> IntegratorOutput:
     """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
     operation = _operation(problem)
-    return _output(call_known(operation, run_inputs(problem, operation, np), len(problem.ts)))
+    return _output(call_concrete(operation, run_inputs(problem, operation, np), len(problem.ts)))
 
 
 def integrate(problem: Problem) -> IntegratorOutput:
@@ -144,7 +144,7 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
 def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
     """Return the arrays that machine code takes, for one member."""
     compiled = problem.compiled
-    scene = _known_inputs_of_run(compiled) if xp is np else _inputs_of_run(compiled, operation.code.policy)
+    scene = _concrete_inputs_of_run(compiled) if xp is np else _inputs_of_run(compiled, operation.code.policy)
     settings = scene.settings | {
         "rtol": problem.rtol,
         "atol": problem.atol,
@@ -196,7 +196,7 @@ def _inputs_of_run(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleTy
 
 
 @cached_by_identity
-def _known_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
+def _concrete_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
     """Return the inputs of a run of known numbers, which are one vector."""
     assert compiled.plan.operation is not None  # a run by machine code has one
     found = _inputs_of_run(compiled, compiled.plan.operation.code.policy, np)
@@ -214,7 +214,7 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
     settings = {"length": length, "omega": rate}
     numbers = [*mechanism.numbers, tol**2, 0.0]
     given = finding.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
-    found = call_known(finding, given, 2) if xp is np else native_p.bind(*given, operation=finding, times=2)
+    found = call_concrete(finding, given, 2) if xp is np else native_p.bind(*given, operation=finding, times=2)
     return found[0][0]
 
 

@@ -21,7 +21,7 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_known, evaluation_of
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_concrete, evaluation_of
 from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.base.layout import INPUTS
@@ -98,7 +98,7 @@ def _pack(
     return operation.pack(numbers, xp.stack([t, t]), q, v, scene.settings, scene.rows, xp=xp, further=further)
 
 
-class KnownRates:
+class ConcreteRates:
     """The derivative (v, a) of a state (q, v) of a mechanism of known numbers, for integrators outside of JAX.
 
     Raises:
@@ -106,7 +106,7 @@ class KnownRates:
     """
 
     def __init__(self, mechanism: Mechanism, method: Pseudoinverse, baumgarte: Baumgarte | None = None):
-        compiled = compile_known(mechanism, analyse(mechanism), method, baumgarte)
+        compiled = compile_concrete(mechanism, analyse(mechanism), method, baumgarte)
         operation, n = evaluation_of(compiled.equations), mechanism.q0.size
         if operation is None or operation.code.marks_rows or mechanism.samples:
             raise ValueError(f"there is no machine code for {type(method).__name__} of this mechanism")

@@ -103,7 +103,7 @@ def begin(mechanism: Mechanism, t: Any, analysis: Analysis | None, state: State 
     return Beginning(analysis, closure, is_open, moves)
 
 
-begin_known = cached_by_identity(begin)
+begin_concrete = cached_by_identity(begin)
 
 
 class PreparedRun(NamedTuple):
@@ -140,7 +140,7 @@ def prepare_run(
     Returns:
         The run. One that cannot be used, or is open, gets loose tolerances: as a member of a batch it would hold up others.
     """
-    start = (_known_start if xp is np else _start)(compiled, analysis, state, closure)
+    start = (_concrete_start if xp is np else _start)(compiled, analysis, state, closure)
     rtol, atol, good, given_ts = choices.rtol, choices.atol, xp.asarray(True), ts
     if xp is jnp:
         numbers: Any = (start.q, start.v, rtol, atol, choices.drift_tol, choices.dt0)
@@ -203,7 +203,7 @@ def _start(
 
 
 @cached_by_identity
-def _known_start(
+def _concrete_start(
     compiled: CompiledMechanism, analysis: Analysis | None, state: State | None, closure: Closure | None
 ) -> RunStart:
     """Return the start of a run of known numbers, by NumPy."""

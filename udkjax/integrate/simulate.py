@@ -18,11 +18,11 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.causes.find import explained
-from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
+from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.native_engine import integrate_known
+from udkjax.integrate.native_engine import integrate_concrete
 from udkjax.integrate.outcome import FinishedRun, counts, outcome
-from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, begin, begin_known, prepare_run
+from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, begin, begin_concrete, prepare_run
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
@@ -141,12 +141,12 @@ def simulate(
         max_steps=max_steps,
         engine=engine,
     )
-    is_known = isinstance(mechanism, Mechanism) and mechanism.is_concrete
+    is_concrete = isinstance(mechanism, Mechanism) and mechanism.is_concrete
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
-    all_known = is_known and not is_traced((ts, analysis, state, closure, choices))
+    all_concrete = is_concrete and not is_traced((ts, analysis, state, closure, choices))
     if isinstance(mechanism, Mechanism):
         start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
-        begun = (begin_known if all_known else begin)(mechanism, start, analysis, state, closure)
+        begun = (begin_concrete if all_concrete else begin)(mechanism, start, analysis, state, closure)
         analysis, closure = begun.analysis, begun.closure
         if begun.moves:
             warnings.warn(begun.moves, AssemblyWarning, stacklevel=3)
@@ -162,16 +162,16 @@ def simulate(
 
         assert analysis is not None  # a mechanism has one
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
-        if not _has_failed(solution) or not is_known or int(solution.stats["events"]):
+        if not _has_failed(solution) or not is_concrete or int(solution.stats["events"]):
             return _required(solution, throw)  # events may have changed what moved
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
 
-    solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices, all_known)
-    if not isinstance(mechanism, Mechanism) or not is_known or isinstance(solution.code, Tracer):
+    solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
+    if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:
         analysis = analyse(mechanism)  # the given analysis was of other numbers, of which a row was redundant
-        solution, _, end = _run(mechanism, analysis, ts, state, closure, choices, all_known)
+        solution, _, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
     if _has_failed(solution):
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
     return solution
@@ -196,18 +196,18 @@ def _run(
     state: State | None,
     closure: Closure | None,
     choices: Choices,
-    all_known: bool,
+    all_concrete: bool,
 ) -> tuple[Solution, Any, Any]:
     """Return the solution, whether it takes rows that the method leaves out, and the last state (t, (q, v)) of the integrator.
 
     Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
     """
-    if all_known and isinstance(system, Mechanism):
+    if all_concrete and isinstance(system, Mechanism):
         with jax.ensure_compile_time_eval():  # while something else is traced
-            compiled = compile_known(system, analysis, *choices.of_mechanism)
+            compiled = compile_concrete(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
                 run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
-                return _finish(run, integrate_known(run.problem), system.body_names, choices, np)
+                return _finish(run, integrate_concrete(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
     given = bare, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
     if is_within_jit():  # in which known numbers are traced, too
@@ -223,14 +223,14 @@ def _simulate(
     state: State | None,
     closure: Closure | None,
     choices: Choices,
-    has_known_times: bool,
+    has_concrete_times: bool,
 ) -> tuple[Solution, Any, Any]:
     compiled = compile_mechanism(system, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, closure, choices)
     if choices.adjoint is not None or choices.meter is not None:
         raw = integrate_by_diffrax(run.problem, choices.adjoint, choices.meter)
     else:
-        raw = differentiable(run.problem, has_known_times)
+        raw = differentiable(run.problem, has_concrete_times)
     return _finish(run, raw, getattr(system, "body_names", ()), choices)
 
 

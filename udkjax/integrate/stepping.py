@@ -68,14 +68,14 @@ def step(
         SimulationError: all numbers are known, and the end was not reached.
         SceneError: `inputs` names no parameter, or a value of another shape.
     """
-    values, has_known_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
+    values, has_concrete_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
     numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, state, values, numbers, analysis))):
         analysis = analysis or analyse(mechanism)
         if is_within_jit():
-            return _advance(mechanism, analysis, state, values, numbers, max_steps, engine, has_known_times)
+            return _advance(mechanism, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
         values, numbers = ({name: number(x) for name, x in given.items()} for given in (values, numbers))
-        return _advance_at_once(mechanism.without_origin, analysis, state, values, numbers, max_steps, engine, has_known_times)
+        return _advance_at_once(mechanism.without_origin, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
     parts = _parts(mechanism, analysis)
     run = _program(parts.form, max_steps, engine)
     q, v = run(parts.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
@@ -95,7 +95,7 @@ def _advance(
     numbers: Mapping[str, Scalar],
     max_steps: int,
     engine: str,
-    has_known_times: bool,
+    has_concrete_times: bool,
 ) -> State:
     dt, t, rtol, atol = (number(numbers[name]) for name in ("dt", "t", "rtol", "atol"))
     moved = mechanism.with_parameters(values).without_origin if values else mechanism.without_origin
@@ -104,7 +104,7 @@ def _advance(
     choices = Choices(rtol, atol, DRIFT_PROJECTED, dt, AUTO, Projection(), max_steps=max_steps, engine=engine)
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)
-    raw = differentiable(replace(run.problem, points=STORED_POINTS), has_known_times)
+    raw = differentiable(replace(run.problem, points=STORED_POINTS), has_concrete_times)
     good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.lost))
     failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
@@ -133,7 +133,7 @@ def _program(form: Any, max_steps: int, engine: str) -> Callable[..., tuple[Arra
 
     def run(leaves: list[Array], q: Array, v: Array, values: dict[str, Array], numbers: dict[str, Array]) -> tuple[Array, Array]:
         mechanism, analysis = jax.tree.unflatten(form, leaves)
-        found = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_known_times=False)
+        found = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_concrete_times=False)
         return found.q, found.v  # pyright: ignore[reportReturnType]
 
     return jax.jit(run)

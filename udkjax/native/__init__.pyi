@@ -52,7 +52,7 @@ from udkjax.native.position_operations import CloseCotangents as CloseCotangents
 from udkjax.native.position_operations import CloseSecondTangents as CloseSecondTangents
 from udkjax.native.position_operations import CloseTangents as CloseTangents
 from udkjax.native.position_operations import March as March
-from udkjax.native.primitive import call_known as call_known
+from udkjax.native.primitive import call_concrete as call_concrete
 from udkjax.native.primitive import call_members as call_members
 from udkjax.native.primitive import machine_code as machine_code
 from udkjax.native.primitive import native_p as native_p

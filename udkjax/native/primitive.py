@@ -208,7 +208,7 @@ def machine_code(operation: Operation, width: int, beside: int) -> LoadedCode:
     return LoadedCode(operation, width, beside)
 
 
-def call_known(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
+def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
     """Run an operation on numbers that are known, of one member: nothing is traced for it."""
     return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 

@@ -31,7 +31,7 @@ from udkjax.positions.channels import point_of_pin as point_of_pin
 from udkjax.positions.continuation import Reached as Reached
 from udkjax.positions.curve import AbstractCurve as AbstractCurve
 from udkjax.positions.curve import Curve as Curve
-from udkjax.positions.curve import KnownCurve as KnownCurve
+from udkjax.positions.curve import NumpyCurve as NumpyCurve
 from udkjax.positions.drive import Coordinate as Coordinate
 from udkjax.positions.drive import Drive as Drive
 from udkjax.positions.drive import Driven as Driven

@@ -126,29 +126,29 @@ def close(
         return close(moment, analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
         analysis = None  # the analysis of the known mechanism lasts
-    return _closure_of_known(mechanism, np.asarray(t).item(), state, analysis)
+    return _closure_of_concrete(mechanism, np.asarray(t).item(), state, analysis)
 
 
 @cached_by_identity  # a second run of a mechanism need not close it again
-def _closure_of_known(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
+def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
     with jax.ensure_compile_time_eval():
         scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
         with np.errstate(all="ignore"):  # a state that is not finite does not close
-            q, v, psi, psi_dot, rank = _close_known(mechanism, scales, t, q, v)
+            q, v, psi, psi_dot, rank = _close_concrete(mechanism, scales, t, q, v)
             closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
         rank, closed = (jax.device_put(np.asarray(x)) for x in (rank, closed))
         return Closure(state_found, number(psi), number(psi_dot), rank, scales, closed)
 
 
-def _close_known(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
+def _close_concrete(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
     """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, of known numbers."""
     if scene_programs(mechanism).is_small:  # for which it takes longer to compile anything
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_closing.can_close(mechanism):
-        return native_closing.close_known(mechanism.at(t), scales, t, q, v)
+        return native_closing.close_concrete(mechanism.at(t), scales, t, q, v)
     from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
 
     return SparseRows(mechanism).assemble(t, q, v)

@@ -46,8 +46,8 @@ class CarriedBodies(NamedTuple):
     def carry(self, start: Float[Array, "bodies 3"], others: Float[Array, "kept 3"]) -> Float[Array, "bodies 3"]:
         """Return the position of all bodies where the others are: these as they were to their carriers at the start."""
         xp, kept = library_for((start, others)), self.kept(len(start))
-        is_known = xp.all(xp.isfinite(others))
-        placed = dict(zip(kept.tolist(), xp.where(is_known, others, 0.0), strict=True))
+        is_reached = xp.all(xp.isfinite(others))
+        placed = dict(zip(kept.tolist(), xp.where(is_reached, others, 0.0), strict=True))
         for k, carrier in self.carrier.items():
             if carrier < 0:
                 placed[k] = start[k]
@@ -56,7 +56,7 @@ class CarriedBodies(NamedTuple):
             (x, y), (c, s) = (start[k] - start[carrier])[:2], (xp.cos(turn), xp.sin(turn))
             placed[k] = placed[carrier] + xp.stack([c * x - s * y, s * x + c * y, start[k][2] - start[carrier][2]])
         found = xp.stack([placed[k] for k in range(len(start))])
-        return xp.where(is_known, found, xp.inf)
+        return xp.where(is_reached, found, xp.inf)
 
 
 def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping[str, Scalar] | None) -> CarriedBodies:
@@ -64,23 +64,23 @@ def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping
 
     Where all numbers of a mechanism are traced it is not known what is free: none.
     """
-    known = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
+    concrete = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     element, taken = element_of(mechanism, driver), [element_of(mechanism, name) for name in held or {}]
-    if known is None:
+    if concrete is None:
         return CarriedBodies({})
-    freedoms = analyse(known).degrees_of_freedom
-    more = [name for name in (driver, *(held or {})) if not (isinstance(name, str) and name in known.drivers)]
+    freedoms = analyse(concrete).degrees_of_freedom
+    more = [name for name in (driver, *(held or {})) if not (isinstance(name, str) and name in concrete.drivers)]
     if freedoms is None or freedoms <= len(more):
         return CarriedBodies({})
-    places = {name: k for k, name in enumerate(known.body_names)} | {GROUND: -1}
-    attached = [known.frames_of(x) for x in known.constraints.values()]
+    places = {name: k for k, name in enumerate(concrete.body_names)} | {GROUND: -1}
+    attached = [concrete.frames_of(x) for x in concrete.constraints.values()]
     groups = [{places[body] for body in bodies} for bodies in (*attached, element.bodies, *(x.bodies for x in taken))]
     asked = {places[body] for x in (element, *taken) for body in x.bodies}
     carrier: dict[int, int] = {}
-    for body in [-1, *range(len(known.body_names))]:
-        for part in _parts_without(body, groups, len(known.body_names)):
+    for body in [-1, *range(len(concrete.body_names))]:
+        for part in _parts_without(body, groups, len(concrete.body_names)):
             hangs = -1 not in part and not part & (asked | set(carrier)) and body not in carrier
-            if hangs and (body < 0 or _is_carried(known, part, body)):
+            if hangs and (body < 0 or _is_carried(concrete, part, body)):
                 carrier |= dict.fromkeys(sorted(part), body)
     return CarriedBodies(carrier)
 

@@ -278,8 +278,8 @@ def _narrow(
     narrowed = state._replace(search=_Search(sigma, value, *other, last.tries + 1))
 
     def beside() -> Array:
-        toggle, is_known = _at_seldom(curve, find_toggle, at, state.tau)
-        return xp.where(is_known, toggle, at)
+        toggle, is_found = _at_seldom(curve, find_toggle, at, state.tau)
+        return xp.where(is_found, toggle, at)
 
     at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), beside, lambda: at)
     # At the toggle: the value lies behind it, at it to rounding, or before.
@@ -316,13 +316,13 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
     current = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
 
     def beside() -> tuple[Crossing, Array]:
-        other, is_known = _at_seldom(curve, find_crossing, X, tau)
-        return jax.tree.map(lambda x, y: xp.where(is_known, x, y), other, current), is_known
+        other, is_found = _at_seldom(curve, find_crossing, X, tau)
+        return jax.tree.map(lambda x, y: xp.where(is_found, x, y), other, current), is_found
 
-    found, is_known = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (current, xp.asarray(False)))
+    found, is_found = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (current, xp.asarray(False)))
     X, tau, dq, ddq, dddq, spacing = found
     deficient = rank < len(X) - 1
-    doubtful = ~is_known & (deficient | (clearance < LOST_RANK))
+    doubtful = ~is_found & (deficient | (clearance < LOST_RANK))
     status = xp.where(doubtful, Reached.not_determined, xp.where(deficient, Reached.singular, Reached.closed))
     dq, ddq = (xp.where(doubtful, xp.nan, x) for x in (dq, ddq))
     new = {"q": X[:-1] * curve.units[:-1], "dq": dq, "ddq": ddq, "status": status, "dddq": dddq, "spacing": spacing}

@@ -117,20 +117,21 @@ def _extremum(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Arr
     _, (sides, closed) = by.scan(outward, (start, start), xp.arange(NEAREST_NODE, FARTHEST_NODE + 1.0))
     points = xp.concatenate([sides[::-1, 0], sides[:, 1]])  # (12, n + 1)
     places = (points - X) @ tau / (FARTHEST_NODE * h)
-    level, all_of, fewer = points, [points[0]], [points[1]]  # divided differences, from the first point and from the second on
+    # Newton's divided differences: of all points, and from the second on
+    differences, coefficients, without_first = points, [points[0]], [points[1]]
     for k in range(1, len(points)):
-        level = (level[1:] - level[:-1]) / (places[k:] - places[:-k])[:, None]
-        all_of.append(level[0])
-        fewer += [level[1]] if k < len(points) - 2 else []
+        differences = (differences[1:] - differences[:-1]) / (places[k:] - places[:-k])[:, None]
+        coefficients.append(differences[0])
+        without_first += [differences[1]] if k < len(points) - 2 else []
     root = xp.zeros((), X.dtype)
     for _ in range(ROOT_STEPS):
-        _, slope, bend = _evaluate_at(root, all_of, places)
+        _, slope, bend = _evaluate_at(root, coefficients, places)
         root = xp.clip(root - slope[-1] / bend[-1], -1.0, 1.0)
-    at = _evaluate_at(root, all_of, places)[0]
-    doubt = xp.max(xp.abs(at - _evaluate_at(root, fewer, places[1:])[0])) / ACCEPTED_DIFFERENCES[0]
+    at = _evaluate_at(root, coefficients, places)[0]
+    doubt = xp.max(xp.abs(at - _evaluate_at(root, without_first, places[1:])[0])) / ACCEPTED_DIFFERENCES[0]
     at = at - curve.plus(curve.slopes(at), NEAR_LOSS) @ curve.residual(at)  # the part that E resolves well is closed to rounding
-    known = xp.all(closed) & curve.is_closed(at) & (xp.abs(root) < 1.0) & xp.isfinite(doubt)
-    return at, xp.where(known, doubt, xp.inf)
+    accepted = xp.all(closed) & curve.is_closed(at) & (xp.abs(root) < 1.0) & xp.isfinite(doubt)
+    return at, xp.where(accepted, doubt, xp.inf)
 
 
 def _evaluate_at(x: Array, coefficients: list[Array], places: Array) -> tuple[Array, Array, Array]:
@@ -169,17 +170,17 @@ def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[
 
     slopes = by.map(at_point, points)
     scaled = points[:, :-1], slopes[0] * units[-1] / units[:-1], slopes[1] * units[-1] ** 2 / units[:-1]
-    all_of, fewer = weights(FARTHEST_NODE), np.pad(weights(FARTHEST_NODE - 1), 1)
-    q, dq, ddq = (xp.asarray(all_of @ x) for x in scaled)
+    twelve, ten = weights(FARTHEST_NODE), np.pad(weights(FARTHEST_NODE - 1), 1)
+    q, dq, ddq = (xp.asarray(twelve @ x) for x in scaled)
     dddq = xp.asarray(_slope_weights() @ scaled[2]) / h
     doubts = [
-        xp.max(xp.abs((all_of - fewer) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)
+        xp.max(xp.abs((twelve - ten) @ x), initial=0.0) / most for x, most in zip(scaled, ACCEPTED_DIFFERENCES, strict=True)
     ]
     at = xp.append(q, X[-1])
     E = xp.where(np.arange(len(at)) == len(at) - 1, 0.0, curve.slopes(at))
     at = at - curve.plus(E, NEAR_LOSS) @ curve.residual(at)  # the part that E resolves well is closed to rounding
-    known = xp.all(closed) & curve.is_closed(at) & (tau[-1] != 0)
-    doubt = xp.where(known, xp.max(xp.stack(doubts)), xp.inf)
+    accepted = xp.all(closed) & curve.is_closed(at) & (tau[-1] != 0)
+    doubt = xp.where(accepted, xp.max(xp.stack(doubts)), xp.inf)
     doubt = xp.where(xp.isfinite(doubt), doubt, xp.inf)
     dq, ddq, dddq = (x * units[:-1] / units[-1] ** k for k, x in ((1, dq), (2, ddq), (3, dddq)))
     return at, dq, ddq, dddq, doubt

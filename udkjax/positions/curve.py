@@ -160,7 +160,7 @@ class Curve(AbstractCurve):
 
 
 @dataclass(frozen=True)
-class KnownCurve(AbstractCurve):
+class NumpyCurve(AbstractCurve):
     """The positions of a mechanism of known numbers, by NumPy on the scene's programs: nothing is compiled for them."""
 
     terms: DenseTerms
@@ -172,7 +172,7 @@ class KnownCurve(AbstractCurve):
     by: ClassVar[ControlFlow] = BY_NUMPY
 
     @classmethod
-    def of(cls, driven: Driven) -> "KnownCurve":
+    def of(cls, driven: Driven) -> "NumpyCurve":
         scales = jax.tree.map(np.asarray, driven.analysis.scales)
         units = np.append(np.tile([scales.length, scales.length, 1.0], driven.analysis.coordinates // 3), driven.unit)
         independent = driven.analysis.independent_rows

@@ -19,7 +19,7 @@ from udkjax.annotations import Scalar
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
-from udkjax.equations.redundancy import kinematic_rows, ordinary_position, owners_of_row
+from udkjax.equations.redundancy import generic_position, kinematic_rows, owners_of_row
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.channels import channel_of, point_of_pin
 from udkjax.printing import PrintsLine
@@ -139,12 +139,12 @@ def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Sc
         mechanism = _with_driver(mechanism, holder, element, _constant(value))
     name, element = _element(mechanism, driver)
     found = _add_driver(mechanism, name, element, t)
-    known = _from_guess(found, name)
-    analysis = analyse(known)
+    concrete = _from_guess(found, name)
+    analysis = analyse(concrete)
     called = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
-    if known.is_concrete and analysis.redundant_rows != ():
+    if concrete.is_concrete and analysis.redundant_rows != ():
         with jax.ensure_compile_time_eval():  # while something else is traced, too
-            require_free(known, with_drivers(known, {}), name, called, names)
+            require_free(concrete, with_drivers(concrete, {}), name, called, names)
     _require_determinate(found, analysis, called)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
     rows = analysis.scales.rows
@@ -229,9 +229,9 @@ def choose_name(name: str, taken: Container[str]) -> str:
 
 def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar) -> Mechanism:
     """Return the mechanism with a driver of this name that goes along its own value; all others hold theirs."""
-    known = mechanism.origin and mechanism.origin.mechanism
+    concrete = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
-        origin = known and Origin(_add_driver(known, name, _known_element(known, name, element), _value_or(t, 0.0)))
+        origin = concrete and Origin(_add_driver(concrete, name, _concrete_element(concrete, name, element), _value_or(t, 0.0)))
     return with_drivers(mechanism, {**_halted(mechanism, t), name: element.driver(ValueMotion())}, origin=origin)
 
 
@@ -247,15 +247,15 @@ def _halted(mechanism: Mechanism, t: Scalar) -> dict[str, Driver]:
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
     """Return the mechanism with one more driver, or with another motion of one that is there."""
     drivers = {**mechanism.drivers, name: element.driver(motion)}
-    known = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
+    concrete = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     found = with_drivers(mechanism, drivers)
-    if known is None or found.is_concrete:
+    if concrete is None or found.is_concrete:
         return found
     with jax.ensure_compile_time_eval():
-        element = _known_element(known, name, element)
-        motion = _constant(value_of(known, element)(known.q0))  # rows are counted as if the guess's value were held
-        of_origin = {**known.drivers, name: element.driver(motion)}
-        return with_drivers(mechanism, drivers, origin=Origin(with_drivers(known, of_origin)))
+        element = _concrete_element(concrete, name, element)
+        motion = _constant(value_of(concrete, element)(concrete.q0))  # rows are counted as if the guess's value were held
+        of_origin = {**concrete.drivers, name: element.driver(motion)}
+        return with_drivers(mechanism, drivers, origin=Origin(with_drivers(concrete, of_origin)))
 
 
 def with_drivers(
@@ -270,10 +270,10 @@ def with_drivers(
     return Mechanism(bodies, joints, drivers, forces, mechanism.gravity, mechanism.name, origin)
 
 
-def _known_element(known: Mechanism, name: str, element: Coordinate) -> Coordinate:
+def _concrete_element(concrete: Mechanism, name: str, element: Coordinate) -> Coordinate:
     """Return the same coordinate, with points and an axis that are not traced."""
-    if name in known.drivers:
-        return Coordinate.of(known.drivers[name])
+    if name in concrete.drivers:
+        return Coordinate.of(concrete.drivers[name])
     return jax.tree.map(lambda x: jnp.zeros(x.shape) if isinstance(x, Tracer) else x, element)
 
 
@@ -338,7 +338,7 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
     Raises:
         SceneError: it names the drivers that hold the coordinate.
     """
-    q = ordinary_position(bare)
+    q = generic_position(bare)
     involved = None if q is None else owners_of_row(kinematic_rows(driven), 0.0, q, name)
     if involved is None:
         return

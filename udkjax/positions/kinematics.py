@@ -17,7 +17,7 @@ from udkjax.positions.assembly import State, assemble
 from udkjax.positions.branches import SAME_POSITION
 from udkjax.positions.carried_bodies import carried_bodies
 from udkjax.positions.continuation import Points, Reached, follow, no_points
-from udkjax.positions.curve import AbstractCurve, Curve, KnownCurve
+from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
 from udkjax.positions.drive import Drive, Driven, drive, element_of
 from udkjax.positions.march import MarchResult, can_march, march, march_at_once
 from udkjax.positions.position_derivatives import with_derivative, with_derivatives
@@ -269,7 +269,7 @@ def _solve(
 ) -> Points:
     """Solve by machine code as far as its steps are to be relied on (if `fast`), and by continuation from there on."""
     xp, is_traced = by.xp, by is BY_JAX
-    curve = (Curve if is_traced else KnownCurve).of(driven)
+    curve = (Curve if is_traced else NumpyCurve).of(driven)
     points, first = no_points(len(values), len(q), xp), xp.asarray(0)
     given = driven.mechanism, driven.analysis, driven.unit, s, q, values
     if fast and can_march(driven.mechanism, driven.analysis):

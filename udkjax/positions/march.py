@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.position_operations import March
-from udkjax.native.primitive import call_known, native_p, unsupported
+from udkjax.native.primitive import call_concrete, native_p, unsupported
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
@@ -61,7 +61,7 @@ def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Sca
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
-    return _march(call_known(operation, inputs, APPROACH + len(values)), np)
+    return _march(call_concrete(operation, inputs, APPROACH + len(values)), np)
 
 
 def _by_numpy(x: PyTree) -> PyTree:

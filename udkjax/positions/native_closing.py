@@ -14,7 +14,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
 from udkjax.native.position_operations import Close, CloseCotangents, CloseSecondTangents, CloseTangents
-from udkjax.native.primitive import call_known, native_p, unsupported
+from udkjax.native.primitive import call_concrete, native_p, unsupported
 from udkjax.scene.mechanism import Mechanism
 
 # Results of closing: q, v, the residuals Psi and Psi_dot, and the rank of D.
@@ -33,9 +33,9 @@ def close(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) ->
     return _unpack(native_p.bind(*_inputs(mechanism, scales, t, q, v), operation=_close(mechanism), times=2), len(q))
 
 
-def close_known(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
+def close_concrete(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
     """Close with known numbers, without tracing anything."""
-    return _unpack(call_known(_close(mechanism), _inputs(mechanism, scales, t, q, v, np), 2), len(q))
+    return _unpack(call_concrete(_close(mechanism), _inputs(mechanism, scales, t, q, v, np), 2), len(q))
 
 
 def _unpack(found: Sequence[Any], n: int) -> Closed:

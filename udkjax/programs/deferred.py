@@ -50,8 +50,8 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
         except _ClosesOverError:
             return by_jit(*args, **kwargs)
         # Bound, JAX would trace a program with rules of derivatives again, to leave them out before it is evaluated.
-        is_known = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
-        found = (_evaluate if is_known else deferred_p.bind)(*leaves, call_jaxpr=program)
+        is_concrete = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
+        found = (_evaluate if is_concrete else deferred_p.bind)(*leaves, call_jaxpr=program)
         return out.rebuild(found)
 
     return run
@@ -77,28 +77,28 @@ def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Argume
 
     call: Callable[..., Any] = function
 
-    def with_known(leaves: list[Any], tree: Any, known: tuple["_Known", ...]) -> Any:
-        numbers = iter(known)
+    def with_concrete(leaves: list[Any], tree: Any, concrete: tuple["_ConcreteLeaf", ...]) -> Any:
+        numbers = iter(concrete)
         found = [x if _is_traced(x) else next(numbers).value for x in leaves]
         args, kwargs = jax.tree.unflatten(tree, found)
         traced, rest = eqx.partition(call(*args, **kwargs), _is_traced)
         return traced, _Rest(rest)
 
-    program = deferred(with_known)
+    program = deferred(with_concrete)
 
     @wraps(function)
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         leaves, tree = jax.tree.flatten((args, kwargs))
         if deferred_p is None or not any(map(_is_traced, leaves)):
             return function(*args, **kwargs)
-        known = tuple(_Known(x) for x in leaves if not _is_traced(x))
-        traced, rest = program([x if _is_traced(x) else None for x in leaves], tree, known)
+        concrete = tuple(_ConcreteLeaf(x) for x in leaves if not _is_traced(x))
+        traced, rest = program([x if _is_traced(x) else None for x in leaves], tree, concrete)
         return eqx.combine(traced, rest.value)
 
     return run
 
 
-class _Known:
+class _ConcreteLeaf:
     """A number, or anything else that is not traced, compared by its content: what is traced for it serves its equals."""
 
     def __init__(self, value: Any):
@@ -109,7 +109,7 @@ class _Known:
         self._key = content if isinstance(content, Hashable) else id(content)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and type(self.value) is type(other.value) and self._key == other._key
+        return isinstance(other, _ConcreteLeaf) and type(self.value) is type(other.value) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -106,14 +106,14 @@ def count_operations(jaxpr: Any) -> int:
 def has_rules(jaxpr: Any) -> bool:
     """Return True if NumPy knows all operations of a program: for others JAX is called."""
 
-    def is_known(equation: Any) -> bool:
+    def has_rule(equation: Any) -> bool:
         primitive = equation.primitive
         if primitive in _EVALUATIONS or primitive.name in _CONTROL or primitive.name in RULES:
             return all(map(has_rules, jaxprs_in_params(equation.params)))
         expanded = _Expanded(equation).trace()
         return expanded is not None and has_rules(expanded)
 
-    return all(map(is_known, jaxpr.eqns))
+    return all(map(has_rule, jaxpr.eqns))
 
 
 _PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()

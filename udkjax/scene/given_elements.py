@@ -88,14 +88,14 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
     if its_own is Constraint.complete or (filled and getattr(constraint, filled) is not None):
         return constraint  # as most are: spares the sines and cosines of every body
     places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
-    known = not is_traced((constraint, places))
-    if known:  # NumPy has nothing to compile
+    is_concrete = not is_traced((constraint, places))
+    if is_concrete:  # NumPy has nothing to compile
         constraint, places = jax.tree.map(np.asarray, (constraint, places))
     frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
-    known_stays_known = jax.ensure_compile_time_eval() if known else nullcontext()  # while something else is traced
-    with known_stays_known, np.errstate(all="ignore"):
+    eager = jax.ensure_compile_time_eval() if is_concrete else nullcontext()  # while something else is traced
+    with eager, np.errstate(all="ignore"):
         completed = constraint.complete(*frames)
-        return jax.tree.map(number, completed) if known else completed
+        return jax.tree.map(number, completed) if is_concrete else completed
 
 
 def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
@@ -114,11 +114,11 @@ def _mistakes_of_guess(where: str, before: eqx.Module, after: eqx.Module) -> Ite
         value = getattr(after, field.name)
         if getattr(before, field.name, None) is not None or not isinstance(value, np.ndarray | jax.Array):
             continue
-        known = np.asarray(value, float)
+        value = np.asarray(value, float)
         conditions = [Requirement("must be finite", np.isfinite), *field.metadata.get("require", ())]
-        unmet = next((c.text for c in conditions if not np.all(c.holds(known))), None)
+        unmet = next((c.text for c in conditions if not np.all(c.holds(value))), None)
         if unmet:
             given = (f.name for f in dataclasses.fields(before) if isinstance(getattr(before, f.name), np.ndarray | jax.Array))
             cure = " or ".join(["other positions of the bodies", *(f"other {name}" for name in given)])
-            found = f"{where}.{field.name}: {unmet}, and is {abbreviate(known)} in the initial guess, from which it is taken"
+            found = f"{where}.{field.name}: {unmet}, and is {abbreviate(value)} in the initial guess, from which it is taken"
             yield f"{found}: give it, or {cure}"

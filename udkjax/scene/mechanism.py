@@ -237,8 +237,8 @@ class Mechanism(PrintsTable):
         """Return the mechanism with one interval, that at time t (s), in place of all that has samples."""
         samples = self.samples
         traced = is_traced((t, samples))
-        xp, known_stays_known = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
-        with known_stays_known, np.errstate(all="ignore"):
+        xp, eager = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
+        with eager, np.errstate(all="ignore"):
             return self.with_samples({place: with_row(x, row_at(x, t, xp)) for place, x in samples.items()})
 
     @property

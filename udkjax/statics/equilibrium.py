@@ -16,7 +16,7 @@ from udkjax.equations.load_scale import LoadScale, load_scale
 from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.positions.assembly import State, close
 from udkjax.positions.branches import distinct_positions, random_positions
-from udkjax.positions.curve import AbstractCurve, Curve, KnownCurve
+from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
 from udkjax.positions.drive import Driven
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.scene.arguments import checked
@@ -164,7 +164,7 @@ def degrees_of_freedom(analysis: Analysis) -> int:
 
 def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> AbstractCurve:
     """Return the positions of the mechanism as a curve, with time in place of a driver's value."""
-    return (Curve if by is BY_JAX else KnownCurve).of(Driven(mechanism, analysis, "", -1, number(1.0)))
+    return (Curve if by is BY_JAX else NumpyCurve).of(Driven(mechanism, analysis, "", -1, number(1.0)))
 
 
 def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:

@@ -6,8 +6,8 @@ from udkjax.synthesis.complete import design_all as design_all
 from udkjax.synthesis.complete.complete_design import CompleteSearch as CompleteSearch
 from udkjax.synthesis.design import DesignSearch as DesignSearch
 from udkjax.synthesis.design import design as design
-from udkjax.synthesis.found import Designs as Designs
-from udkjax.synthesis.found import FoundDesign as FoundDesign
+from udkjax.synthesis.designs import Designs as Designs
+from udkjax.synthesis.designs import FoundDesign as FoundDesign
 from udkjax.synthesis.goal_file import read_design as read_design
 from udkjax.synthesis.goals import FunctionGoal as FunctionGoal
 from udkjax.synthesis.goals import PathGoal as PathGoal

@@ -13,7 +13,7 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_count, require_number
 from udkjax.synthesis.design_problem import DesignProblem
-from udkjax.synthesis.found import Designs
+from udkjax.synthesis.designs import Designs
 from udkjax.synthesis.goals import Goal
 from udkjax.synthesis.limits import LengthLimits, Range, box_of, read_bounds
 from udkjax.synthesis.motion_goals import MotionTerm

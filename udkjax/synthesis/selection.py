@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.design_problem import DesignProblem
-from udkjax.synthesis.found import FoundDesign, verified
+from udkjax.synthesis.designs import FoundDesign, verified
 from udkjax.synthesis.polish import polish
 from udkjax.synthesis.search import KEPT_TO, SearchState, begin, improve, loss_of
 from udkjax.synthesis.trials import Trials

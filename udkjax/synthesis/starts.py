@@ -136,8 +136,8 @@ def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.
             a, b, cost = _move(measured[..., 0] + 1j * measured[..., 1], target, moves)
         else:
             difference = measured[..., 0] - problem.data[:, 0]
-            level = difference.mean(1, keepdims=True) if goal.extras else 0.0
-            cost = np.sum((difference - level) ** 2, 1)
+            offset = difference.mean(1, keepdims=True) if goal.extras else 0.0
+            cost = np.sum((difference - offset) ** 2, 1)
         better = cost < best
         best = np.where(better, cost, best)
         chosen = [np.where(better, new, old) for new, old in zip((a, b, shift), chosen, strict=True)]

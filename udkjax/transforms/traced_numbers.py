@@ -16,7 +16,7 @@ from udkjax.transforms.gradients import TreeDef
 Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
 
 
-class KnownNumbers:
+class ConcreteNumbers:
     """The known arrays among those of a tree, None in place of the others; compared by value, so that they are static."""
 
     def __init__(self, arrays: Sequence[Array | None]):
@@ -24,7 +24,7 @@ class KnownNumbers:
         self._key = tuple(None if x is None else (x.shape, np.asarray(x).tobytes()) for x in arrays)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, KnownNumbers) and self._key == other._key
+        return isinstance(other, ConcreteNumbers) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
@@ -34,18 +34,18 @@ class TreeOfNumbers(eqx.Module):
     """A tree as a function of the arrays of floats in it that are traced. The others stay known: JAX would trace them all."""
 
     rest: PyTree  # the tree without arrays of floats
-    known: KnownNumbers = eqx.field(static=True)
+    concrete: ConcreteNumbers = eqx.field(static=True)
     structure: TreeDef = eqx.field(static=True)
 
     def __call__(self, xs: Sequence[Array]) -> Any:
         traced = iter(xs)
-        arrays = [next(traced) if x is None else x for x in self.known.arrays]
+        arrays = [next(traced) if x is None else x for x in self.concrete.arrays]
         return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
 
     def marks(self, active: Mask) -> Any:
         """Return the tree with True in place of the arrays that are active, and False in place of the others."""
         traced = iter(active)
-        return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.known.arrays])
+        return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.concrete.arrays])
 
     def changes(self, active: Mask, some: Sequence[Array]) -> Any:
         """Return the tree with some arrays in place of those that are active, and None in place of the others."""
@@ -57,8 +57,8 @@ def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
     """Return a tree as a function of the arrays of floats in it that are traced, and these arrays."""
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
-    known = KnownNumbers([None if isinstance(x, Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves])
-    return TreeOfNumbers(rest, known, structure), vary_together([x for x in leaves if isinstance(x, Tracer)])
+    concrete = ConcreteNumbers([None if isinstance(x, Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves])
+    return TreeOfNumbers(rest, concrete, structure), vary_together([x for x in leaves if isinstance(x, Tracer)])
 
 
 def select(xs: Sequence[Any], which: Mask) -> list[Any]:

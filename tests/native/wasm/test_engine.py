@@ -26,15 +26,15 @@ def both(operation, inputs, times):
     return host.run(made.module, inputs, shapes), run_without_contraction(made.module, inputs, shapes)
 
 
-def known_call(monkeypatch, module, do):
+def concrete_call(monkeypatch, module, do):
     """The operation and the inputs with which `do()` first calls machine code, by way of a module of the package."""
     seen = []
 
     def call(operation, inputs, times):
         seen.append((operation, inputs, times))
-        return primitive.call_known(operation, inputs, times)
+        return primitive.call_concrete(operation, inputs, times)
 
-    monkeypatch.setattr(module, "call_known", call)
+    monkeypatch.setattr(module, "call_concrete", call)
     do()
     return seen[0]
 
@@ -43,7 +43,7 @@ def known_call(monkeypatch, module, do):
 def test_a_run(monkeypatch, name):
     mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
     found = []
-    operation, inputs, times = known_call(
+    operation, inputs, times = concrete_call(
         monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, ts, engine="native"))
     )
     wasm, native = both(operation, inputs, times)
@@ -96,7 +96,7 @@ def test_closing(name):
 def test_a_scene_that_runs_by_loops(monkeypatch):
     mechanism, found = udk.library.n_four_bar(14), []
     times = np.linspace(0.0, 0.2, 5)
-    operation, inputs, count = known_call(
+    operation, inputs, count = concrete_call(
         monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, times, engine="native"))
     )
     assert not operation.code.is_small
@@ -108,7 +108,7 @@ def test_a_scene_that_runs_by_loops(monkeypatch):
 
 def test_marching(monkeypatch):
     mechanism = udk.library.slider_crank()
-    operation, inputs, times = known_call(
+    operation, inputs, times = concrete_call(
         monkeypatch, march, lambda: udk.kinematics(mechanism, "motor", np.linspace(0.0, 1.0, 21))
     )
     assert isinstance(operation, position_operations.March)
@@ -121,7 +121,7 @@ def test_marching(monkeypatch):
 @pytest.mark.slow
 def test_forward_tangents(monkeypatch):
     mechanism = udk.library.parallelogram()
-    run, inputs, times = known_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))
+    run, inputs, times = concrete_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))
     n, count = run.coordinates, run.code.number_count
     operation = run.with_tangents((True,) * count)
     along = np.zeros((1, 1, count))

@@ -277,7 +277,7 @@ def test_pins_are_differentiated_and_batched():
     assert_allclose(ahead[0], error(at + steps[0]), rtol=1e-9)
 
 
-def test_a_traced_pin_keeps_machine_code_and_known_numbers():
+def test_a_traced_pin_keeps_machine_code_and_concrete_numbers():
     mech = four_bar().mechanism()
 
     @jax.jit

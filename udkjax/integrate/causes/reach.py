@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.redundancy import dense, kinematic_rows, ordinary_position, owners_of_row
+from udkjax.equations.redundancy import dense, generic_position, kinematic_rows, owners_of_row
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
@@ -109,7 +109,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
 
 def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
     """Return whether the rows of drivers depend on the others in an ordinary position, too."""
-    q = ordinary_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
+    q = generic_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
     return q is not None and owners_of_row(kinematic_rows(mechanism), 0.0, q, names[-1]) is not None
 
 

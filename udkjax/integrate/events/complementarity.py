@@ -57,10 +57,10 @@ def solve_complementarity(
         x and y, with derivatives at the passive set that it has.
     """
     size = xp.sqrt(xp.where(allowed, diagonal(W, xp), 1.0))
-    unit, known = W / size[..., None, :] / size[..., :, None], b / size
-    given = unit, known, allowed, floor / size
+    scaled, rhs = W / size[..., None, :] / size[..., :, None], b / size
+    given = scaled, rhs, allowed, floor / size
     passive = _passive_set(*(given if xp is np else stop_gradients(given)), xp)
-    x = _solve_passive(unit, known, passive, xp) / size
+    x = _solve_passive(scaled, rhs, passive, xp) / size
     return Complementary(x, times(W, x) + b, passive)
 
 

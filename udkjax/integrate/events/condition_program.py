@@ -27,8 +27,8 @@ def condition_numbers(events: Sequence[Event]) -> list[Array]:
 
 def watched_conditions(events: Sequence[Event], mechanism: Mechanism) -> Conditions | None:
     """Return the conditions of the events of a mechanism as programs; None where machine code has no instruction for one."""
-    known = not any(isinstance(x, Tracer) for x in condition_numbers(events))
-    return _known_conditions(mechanism, *events) if known and mechanism.is_concrete else _conditions(mechanism, *events)
+    is_concrete = not any(isinstance(x, Tracer) for x in condition_numbers(events))
+    return _concrete_conditions(mechanism, *events) if is_concrete and mechanism.is_concrete else _conditions(mechanism, *events)
 
 
 def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
@@ -64,7 +64,7 @@ def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
     return Conditions(text, watched, at_state, len(numbers), by_velocity)
 
 
-_known_conditions = cached_by_identity(_conditions)
+_concrete_conditions = cached_by_identity(_conditions)
 
 
 class _Functions:
@@ -96,7 +96,7 @@ def _first_of_equals(functions: _Functions) -> _Functions:
     return functions
 
 
-def with_known_functions(events: Sequence[Event], programs: Conditions) -> tuple[Event, ...]:
+def with_cached_functions(events: Sequence[Event], programs: Conditions) -> tuple[Event, ...]:
     """Return events with functions of earlier ones that have the same programs: code that is compiled for those serves these.
 
     A function that is written within another is a new one in each call.

@@ -63,8 +63,8 @@ def apply_event(
         return JumpResult(state, None, blocked)
 
     free, held = state._replace(phase=xp.asarray(plan.free)[after]), xp.asarray(plan.held)[phase]
-    is_known = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
-    found = found if is_known else system.look(some, free, is_free=True)
+    is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
+    found = found if is_evaluated else system.look(some, free, is_free=True)
     rows = rows_of_directions(found.by_q, found.directions, take(system.inverse_mass, some))
 
     def second_rates(v: Any) -> Any:

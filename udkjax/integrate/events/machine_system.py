@@ -71,7 +71,7 @@ class MachineSystem:
         self._phases, self.ts, self._units, self._restitution = phases, ts, units, restitution
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
         (B, _), n = ts.shape, inverse_mass.shape[1]
-        self.end, self.rate, self.unsure, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
+        self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
         self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         E = self.plan.count
         self._watched = [np.append(np.arange(E), E + np.flatnonzero(held)) for held in self.plan.held]
@@ -185,7 +185,7 @@ class MachineSystem:
     ):
         """Take over how the runs have ended that do not go on, and where."""
         status, (n, fails) = found.info[:, STATUS], (runs.q.shape[1], ~known)
-        self.unsure[some] |= (status == UNSURE) & ~drifts
+        self.unresolved[some] |= (status == UNSURE) & ~drifts
         code = np.where(status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
         code = np.where(status == NOT_FINITE, Result.not_finite, code)
         code = np.where((status == LOST) | drifts, Result.drift, code)

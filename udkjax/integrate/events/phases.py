@@ -160,12 +160,12 @@ def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint])
     added = {name: joint for name, joint in extra.items() if name in active}
     drivers = {name: driver for name, driver in mechanism.drivers.items() if name in active}
     parts = (joints | added, drivers, mechanism.forces, mechanism.gravity, mechanism.name)
-    is_known = not any(isinstance(x, Tracer) for x in jax.tree.leaves(list(added.values())))
-    if mechanism.is_concrete and is_known:
+    is_concrete = not any(isinstance(x, Tracer) for x in jax.tree.leaves(list(added.values())))
+    if mechanism.is_concrete and is_concrete:
         with jax.ensure_compile_time_eval():  # while something else is traced, what a joint takes from the guess is known, too
             return Mechanism(mechanism.bodies, *parts)
     origin = None
-    if mechanism.origin is not None and is_known:
+    if mechanism.origin is not None and is_concrete:
         origin = Origin(_with(mechanism.origin.mechanism, active, extra))
     return Mechanism(mechanism.bodies, *parts, origin)
 

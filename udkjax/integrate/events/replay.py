@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.integrate.events.crossings import ZERO_RATE
+from udkjax.integrate.events.host_run import run_by_machine_code
 from udkjax.integrate.events.hybrid import Hybrid, rate_along
 from udkjax.integrate.events.jumps import apply_event
-from udkjax.integrate.events.known_run import run_by_machine_code
 from udkjax.integrate.events.loop import condition_values
 from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_member, without_member
 from udkjax.integrate.events.runs import EventRun, RunState

@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.integrate.compiled_mechanism import compile_known, compile_mechanism
-from udkjax.integrate.events.condition_program import watched_conditions, with_known_functions
+from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
+from udkjax.integrate.events.condition_program import watched_conditions, with_cached_functions
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
 from udkjax.integrate.events.event_plan import event_plan
+from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.hybrid import Hybrid
-from udkjax.integrate.events.known_run import KnownRun, event_arrays, known_plan
 from udkjax.integrate.events.phases import Phases, phases_of
 from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.events.runs import EventRun
@@ -80,7 +80,7 @@ def simulate_events(
     has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax and jax.default_backend() == "cpu"
     conditions = watched_conditions(listed, phases.mechanisms[0]) if has_code else None
     if conditions is not None:
-        listed = with_known_functions(listed, conditions)
+        listed = with_cached_functions(listed, conditions)
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
     given = Given(phases, listed, ts, state, closure, choices, max_events, conditions)
     found = _run_at_once(mechanism, given)
@@ -101,11 +101,11 @@ def simulate_events(
 
 def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
     """Return the result of `_run`, of known numbers; None where machine code alone does not find it."""
-    is_known = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
-    if given.conditions is None or not is_known or jax.config.jax_disable_jit:
+    is_concrete = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
+    if given.conditions is None or not is_concrete or jax.config.jax_disable_jit:
         return None
     phases, choices = given.phases, given.choices
-    compiled = [compile_known(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
+    compiled = [compile_concrete(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     if not all(x.plan.is_native for x in compiled):
         return None
     run = prepare_run(compiled[0], phases.analyses[0], given.ts, given.state, given.closure, choices, np)
@@ -113,9 +113,9 @@ def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[st
     code = Result.invalid_argument if not run.is_usable else Result.drift if run.has_missed_rows else code
     problems = [replace(run.problem, compiled=x) for x in compiled]
     settings = choices.max_steps, given.max_events
-    plan = known_plan(phases, given.conditions, *settings, *given.events, *compiled)
+    plan = concrete_plan(phases, given.conditions, *settings, *given.events, *compiled)
     arrays = event_arrays(plan, given.events, phases, problems, np.asarray(code.value), choices.drift_tol, np)
-    found = EventRun(*(x[0] for x in KnownRun(plan, len(run.ts), len(run.problem.q))(*arrays)))
+    found = EventRun(*(x[0] for x in HostRun(plan, len(run.ts), len(run.problem.q))(*arrays)))
     return None if found.code < 0 else (found, tuple(x.plan.why_not_native for x in compiled))
 
 
@@ -127,11 +127,11 @@ def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToE
     listed = tuple(events) if isinstance(events, Sequence) else (events,)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, listed, analysis))):
         return _expand(mechanism, listed, analysis)
-    return _expand_known(mechanism, analysis, *listed)
+    return _expand_concrete(mechanism, analysis, *listed)
 
 
 @cached_by_identity
-def _expand_known(mechanism: Mechanism, analysis: Analysis, *events: ExpandsToEvents) -> Prepared:
+def _expand_concrete(mechanism: Mechanism, analysis: Analysis, *events: ExpandsToEvents) -> Prepared:
     with jax.ensure_compile_time_eval():
         return _expand(mechanism, events, analysis)
 

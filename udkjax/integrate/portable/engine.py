@@ -12,7 +12,7 @@ import numpy as np
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.integrate.compiled_mechanism import compile_known
+from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
@@ -202,7 +202,7 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
     """Return a run that stands for all: its times and its state are replaced in the page."""
     choices = Choices(rtol=rtol, atol=atol, drift_tol=DRIFT_PROJECTED, dt0=None, method=AUTO, stabilization=Projection())
     choices = choices._replace(max_steps=STEPS_OF_A_PAGE)
-    compiled = compile_known(mechanism, analysis, *choices.of_mechanism)
+    compiled = compile_concrete(mechanism, analysis, *choices.of_mechanism)
     start = State(mechanism.q0, mechanism.v0)
     problem = prepare_run(compiled, analysis, np.array([0.0, 1.0]), start, None, choices, np).problem
     return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-NOT_KNOWN = -1  # before the first step, which says how many evaluations the start took
+NOT_COUNTED = -1  # before the first step, which says how many evaluations the start took
 
 
 class Tally(eqx.Module):
@@ -115,7 +115,7 @@ class CountingController(diffrax.AbstractAdaptiveStepSizeController):
 
     def init(self, *args, **kwargs):
         tnext, state = self.controller.init(*args, **kwargs)
-        return tnext, (state, jnp.array(NOT_KNOWN))
+        return tnext, (state, jnp.array(NOT_COUNTED))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: PyTree, error_order, controller_state):
         state, total = controller_state
@@ -125,7 +125,7 @@ class CountingController(diffrax.AbstractAdaptiveStepSizeController):
         if y_error.evaluations is not None:
             # diffrax replaces what is not a number in an error, and so makes these of a float type
             taken, before = (jnp.asarray(x).astype(total.dtype) for x in (y_error.evaluations, y_error.before))
-            total = jnp.where(total == NOT_KNOWN, before, total) + taken
+            total = jnp.where(total == NOT_COUNTED, before, total) + taken
         return keep, *times, jumped, (state, total), result
 
 

@@ -16,7 +16,7 @@ from udkjax.scene.drawing.drawing_reader import (
     DRAWN,
     SECTIONS,
     DrawingElements,
-    known_elements,
+    concrete_elements,
     placement_of,
     read_drawing,
 )
@@ -138,7 +138,7 @@ class Drawing(AbstractDrawing):
 
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
         """Return the last of the links through a pin, or the ground, and the point in its frame (m); None where it is no pin."""
-        placement = placement_of(known_elements(self.groups), self.ground)
+        placement = placement_of(concrete_elements(self.groups), self.ground)
         if name not in placement.places:
             return None
         body = placement.members(name)[-1]
@@ -151,7 +151,7 @@ class Drawing(AbstractDrawing):
 
     def shapes(self) -> dict[str, Array]:
         """Return the points (n, 2) through which links are drawn, their pins or outlines, by name, in their own frames (m)."""
-        placement, found = placement_of(known_elements(self.groups), self.ground), {}
+        placement, found = placement_of(concrete_elements(self.groups), self.ground), {}
         for name, link in placement.links.items():
             places = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
             found[name] = number([placement.local(name, place) for place in places])
@@ -159,7 +159,7 @@ class Drawing(AbstractDrawing):
 
     def free_pins(self) -> dict[str, tuple[str, Array]]:
         """Return the pins that belong to one link alone: the link of each, and its place in the link's frame (m)."""
-        placement, found = placement_of(known_elements(self.groups), self.ground), {}
+        placement, found = placement_of(concrete_elements(self.groups), self.ground), {}
         for pin, place in placement.places.items():
             members = placement.members(pin)
             if len(members) == 1 and members[0] in placement.links:
@@ -174,7 +174,7 @@ class Drawing(AbstractDrawing):
     @deferred_if_traced
     def mechanism(self) -> Mechanism:
         """Return the mechanism that is drawn; its numbers follow from those of the drawing, and may be traced."""
-        groups = known_elements(self.groups)
+        groups = concrete_elements(self.groups)
         placement = placement_of(groups, self.ground)
         bodies = {name: drawn.body for name, drawn in placement.drawn.items()} | groups["body"]
         joints: dict[str, Joint] = {}

@@ -10,7 +10,7 @@ from udkjax.scene.checks import SceneEntry, abbreviate, check_table, gravity_mis
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
-from udkjax.scene.drawing.link import Link, Pin, with_known_numbers
+from udkjax.scene.drawing.link import Link, Pin, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
@@ -76,7 +76,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     all_read = all(len(groups[section]) == len(named[section]) for section in groups)
     problems += layout_mistakes(layout, groups, fixed, all_read)
     if not is_traced((groups["pin"], groups["link"])):
-        drawn = known_elements(groups)
+        drawn = concrete_elements(groups)
         problems += shape_mistakes({name: pin.position for name, pin in drawn["pin"].items()}, drawn["link"])
         if not problems:
             problems += gap_mistakes(placement_of(drawn, fixed), drawn)
@@ -126,6 +126,6 @@ def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str])
     return Placement(PinLayout(links, ground, groups["slide"]), places, drawn, frames)
 
 
-def known_elements(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def concrete_elements(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return elements with NumPy's arrays for all numbers that are not traced, in their order: JAX sorts the keys of a dict."""
-    return {section: {name: with_known_numbers(x) for name, x in group.items()} for section, group in groups.items()}
+    return {section: {name: with_concrete_numbers(x) for name, x in group.items()} for section, group in groups.items()}

@@ -180,6 +180,6 @@ class DrawnBody(NamedTuple):
         return self.frame.local((point[0] - self.frame.x, point[1] - self.frame.y))
 
 
-def with_known_numbers(tree):
+def with_concrete_numbers(tree):
     """Return a tree with NumPy's arrays in place of all that are not traced: results of these alone stay known."""
     return jax.tree.map(lambda x: x if isinstance(x, Tracer) else np.asarray(x), tree)

@@ -10,7 +10,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import Numbers
 from udkjax.scene.forces import Spring, Torque
 from udkjax.scene.joints import Revolute
-from udkjax.scene.library.posed_bodies import bodies_on_pose, unit_vector, with_known_numbers
+from udkjax.scene.library.posed_bodies import bodies_on_pose, unit_vector, with_concrete_numbers
 from udkjax.scene.mechanism import Mechanism
 
 # Masses (kg) and inertias (kg m^2) of K1 to K7.
@@ -34,7 +34,7 @@ START: Mapping[str, float] = MappingProxyType(  # rad
 )
 
 
-@with_known_numbers
+@with_concrete_numbers
 def andrews_squeezer(
     torque: ArrayLike = 0.033, stiffness: ArrayLike = 4530.0, spring_length: ArrayLike = 0.07785, gravity: Numbers = (0.0, 0.0)
 ) -> Mechanism:

@@ -13,11 +13,19 @@ from udkjax.scene.drawing.drawn_joints import PinInSlot, Slide
 from udkjax.scene.drawing.link import Link
 from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import Spring
-from udkjax.scene.library.posed_bodies import ORIGINS, apex, as_array, derivative, gravity_vector, unit_vector, with_known_numbers
+from udkjax.scene.library.posed_bodies import (
+    ORIGINS,
+    apex,
+    as_array,
+    derivative,
+    gravity_vector,
+    unit_vector,
+    with_concrete_numbers,
+)
 from udkjax.scene.mechanism import Mechanism
 
 
-@with_known_numbers
+@with_concrete_numbers
 def four_bar(
     angle: ArrayLike = np.pi / 3,
     angular_velocity: ArrayLike = 0.0,
@@ -41,7 +49,7 @@ def four_bar(
     return draw_on_pose(places, angle, angular_velocity, links, ["A", "D"], gravity, "four-bar")
 
 
-@with_known_numbers
+@with_concrete_numbers
 def slider_crank(
     angle: ArrayLike = 0.0,
     angular_velocity: ArrayLike = 4.0,
@@ -81,7 +89,7 @@ def slider_crank(
     )
 
 
-@with_known_numbers
+@with_concrete_numbers
 def scissor_lift(
     stages: int = 2,
     angle: ArrayLike = np.pi / 6,

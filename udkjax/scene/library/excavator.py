@@ -18,7 +18,7 @@ from udkjax.scene.library.posed_bodies import (
     derivative,
     gravity_vector,
     uniform_rod,
-    with_known_numbers,
+    with_concrete_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
 
@@ -30,7 +30,7 @@ BUCKET = {"centre": (0.45, 0.20), "bucket": (0.0, 0.0), "link": (-0.13, 0.28)}
 BASE = (0.13, -0.09)  # of the boom's cylinder on the ground, from the boom's foot, in units of the boom's length
 
 
-@with_known_numbers
+@with_concrete_numbers
 def excavator(
     angles: Sequence[ArrayLike] = (0.6, -1.1, -2.2),
     angular_velocities: Sequence[ArrayLike] = (-0.2, 0.3, 0.6),

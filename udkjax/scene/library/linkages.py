@@ -10,12 +10,12 @@ from udkjax.scene.library.posed_bodies import (
     gravity_vector,
     uniform_rod,
     unit_vector,
-    with_known_numbers,
+    with_concrete_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
 
 
-@with_known_numbers
+@with_concrete_numbers
 def parallelogram(
     angle: ArrayLike = -np.pi / 4,
     angular_velocity: ArrayLike = 0.0,
@@ -50,7 +50,7 @@ def parallelogram(
     )
 
 
-@with_known_numbers
+@with_concrete_numbers
 def n_four_bar(
     n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81
 ) -> Mechanism:
@@ -74,7 +74,7 @@ def n_four_bar(
     return Mechanism(bodies, joints, gravity=gravity_vector(gravity), name=f"{n}-four-bar")
 
 
-@with_known_numbers
+@with_concrete_numbers
 def elliptic_trammel(
     angle: ArrayLike = np.pi / 4,
     angular_velocity: ArrayLike = 0.0,

@@ -16,12 +16,12 @@ from udkjax.scene.library.posed_bodies import (
     uniform_disc,
     uniform_rod,
     unit_vector,
-    with_known_numbers,
+    with_concrete_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
 
 
-@with_known_numbers
+@with_concrete_numbers
 def peaucellier(
     angle: ArrayLike = np.pi / 6,
     angular_velocity: ArrayLike = 0.0,
@@ -70,7 +70,7 @@ def peaucellier(
     return Mechanism(bodies, joints, gravity=[gravity, 0.0], name="Peaucellier-Lipkin linkage")
 
 
-@with_known_numbers
+@with_concrete_numbers
 def planetary_gear(
     planets: int = 3,
     angular_velocity: ArrayLike = 1.0,

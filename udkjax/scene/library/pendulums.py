@@ -16,12 +16,12 @@ from udkjax.scene.library.posed_bodies import (
     hanging_rod_pose,
     uniform_rod,
     unit_vector,
-    with_known_numbers,
+    with_concrete_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
 
 
-@with_known_numbers
+@with_concrete_numbers
 def simple_pendulum(
     position: Numbers = (-1.0, 0.0),
     velocity: Numbers = (0.0, 0.0),
@@ -36,7 +36,7 @@ def simple_pendulum(
     return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=gravity_vector(gravity), name="simple pendulum")
 
 
-@with_known_numbers
+@with_concrete_numbers
 def compound_pendulum(
     angle: ArrayLike = np.pi / 3,
     angular_velocity: ArrayLike = 0.0,
@@ -57,7 +57,7 @@ def compound_pendulum(
     )
 
 
-@with_known_numbers
+@with_concrete_numbers
 def double_pendulum(
     angles: Sequence[ArrayLike] = (np.pi / 2, np.pi / 2),
     angular_velocities: Sequence[ArrayLike] = (0.0, 0.0),
@@ -84,7 +84,7 @@ def double_pendulum(
     )
 
 
-@with_known_numbers
+@with_concrete_numbers
 def driven_pendulum(
     amplitude: ArrayLike = 0.8,
     frequency: ArrayLike = 3.0,
@@ -107,7 +107,7 @@ def driven_pendulum(
     )
 
 
-@with_known_numbers
+@with_concrete_numbers
 def chain(
     n: int = 10,
     angle: ArrayLike = np.pi / 2,

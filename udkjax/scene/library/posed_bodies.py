@@ -28,23 +28,23 @@ Several: TypeAlias = ArrayLike | Sequence[ArrayLike]  # a number or several
 COMPLEX_STEP = 1e-100  # of the coordinate: its square is lost beside 1, and a rate times it is no denormal number
 
 
-def with_known_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
+def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
     """Give a function of the library all numbers that are not traced as NumPy's: results of these alone stay known."""
     parameters, build_deferred = signature(build), deferred_if_traced(build)
 
     @wraps(build)
-    def build_with_known_numbers(*arguments: P.args, **named: P.kwargs) -> Mechanism:
+    def build_with_concrete_numbers(*arguments: P.args, **named: P.kwargs) -> Mechanism:
         bound = bind_arguments(build.__name__, parameters, arguments, named)
         bound.apply_defaults()
         for name, value in bound.arguments.items():
             if not isinstance(parameters.parameters[name].default, int):  # counts and switches stay what they are
-                bound.arguments[name] = jax.tree.map(_known, value)
+                bound.arguments[name] = jax.tree.map(_as_concrete, value)
         return build_deferred(*bound.args, **bound.kwargs)
 
-    return build_with_known_numbers
+    return build_with_concrete_numbers
 
 
-def _known(value: ArrayLike) -> ArrayLike:
+def _as_concrete(value: ArrayLike) -> ArrayLike:
     return value if isinstance(value, Tracer) else np.asarray(value, float)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
-from udkjax.equations.scales import known_scales
+from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.positions.assembly import close, require_closed
 from udkjax.programs.deferred import deferred
@@ -112,7 +112,7 @@ def require_consistent_loops(mechanism: Mechanism, unknowns: Unknowns) -> None:
 
 def _length(mechanism: Mechanism) -> float:
     """Return its characteristic length (m)."""
-    return float(known_scales(mechanism).length)
+    return float(concrete_scales(mechanism).length)
 
 
 def _constraint_bytes(mechanism: Mechanism) -> list[bytes]:

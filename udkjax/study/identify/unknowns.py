@@ -15,7 +15,7 @@ from scipy.linalg import qr
 from scipy.special import expit, logit
 
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.scales import known_scales
+from udkjax.equations.scales import concrete_scales
 from udkjax.positions.assembly import State, assemble
 from udkjax.positions.channels import RATES, UNITS
 from udkjax.scene.bodies import COORDINATES
@@ -222,7 +222,7 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
         position = rows.close(t0, q)
         assert position is not None, "what has been assembled is closed"
         free = rows.metric[:, None] * position.vt[position.rank :].T
-    chosen, scales = _independent_rows(free), known_scales(mech)
+    chosen, scales = _independent_rows(free), concrete_scales(mech)
     size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles are in rad
     rate = float(scales.rate) or 1.0  # of what rests without any load, in 1/s
     basis = free @ np.linalg.inv(free[chosen]) * size

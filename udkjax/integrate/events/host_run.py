@@ -46,8 +46,8 @@ class PlainForm:
 
     def run(self, *arrays: Array) -> EventRun:
         """Return the run of some arrays."""
-        known = iter(arrays)
-        return run_plain(jax.tree.unflatten(self.tree, [next(known) if x is None else x for x in self.others]))
+        given = iter(arrays)
+        return run_plain(jax.tree.unflatten(self.tree, [next(given) if x is None else x for x in self.others]))
 
     def __call__(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         given = [x.astype(dtype) for x, (_, dtype) in zip(arrays, self.shapes, strict=True)]
@@ -73,14 +73,14 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
         *event_arrays(plan, hybrid.events, hybrid.phases, problems, hybrid.code, hybrid.drift_tol),
         *(x[None] for x in arrays),
     ]
-    found = EventRun(*(x[0] for x in call_host(KnownRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
+    found = EventRun(*(x[0] for x in call_host(HostRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
     whole = ("event_index", "event_phase", "closed", "count", "code", "totals")
     found = found._replace(**{name: getattr(found, name).astype(int) for name in whole})
     return found._replace(together=found.together > 0.5, undefined=found.undefined > 0.5)
 
 
 @dataclass(frozen=True)
-class KnownRun:
+class HostRun:
     """Runs of the members of a batch, as a function of arrays of NumPy (native/base/host_function.py).
 
     Attributes:
@@ -113,7 +113,7 @@ class KnownRun:
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.zeros(B, int), joints)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
         found = results(plan.events, runs, ts, np.full(runs.scale.shape, np.inf), np)
-        for b in np.flatnonzero(system.unsure):
+        for b in np.flatnonzero(system.unresolved):
             if self.plain is None:
                 found.code[b] = -1
             else:
@@ -137,7 +137,7 @@ def machine_plan(plan: EventPlan, phases: Phases, compiled: Sequence[CompiledMec
 
 
 @cached_by_identity
-def known_plan(phases: Phases, conditions: Conditions, max_steps: int, max_events: int, *others: Any) -> MachinePlan:
+def concrete_plan(phases: Phases, conditions: Conditions, max_steps: int, max_events: int, *others: Any) -> MachinePlan:
     """Return the same for all events, and the compiled mechanisms behind them, of known numbers."""
     count = len(others) - len(phases.mechanisms)
     plan = event_plan(phases, others[:count], max_steps, max_events)
@@ -168,7 +168,7 @@ def event_arrays(
     units = MemberUnits(first.rate, scales.length, scales.rate, scales.mass, drift_tol)
     of_run = [xp.asarray(x, float)[None] for x in (first.ts, first.q, first.v, _stack([code], xp), _stack(units, xp))]
     of_phases = [phase_arrays(p, x, xp) for p, x in zip(problems, plan.phases, strict=True)]
-    of_events = (_known_numbers if xp is np else _numbers)(xp, phases, *events)
+    of_events = (_concrete_numbers if xp is np else _numbers)(xp, phases, *events)
     return [*of_run, *of_events, *(x for phase in of_phases for x in phase)]
 
 
@@ -186,4 +186,4 @@ def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
     return [x[None] for x in (of_conditions, _stack(restitution, xp), 1 / mass_of(phases.mechanisms[0], xp), of_joints)]
 
 
-_known_numbers = cached_by_identity(_numbers)
+_concrete_numbers = cached_by_identity(_numbers)

@@ -17,7 +17,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", fast(["through meetings of branches"], CASES))
-def test_positions_of_known_and_of_traced_numbers(name):
+def test_positions_of_concrete_and_of_traced_numbers(name):
     make, driver, values = CASES[name]
     mechanism = make()
     known = udk.kinematics(mechanism, driver, values)
@@ -29,7 +29,7 @@ def test_positions_of_known_and_of_traced_numbers(name):
 
 
 @pytest.mark.parametrize("name", fast(["to a toggle"], CASES))
-def test_limits_of_known_and_of_traced_numbers(name):
+def test_limits_of_concrete_and_of_traced_numbers(name):
     make, driver, _ = CASES[name]
     mechanism = make()
     known = udk.travel(mechanism, driver)
