@@ -198,7 +198,7 @@ def test_static_parts_and_trees_come_through():
 
 
 @pytest.mark.skipif(deferred_p is None, reason="this JAX evaluates such a function operation by operation")
-def test_what_is_known_beside_traced_numbers_stays_known_and_is_traced_once_for_its_content():
+def test_concrete_numbers_among_traced_ones_stay_concrete_and_are_traced_once_for_their_content():
     seen = []
 
     @deferred_if_traced
