@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM
+from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, G
 from udkjax.equations.analysis import analyse
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events import simulate_events
+from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.condition_program import watched_conditions
 from udkjax.integrate.events.conditions import frames_of
 from udkjax.integrate.events.event import expand_events
@@ -38,6 +39,22 @@ LOCKS = [
     udk.Event(lambda t, at: t - 0.9, udk.Release("A.lock"), name="free"),
     udk.Contact("link", point=[0.5, 0], through=[0, -0.9], restitution=0.5, name="floor"),
 ]
+
+
+class ChangeEnds(Action):
+    """Pin the free end of the pendulum where it is as it passes the vertical, and take its own pin away."""
+
+    adds = True
+
+    @property
+    def removed(self):
+        return frozenset(["A"])
+
+    def addition(self, mechanism, where):
+        return "B", udk.Revolute(("ground", "link"), [[0, -1], [0.5, 0]])
+
+
+CHANGE = [udk.Event(lambda t, at: at["link"].angle + np.pi / 2, ChangeEnds(), -1, name="change")]
 FIVE_BAR = udk.library.parallelogram()
 STOPS = [udk.JointLimit(next(iter(FIVE_BAR.joints)), lower=-2.0, restitution=0.6)]
 
@@ -48,6 +65,7 @@ STOPS = [udk.JointLimit(next(iter(FIVE_BAR.joints)), lower=-2.0, restitution=0.6
         pytest.param(PENDULUM, LIMITS, 2.0, id="limits"),
         pytest.param(CATCH, CAUGHT, 0.8, id="catch"),
         pytest.param(BOX, FEET, 0.41, id="box"),
+        pytest.param(PENDULUM, [*CHANGE, *LIMITS[1:]], 0.8, id="change"),
         pytest.param(PENDULUM, LOCKS, 1.5, id="locks", marks=pytest.mark.slow),
         pytest.param(FIVE_BAR, STOPS, 3.0, id="redundant", marks=pytest.mark.slow),
     ],
@@ -61,6 +79,16 @@ def test_machine_code_does_what_the_plain_form_does(mechanism, events, end, monk
     assert np.abs(fast.events.time - plain.events.time).max() < 1e-8
     assert np.abs(fast.events.v_after - plain.events.v_after).max() < 1e-6
     assert fast.result == plain.result and np.abs(fast.q - plain.q).max() < 1e-7
+
+
+def test_an_action_of_ones_own_is_a_class():
+    """A pendulum that goes over to its other end keeps its angular momentum about that: (0.1 - 0.25) w = (0.1 + 0.25) w'."""
+    found = udk.simulate(PENDULUM, np.linspace(0.0, 0.6, 4), events=CHANGE, rtol=1e-10, atol=1e-10)
+    before, after = found.events.v_before[0, 0], found.events.v_after[0, 0]
+    assert found.events.count == 1 and np.abs(before[2] + np.sqrt(G / 0.35)) < 1e-8
+    assert np.abs(after[2] + 0.15 / 0.35 * before[2]) < 1e-8
+    tip = found.q[-1, 0, :2] + 0.5 * np.array([np.cos(found.q[-1, 0, 2]), np.sin(found.q[-1, 0, 2])])
+    assert np.abs(tip - [0, -1]).max() < 1e-9
 
 
 def test_members_of_a_batch_run_as_they_do_alone():

@@ -12,8 +12,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
-from udkjax.integrate.events.conditions import frames_of
-from udkjax.integrate.events.event import Event, sees_velocity
+from udkjax.integrate.events.conditions import frames_of, sees_velocity
+from udkjax.integrate.events.event import Event
 from udkjax.native.base.program import UnsupportedError, consecutive, write
 from udkjax.native.watching.conditions import Conditions
 from udkjax.scene.identity_cache import cached_by_identity
@@ -32,7 +32,7 @@ def watched_conditions(events: Sequence[Event], mechanism: Mechanism) -> Conditi
 
 
 def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
-    names, by_velocity = mechanism.body_names, tuple(sees_velocity(e, mechanism) for e in events)
+    names, by_velocity = mechanism.body_names, tuple(sees_velocity(e.condition, mechanism) for e in events)
     arrays, rest = eqx.partition(events, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
     n, graph = 3 * len(names), Graph()

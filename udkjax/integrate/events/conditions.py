@@ -1,6 +1,7 @@
 """Conditions of events: the frames that they see, the coordinate of a joint, the gap of a contact."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -80,6 +81,14 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
         return JointCoordinate(found.bodies, found.points, found.axis)
     kinds = "a revolute or prismatic joint, or a slot"
     raise ValueError(f"{where}: {quote(joint)} is a {type(found).__name__}, and must be {kinds}")
+
+
+def sees_velocity(condition: Callable[[Number, Frames], Any], mechanism: Mechanism) -> bool:
+    """Tell whether a condition depends on velocities: it then fails with frames that have none."""
+    try:
+        return condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
+    except (TypeError, AttributeError, ValueError):  # as arithmetic with None raises, of Python, JAX or NumPy
+        return True
 
 
 def require_name(name: str, known: Sequence[str], where: str, what: str) -> None:

@@ -21,17 +21,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import Scalar
-from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Release, Stop
+from udkjax.integrate.events.actions import Action, Impact, Stop
 from udkjax.integrate.events.checks import (
     number_if_any,
-    require_joint,
     require_limits,
     require_name_text,
     require_normal,
-    require_restitution,
     require_vector,
 )
-from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name
+from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name, sees_velocity
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import Mistakes, quote, suggestion
@@ -232,14 +230,6 @@ def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Ev
         _check(found[-1], mechanism)
 
 
-def sees_velocity(event: Event, mechanism: Mechanism) -> bool:
-    """Tell whether a condition depends on velocities: it then fails with frames that have none."""
-    try:
-        return event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
-    except (TypeError, AttributeError, ValueError):  # as arithmetic with None raises, of Python, JAX or NumPy
-        return True
-
-
 def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
     """Tell whether the numbers of events are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
 
@@ -249,8 +239,7 @@ def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
     for e in events:
         if isinstance(e.condition, WithinLimit):
             limits[e.name] = e.condition.limit
-        if isinstance(e.action, Impact):
-            found &= (e.action.restitution >= 0) & (e.action.restitution <= 1)
+        found &= e.action.has_usable_numbers()
         if isinstance(e.condition, WithinLimit | Gap):
             found &= jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(e.condition)]))
         if isinstance(e.condition, Gap):
@@ -260,7 +249,7 @@ def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
 
 
 def _with_name(event: Event, name: str) -> Event:
-    falls = isinstance(event.action, Impact) and event.direction in (0, -1)  # from above zero, which it does not pass
+    falls = event.action.is_impact and event.direction in (0, -1)  # from above zero, which it does not pass
     return Event(event.condition, event.action, -1 if falls else event.direction, name)
 
 
@@ -286,24 +275,10 @@ def _check(event: Event, mechanism: Mechanism) -> None:
             raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
     if value.shape:
         raise ValueError(f"{where}: the condition must return one number, not an array of shape {value.shape}")
-    if isinstance(action, Impact):
+    if action.is_impact:
         if event.direction == 1:
             cure = "turn the condition's sign, and leave the direction out"
             raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
-        if sees_velocity(event, mechanism):
+        if sees_velocity(event.condition, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
-        require_restitution(f"{where}: the restitution", action.restitution)
-        if not isinstance(action.at_rest, str) or action.at_rest not in ("hold", "stop"):
-            raise ValueError(f'{where}: at_rest must be "hold" or "stop", {describe(action.at_rest)}')
-    elif isinstance(action, Lock):
-        require_name_text(f"{where}: the joint of Lock", action.joint)
-        joint_coordinate(mechanism, action.joint, where)
-    elif isinstance(action, Release):
-        require_name_text(f"{where}: the name of Release", action.name)
-    elif isinstance(action, Attach):
-        require_name_text(f"{where}: the name of Attach", action.name)
-        require_joint(f"{where}: the joint of Attach", action.joint)
-        if action.name in mechanism.constraints:
-            raise ValueError(f"{where}: {quote(action.name)} is in the scene already; attach the joint under another name")
-        for body in action.joint.bodies:
-            require_name(body, [*mechanism.body_names, GROUND], where, "body")
+    action.check(mechanism, where)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from udkjax.integrate.events.actions import Action, Attach, Impact, Lock, Log, Stop
-from udkjax.integrate.events.event import Event, sees_velocity
+from udkjax.integrate.events.actions import Action
+from udkjax.integrate.events.conditions import sees_velocity
+from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.phases import Phases, Tables
 
 
@@ -39,22 +40,22 @@ class EventPlan:
     @cached_property
     def impacts(self) -> Bool[np.ndarray, "E"]:
         """Mask of the events that are impacts."""
-        return self._mask(Impact)
+        return np.array([x.is_impact for x in self.actions])
 
     @cached_property
     def stops(self) -> Bool[np.ndarray, "E"]:
         """Mask of the events that end the run."""
-        return self._mask(Stop)
+        return np.array([x.stops for x in self.actions])
 
     @cached_property
     def changes(self) -> Bool[np.ndarray, "E"]:
         """Mask of the events that do more than to take note or to stop."""
-        return ~self._mask(Log, Stop)
+        return np.array([x.changes for x in self.actions])
 
     @cached_property
     def adds(self) -> Bool[np.ndarray, "E"]:
         """Mask of the events that add a joint."""
-        return self._mask(Attach, Lock)
+        return np.array([x.adds for x in self.actions])
 
     @cached_property
     def held_at_rest(self) -> Bool[np.ndarray, "E"]:
@@ -96,9 +97,6 @@ class EventPlan:
         held = xp.asarray(self.held)[phase]
         return xp.concatenate([~held & ~carried, held], axis=-1)
 
-    def _mask(self, *actions: type[Action]) -> Bool[np.ndarray, "E"]:
-        return np.array([issubclass(x, actions) for x in self.actions])
-
 
 def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_events: int) -> EventPlan:
     """Return the plan of a run.
@@ -112,9 +110,9 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
     return EventPlan(
         tables=phases.tables,
         directions=tuple(e.direction for e in events),
-        by_velocity=tuple(sees_velocity(e, phases.mechanisms[0]) for e in events),
+        by_velocity=tuple(sees_velocity(e.condition, phases.mechanisms[0]) for e in events),
         actions=tuple(type(e.action) for e in events),
-        at_rest=tuple(e.action.at_rest if isinstance(e.action, Impact) else "" for e in events),
+        at_rest=tuple(e.action.rest for e in events),
         max_steps=max_steps,
         max_events=max_events,
     )

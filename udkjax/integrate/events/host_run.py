@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int
 
 from udkjax.equations.scales import mass_of
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
-from udkjax.integrate.events.actions import Impact
 from udkjax.integrate.events.added_joints import added_joints, joint_numbers
 from udkjax.integrate.events.condition_program import condition_numbers
 from udkjax.integrate.events.event import Event
@@ -178,12 +177,14 @@ def _stack(numbers: Sequence[Any], xp: ModuleType) -> Any:
 
 def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
     """Return the arrays that no state and no choice decides: of conditions, of impacts, of masses and of joints."""
-    restitution = [e.action.restitution if isinstance(e.action, Impact) else 0.0 for e in events]
     of_conditions, of_joints = (
         xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
         for numbers in (condition_numbers(events), joint_numbers(phases))
     )
-    return [x[None] for x in (of_conditions, _stack(restitution, xp), 1 / mass_of(phases.mechanisms[0], xp), of_joints)]
+    return [
+        x[None]
+        for x in (of_conditions, _stack([e.action.rebound for e in events], xp), 1 / mass_of(phases.mechanisms[0], xp), of_joints)
+    ]
 
 
 _concrete_numbers = cached_by_identity(_numbers)

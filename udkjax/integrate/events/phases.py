@@ -11,16 +11,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.integrate.events.actions import Attach, Impact, Lock, Release
-from udkjax.integrate.events.conditions import Frames, JointCoordinate, frames_of, joint_coordinate
+from udkjax.integrate.events.conditions import Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import Number, number, optional_number
-from udkjax.scene.joints import Angle, Joint, fill
+from udkjax.scene.fields import Number, number
+from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism, Origin
 
 MOST_PHASES = 32  # each is compiled
@@ -69,9 +68,8 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
     names = [name for _, name in added_by]
     known = [*mechanism.constraints, *names]
     for event in events:
-        if isinstance(event.action, Release) and event.action.name not in known:
-            near = suggestion(event.action.name, known)
-            raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(event.action.name)}{near}")
+        for name in sorted(event.action.removed.difference(known)):
+            raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(name)}{suggestion(name, known)}")
     first: frozenset[str] = frozenset(mechanism.constraints)
     found, steps = [first], []
     for active in found:  # the list grows in this loop
@@ -87,7 +85,7 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
         steps.append(rows)
     place = {active: k for k, active in enumerate(found)}
     after, resting, freed = (tuple(tuple(place[row[i]] for row in rows) for rows in steps) for i in range(3))
-    contacts = {_contact(event): HeldContact.of(event, mechanism) for event in events if _holds(event)}
+    contacts = {_contact(event): HeldContact.of(event, mechanism) for event in events if event.action.rest == "hold"}
     extra = {**dict(zip(names, added, strict=True)), **contacts}
     mechanisms = [_with(mechanism, active, extra) for active in found]
     analyses = [analysis]
@@ -105,14 +103,11 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
 def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Joint], list[tuple[int, str]]]:
     joints, by = [], []
     for k, event in enumerate(events):
-        if isinstance(event.action, Attach):
-            joints.append(event.action.joint)
-            by.append((k, event.action.name))
-        elif isinstance(event.action, Lock):
-            coordinate = joint_coordinate(mechanism, event.action.joint, f"event {quote(event.name)}")
-            bodies, points, axis = coordinate.bodies, coordinate.points, coordinate.axis
-            joints.append(Angle(bodies) if points is None or axis is None else Displacement(bodies, points, axis))
-            by.append((k, f"{event.action.joint}.lock"))
+        addition = event.action.addition(mechanism, f"event {quote(event.name)}")
+        if addition is not None:
+            name, joint = addition
+            joints.append(joint)
+            by.append((k, name))
     for k, name in by:
         if [other for _, other in by].count(name) > 1:
             raise ValueError(f"event {quote(events[k].name)}: two events add {quote(name)}; give one of them another name")
@@ -123,15 +118,9 @@ def _next_phases(
     event: Event, active: frozenset[str], names: Sequence[str], by: Sequence[tuple[int, str]], k: int
 ) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
     """Return the constraints after an event, after it has come to rest, and after its contact has let go."""
-    action = event.action
     added = frozenset(name for i, name in by if i == k)
-    after = active - {action.name} if isinstance(action, Release) else active | added
-    contact = frozenset([_contact(event)] if _holds(event) else [])
-    return after, active | contact, active - contact
-
-
-def _holds(event: Event) -> bool:
-    return isinstance(event.action, Impact) and event.action.at_rest == "hold"
+    contact = frozenset([_contact(event)] if event.action.rest == "hold" else [])
+    return (active - event.action.removed) | added, active | contact, active - contact
 
 
 def _contact(event: Event) -> str:
@@ -184,21 +173,3 @@ class HeldContact(Joint):
 
     def residual(self, t, *frames):
         return [self.condition(t, {GROUND: GROUND_FRAME_AT_REST, **dict(zip(self.labels, frames, strict=True))})]
-
-
-class Displacement(Joint):
-    """Point 2 stays where it is along `axis` of body 1. 1 row (m): its distance from point 1 along it, less `position`."""
-
-    points: Float[Array, "2 2"] = eqx.field(converter=number)
-    axis: Float[Array, ""] = eqx.field(converter=number)
-    position: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
-
-    def residual(self, t, *frames):
-        assert self.position is not None  # `complete` fills it in
-        return [self._along(*frames) - self.position]
-
-    def complete(self, *frames):
-        return fill(self, "position", self._along(*frames))
-
-    def _along(self, one, two):
-        return JointCoordinate(self.bodies, self.points, self.axis).of(one, two)

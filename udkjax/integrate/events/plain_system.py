@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.scales import mass_of
-from udkjax.integrate.events.actions import Impact
 from udkjax.integrate.events.crossings import NO_EVENT
 from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
 from udkjax.integrate.events.hybrid import Added, Hybrid
@@ -80,7 +79,7 @@ class PlainSystem:
     def contacts(self, some: Members) -> Contacts:
         """Return the contacts."""
         plan = self.plan
-        e = [e.action.restitution if isinstance(e.action, Impact) else jnp.zeros(()) for e in self.hybrid.events]
+        e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
 
     def look(self, some: Members, at: RunState, is_free: bool = False) -> StateValues:

@@ -9,7 +9,6 @@ from jaxtyping import Array
 
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events import impacts as law
-from udkjax.integrate.events.actions import Impact, Log, Stop
 from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions
 from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
@@ -48,7 +47,7 @@ class PortableEvents:
         self._given = tuple(events)
         self._events = expand_events(events, mechanism) if events else ()
         for event in self._events:
-            if not isinstance(event.action, Log | Stop | Impact):
+            if not event.action.on_page:
                 kind, cure = type(event.action).__name__, "a page knows Log, Stop and Impact; leave out live"
                 raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) is no program yet: {cure}")
         self._conditions = watched_conditions(self._events, mechanism) if events else None
@@ -58,7 +57,7 @@ class PortableEvents:
     @property
     def holding(self) -> list[int]:
         """The events whose contacts are held when they come to rest."""
-        return [k for k, e in enumerate(self._events) if isinstance(e.action, Impact) and e.action.at_rest == "hold"]
+        return [k for k, e in enumerate(self._events) if e.action.rest == "hold"]
 
     def with_contact(self, mechanism: Mechanism, event: int) -> Mechanism:
         """Return the mechanism with the contact of an event as a joint: it is at rest."""
@@ -74,15 +73,14 @@ class PortableEvents:
         """Return the events as data of a page; None where there are none."""
         if not self._events:
             return None
-        impacts = [event.action if isinstance(event.action, Impact) else None for event in self._events]
         assert self._conditions is not None  # since there are events
         return {
             "names": [event.name for event in self._events],
             "directions": [event.direction for event in self._events],
             "by_velocity": list(self._conditions.by_velocity),
-            "stops": [isinstance(event.action, Stop) for event in self._events],
-            "restitution": [None if impact is None else float(impact.restitution) for impact in impacts],
-            "ends_at_rest": [impact is not None and impact.at_rest == "stop" for impact in impacts],
+            "stops": [event.action.stops for event in self._events],
+            "restitution": [float(event.action.rebound) if event.action.is_impact else None for event in self._events],
+            "ends_at_rest": [event.action.rest == "stop" for event in self._events],
             "slowest": float(analysis.scales.rate),
             "most": MOST_EVENTS,
             "head": HEAD,
@@ -100,5 +98,5 @@ class PortableEvents:
     def states_of(self, run: RunStates) -> EvaluateEvents:
         """Return the operation that finds conditions, their rates and slopes, and directions of impulses at states."""
         assert self._conditions is not None  # since there are events
-        impacts = tuple(k for k, event in enumerate(self._events) if isinstance(event.action, Impact))
+        impacts = tuple(k for k, event in enumerate(self._events) if event.action.is_impact)
         return EvaluateEvents(run.code, run.pseudoinverse, run.formulation, self._conditions, impacts)
