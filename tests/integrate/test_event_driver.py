@@ -88,7 +88,7 @@ def test_an_action_of_ones_own_is_a_class():
     assert found.events.count == 1 and np.abs(before[2] + np.sqrt(G / 0.35)) < 1e-8
     assert np.abs(after[2] + 0.15 / 0.35 * before[2]) < 1e-8
     tip = found.q[-1, 0, :2] + 0.5 * np.array([np.cos(found.q[-1, 0, 2]), np.sin(found.q[-1, 0, 2])])
-    assert np.abs(tip - [0, -1]).max() < 1e-9
+    assert np.abs(tip - np.array([0.0, -1.0])).max() < 1e-9
 
 
 def test_members_of_a_batch_run_as_they_do_alone():
