@@ -247,7 +247,7 @@ def _as_array(value: object) -> np.ndarray | None:
 
 def _check_references(path: str, kind: str | None, value: object, known: KnownNames) -> Iterator[str]:
     """Iterate over the names in a value that name nothing."""
-    if kind is None:
+    if kind not in known:  # in a module that an element holds, whose names need not be those of the scene
         return
     named = known[kind]
     single = isinstance(value, str)

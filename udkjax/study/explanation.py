@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udkjax.equations import determinacy
-from udkjax.scene.joints import Revolute
+from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.wording import plain, plural, row_label
 
@@ -190,11 +190,12 @@ def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
 
 
 def _directions(e: Explanation) -> list[tuple[str, float]]:
-    """Return the pins whose force is unique in one direction alone, and that direction (rad)."""
+    """Return the pins and welds whose force is unique in one direction alone, and that direction (rad)."""
     found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
     for name, joint in e.mechanism.joints.items():
         own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
-        angle = determinacy.unique_direction(null_rows[own]) if isinstance(joint, Revolute) else None
+        holds_point = isinstance(joint, Revolute | Weld)
+        angle = determinacy.unique_direction(null_rows[own[:2]]) if holds_point else None  # a weld's third row is its torque
         found += [] if angle is None else [(name, angle)]
     return found
 

@@ -54,7 +54,7 @@ def explain_reach(run: FailedRun, until: float) -> str:
     if opposed:
         return f"{demands} {where}, where the joints leave its coordinate no motion; take it out, or free the coordinate"
     reached = " and ".join(_value(mechanism.drivers[name], found.t) for name in names)
-    point = _dead_point(mechanism, found, names)
+    point = dead_point(mechanism, found, names)
     return f"{demands} {where}; the linkage reaches {reached}, at {found.t:.6g} s ({point})"
 
 
@@ -113,7 +113,7 @@ def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
     return q is not None and owners_of_row(kinematic_rows(mechanism), 0.0, q, names[-1]) is not None
 
 
-def _dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
+def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
     """Describe a dead point: the pins of links that lie in line, or the joints that hold together."""
     index = {name: k for k, name in enumerate(mechanism.body_names)}
     frames = found.q.reshape(-1, 3)

@@ -103,7 +103,7 @@ def _candidates(
     for name in dependency.constraints:
         options, own, places = [], _own(owners, name), _places(mechanism, name)
         forces = [stress[own] / positions.row_unit[own, None] for stress in stresses]
-        for change in _changes(mechanism, name, at[0], forces[0]):
+        for change in changes_of(mechanism, name, at[0], forces[0]):
             removes, conditioning = _effect(own, places, change, at, positions.rank_tol)
             if removes > 0 and conditioning > SMALLEST_PIVOT * min(c.smallest for c in at):
                 aligned = min(change.alignment(force, c.q, places) for force, c in zip(forces, at, strict=True))
@@ -151,7 +151,7 @@ def _places(mechanism: Mechanism, name: str) -> list[int | None]:
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
 
 
-def _changes(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[JointChange]:
+def changes_of(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[JointChange]:
     """Iterate over the ways to relax a constraint that carries the multipliers `force` (rows, redundancy) of the stress."""
     element = mechanism.constraints[name]
     yield JointChange("remove it", None)

@@ -1,0 +1,263 @@
+"""Joint types and the modules that ask for them: each cell of the table is found by calling the module.
+
+"served": the module does something for this type that it does not do for a class of one's own with the same equations;
+"refused": an error names the joint; "-": the module treats it as it treats any joint. A new type needs a column here, and
+nowhere else a list: who adds one reads off which modules may want to know it.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.elements import BODIES, JOINTS, P
+from udkjax.integrate.causes.reach import Reach, dead_point
+from udkjax.integrate.events.conditions import joint_coordinate
+from udkjax.scene.wording import row_label
+from udkjax.show.player.followers import followers
+from udkjax.show.player.marks import marks
+from udkjax.show.player.symbols import symbols_of
+from udkjax.statics.reaction_peaks import cam_forces
+from udkjax.studio.drawn_scenes import drawing_text_of
+from udkjax.studio.findings import drawn_change
+from udkjax.study.diagnosis.configuration import RankedPositions
+from udkjax.study.diagnosis.fixes import Fix, changes_of
+
+TABLE = """
+                  Revolute  Prismatic Slot      Weld      Distance  Angle     Gear      Rack      Cam
+row labels        served    served    -         served    -         -         -         -         -
+marks             -         served    served    served    served    -         served    served    served
+followers         -         -         -         -         -         -         served    served    -
+mjcf, tree        served    served    served    served    served    served    served    refused   refused
+mjcf, loop        served    refused   refused   served    served    served    served    refused   refused
+drawings          served    served    served    refused   served    refused   served    refused   refused
+drawn fixes       -         -         served    -         -         -         -         -         -
+with_angle        served    -         -         served    -         -         -         -         -
+event limits      served    served    served    refused   refused   refused   refused   refused   refused
+dead points       served    -         -         -         -         -         -         -         -
+joint axes        -         served    served    -         served    -         -         served    -
+one compliance    served    refused   -         refused   -         -         -         -         -
+cam forces        -         -         -         -         -         -         -         -         served
+pin directions    served    -         -         served    -         -         -         -         -
+explained pins    served    -         -         served    -         -         -         -         -
+fixes             served    served    -         served    -         -         -         -         -
+transmission      served    refused   refused   refused   refused   refused   refused   refused   refused
+motion ranges     served    served    -         -         -         -         -         -         -
+"""
+
+
+class Own(udk.Joint):
+    """A joint of one's own with the equations of another."""
+
+    other: udk.Joint
+
+    @property
+    def frame_names(self):
+        return self.other.frame_names
+
+    def residual(self, t, *frames):
+        return self.other.residual(t, *frames)
+
+    def complete(self, *frames):
+        return eqx.tree_at(lambda own: own.other, self, self.other.complete(*frames))
+
+
+class OwnAtPoints(Own):
+    """The same, of joints that have points."""
+
+    @property
+    def points(self):
+        return self.other.points  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class Motion(NamedTuple):
+    """A motion through some states."""
+
+    ts: jax.Array
+    q: jax.Array
+    v: jax.Array
+
+
+def own(joint: udk.Joint) -> udk.Joint:
+    kind = OwnAtPoints if hasattr(joint, "points") else Own
+    return kind(joint.bodies, joint)  # pyright: ignore[reportCallIssue]
+
+
+def scene(joints: dict[str, udk.Joint], bodies: dict[str, udk.Body] = BODIES) -> udk.Mechanism:
+    """Return a mechanism that starts closed."""
+    mechanism = udk.Mechanism(bodies, joints)
+    state = udk.assemble(mechanism)
+    places = {f"body.{name}.position": q[:2] for name, q in zip(bodies, state.q, strict=True)}
+    return mechanism.with_parameters(places | {f"body.{name}.angle": q[2] for name, q in zip(bodies, state.q, strict=True)})
+
+
+def chain(joint: udk.Joint) -> udk.Mechanism:
+    """Return two links in line, pinned to the ground at their outer ends, with a joint between them."""
+    bodies = {"a": udk.Body(1.0, 0.1, [0.5, 0.0]), "b": udk.Body(1.0, 0.1, [1.5, 0.0]), "c": udk.Body(1.0, 0.1, [1.0, 1.0])}
+    more = {"points": ((0.5, 0.0), (-0.4, 0.0))} if hasattr(joint, "points") else {}
+    outer = udk.Revolute(["ground", "a"], [[0, 0], [-0.5, 0]]), udk.Revolute(["ground", "b"], [[2, 0], [0.5, 0]])
+    return udk.Mechanism(bodies, {"A": outer[0], "J": replace(joint, bodies=("a", "b"), **more), "B": outer[1]})
+
+
+def motion_of(mechanism: udk.Mechanism, turn: float = 0.0) -> Motion:
+    """Return a motion that begins at the initial guess, where everything turns as far at each time."""
+    q = jnp.stack([mechanism.q0, mechanism.q0 + jnp.array([0.0, 0.0, turn])])
+    return Motion(jnp.array([0.0, 1.0]), q, 0 * q)
+
+
+def outcome(is_served: Callable[[], object]) -> str:
+    """Return what happens, where errors name the joint."""
+    try:
+        return "served" if is_served() else "-"
+    except (udk.SceneError, ValueError) as error:
+        assert "J" in str(error)
+        return "refused"
+
+
+def kinds_of_marks(joint: udk.Joint) -> Counter:
+    mechanism = udk.Mechanism(BODIES, {"J": joint})
+    return Counter(mark["kind"] for mark in marks(mechanism, mechanism.q0[None]))
+
+
+def follows_radius(joint: udk.Joint) -> bool:
+    mechanism = udk.Mechanism(BODIES, {"J": joint})
+    symbols = symbols_of(marks(mechanism, mechanism.q0[None]), 0.1)
+    record = {"marks": [], "traces": [], "reactions": None}
+    return bool(followers(mechanism, record, symbols, 0)["sizes"])
+
+
+def axles(joint: udk.Joint) -> dict[str, udk.Joint]:
+    """Return the pins of wheels on their carrier, where each is."""
+    if not isinstance(joint, udk.Gear):
+        return {}
+    frames = {name: body.frame() for name, body in BODIES.items()}
+    places = [(frames[name].x, frames[name].y) for name in joint.bodies]
+    if joint.carrier != "ground":
+        carrier = frames[joint.carrier]
+        places = [carrier.local((x - carrier.x, y - carrier.y))[:2] for x, y in places]
+    pairs = zip(joint.bodies, places, strict=True)
+    return {f"axle {name}": udk.Revolute([joint.carrier, name], [place, (0.0, 0.0)]) for name, place in pairs}
+
+
+def reactions_differ(joint: udk.Joint) -> bool:
+    """Tell whether loads in axes and about points of the joint are others than those of a joint of one's own."""
+    found = []
+    for one in (joint, own(joint)):
+        mechanism = scene({"J": one})
+        mechanism = udk.Mechanism(
+            dict(mechanism.bodies), dict(mechanism.joints), forces={"push": udk.Force("b", [1.0, 2.0], P[0])}
+        )
+        loads = udk.reactions(mechanism, motion_of(mechanism), frame="joint", about="joint", method=udk.SVD())
+        found.append(np.concatenate([np.asarray(load) for load in loads["J"].values()]))
+    size = np.abs(found[0]).max()
+    assert size > 0
+    return bool(np.abs(found[0] - found[1]).max() > 1e-9 * size)
+
+
+def slot_for(joint: udk.Joint) -> udk.Slot:
+    """Return a slot through the point of a joint, which holds one direction of it again."""
+    points = getattr(joint, "points", None)
+    return udk.Slot(joint.bodies, P if points is None else np.asarray(points), axis=0.3)
+
+
+def can_be_drawn(joint: udk.Joint) -> bool:
+    """Tell whether the studio draws a joint of a body on the ground, or of wheels on their carrier, which mesh."""
+    pins = axles(joint)
+    if isinstance(joint, udk.Gear):
+        one, two = (BODIES[name].position for name in joint.bodies)
+        apart = jnp.linalg.norm(two - one)
+        first, second = joint.radii
+        joint = replace(joint, radii=joint.radii * apart / abs(second - first if joint.internal else second + first))
+    else:
+        joint = replace(joint, bodies=("ground", "b"))
+    bodies = {name: body for name, body in BODIES.items() if name in joint.frame_names}
+    return '"J"' in drawing_text_of(scene({"J": joint, **pins}, bodies))
+
+
+def with_slot(joint: udk.Joint) -> udk.Mechanism:
+    return scene({"J": joint, "again": slot_for(joint)})
+
+
+def moves_on_pins(joint: udk.Joint) -> bool:
+    """Tell whether a body follows another that is turned."""
+    mechanism = chain(joint)
+    hanging = udk.Mechanism(dict(mechanism.bodies), {name: mechanism.joints[name] for name in "AJ"})
+    return bool(np.any(udk.with_angle(hanging, "a", 0.3).q0[1] != hanging.q0[1]))
+
+
+def has_fixes(joint: udk.Joint) -> bool:
+    """Tell whether a constraint can be relaxed by less than taking it away."""
+    mechanism = scene({"J": joint})
+    at = RankedPositions(mechanism, 1e-9).at(0.0, np.asarray(mechanism.q0, float).ravel())
+    return len(list(changes_of(mechanism, "J", at, np.ones((len(udk.analyse(mechanism).row_names), 1))))) > 1
+
+
+def ranges(joint: udk.Joint) -> bool:
+    mechanism = udk.Mechanism(BODIES, {"J": replace(joint, bodies=("ground", "b"))})
+    found = udk.motion_ranges(mechanism, motion_of(mechanism, 0.5))
+    return bool(found.swings or found.strokes)
+
+
+def peaks(joint: udk.Joint) -> bool:
+    mechanism = scene({"J": joint})
+    return bool(cam_forces(mechanism, motion_of(mechanism)))
+
+
+def compliance(joint: udk.Joint) -> bool:
+    """Tell whether one number serves several rows; of one row it is what any joint takes."""
+    mechanism = scene({"J": joint})
+    udk.reactions(mechanism, motion_of(mechanism), compliances={"J": 0.1})
+    return len(udk.analyse(mechanism).row_names) > 1
+
+
+def dead(joint: udk.Joint) -> bool:
+    mechanism = chain(joint)
+    return "pins A, J, B in line" in dead_point(mechanism, Reach(0.0, np.ravel(mechanism.q0), frozenset("AJB")), [])
+
+
+def fix(joint: udk.Joint) -> bool:
+    return drawn_change(Fix("J", "", 1, 1.0, udk.Mechanism(BODIES, {"J": joint}))) is not None
+
+
+CHECKS: dict[str, Callable[[udk.Joint], object]] = {
+    "row labels": lambda joint: "row" not in row_label(udk.Mechanism(BODIES, {"J": joint}), "J", 0),
+    "marks": lambda joint: kinds_of_marks(joint) != kinds_of_marks(own(joint)),
+    "followers": follows_radius,
+    "mjcf, tree": lambda joint: udk.mjcf_text(scene({"J": joint, **axles(joint)})),
+    "mjcf, loop": lambda joint: udk.mjcf_text(scene({"I": slot_for(joint), "J": joint, **axles(joint)})),
+    "drawings": can_be_drawn,
+    "drawn fixes": fix,
+    "with_angle": moves_on_pins,
+    "event limits": lambda joint: joint_coordinate(udk.Mechanism(BODIES, {"J": joint}), "J", "limit") is not None,
+    "dead points": dead,
+    "joint axes": reactions_differ,
+    "one compliance": compliance,
+    "cam forces": peaks,
+    "pin directions": lambda joint: udk.diagnose(with_slot(joint), fixes=False, walk=False).forces["J"].direction is not None,
+    "explained pins": lambda joint: "J: its force is unique only along" in str(udk.explain(with_slot(joint))),
+    "fixes": has_fixes,
+    "transmission": lambda joint: udk.transmission_angle(chain(joint), motion_of(chain(joint)), "J").shape,
+    "motion ranges": ranges,
+}
+HEAD, *ROWS = [line for line in TABLE.splitlines() if line]
+TYPES = HEAD.split()
+CELLS = {line[:18].strip(): dict(zip(TYPES, line[18:].split(), strict=True)) for line in ROWS}
+
+
+def test_the_table_has_a_column_for_each_type_and_a_row_for_each_check():
+    assert set(TYPES) == {type(joint).__name__ for joint in JOINTS.values()}
+    assert list(CELLS) == list(CHECKS)
+
+
+@pytest.mark.parametrize("module", CHECKS)
+@pytest.mark.parametrize("name", JOINTS)
+def test_modules_treat_joint_types_as_the_table_says(module, name):
+    joint = JOINTS[name]
+    assert outcome(lambda: CHECKS[module](joint)) == CELLS[module][type(joint).__name__]
