@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose
 
-from udkjax.native.seldom import call_seldom
+from udkjax.native.base.host_function import call_seldom
 
 
 def _roots(x, scale, names):

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
-from udkjax.equations.traced_once import traced_once
+from udkjax.programs.deferred import traced_once
 from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 

@@ -1,7 +1,54 @@
-"""Quantities of the equations of motion at a state, each as one compiled program: what `udkjax.equations` offers to its users."""
+"""Quantities of the equations of motion at a state, each as one compiled program: what `udkjax.equations` offers to its users.
+
+Operation by operation each would be dozens of small ones. Inside the package the plain functions are called, within larger
+programs.
+"""
+
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from typing import ParamSpec, TypeVar
+
+import jax.numpy as jnp
 
 from udkjax.equations import constraints, determinacy, loads
-from udkjax.equations.compiled import compiled
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.programs.deferred import deferred
+from udkjax.scene.arguments import checked
+from udkjax.scene.mechanism import Mechanism
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a function of a mechanism and of numbers as one program for all mechanisms of a structure.
+
+    It may be transformed like the function itself. Its `analysis`, if it takes one, is made before the numbers are traced.
+
+    Args:
+        function: Its first argument is the `mechanism`; of the others, all but an `analysis` are numbers or arrays.
+
+    Returns:
+        A function with the same arguments and the same result.
+    """
+    program, parameters = deferred(function), signature(function)
+
+    @wraps(function)
+    def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        given = parameters.bind(*args, **kwargs)
+        found = given.arguments
+        mechanism: Mechanism = found["mechanism"]
+        if "analysis" in parameters.parameters and found.get("analysis") is None:
+            found["analysis"] = analyse(mechanism)
+        for name, value in found.items():
+            if not isinstance(value, Mechanism | Analysis):
+                found[name] = jnp.asarray(value, jnp.result_type(float))  # a plain number would be part of the program
+        found["mechanism"] = mechanism.without_origin
+        return program(*given.args, **given.kwargs)
+
+    return checked(run)
+
 
 psi = compiled(constraints.psi)
 psi_q = compiled(constraints.psi_q)

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.constraints import State, bodies, vector
 from udkjax.equations.structure import ElementKind, evaluate_by_kind
-from udkjax.equations.traced_once import traced_once
+from udkjax.programs.deferred import traced_once
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism

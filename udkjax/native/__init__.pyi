@@ -4,6 +4,7 @@ from udkjax.native.base import code_cache as code_cache
 from udkjax.native.base import machine as machine
 from udkjax.native.base.code_cache import cache_folder as cache_folder
 from udkjax.native.base.host_function import call_host as call_host
+from udkjax.native.base.host_function import call_seldom as call_seldom
 from udkjax.native.base.ir import Function as Function
 from udkjax.native.base.layout import FORMULATION_SETTINGS as FORMULATION_SETTINGS
 from udkjax.native.base.layout import INFO as INFO
@@ -65,7 +66,6 @@ from udkjax.native.run.formulations import formulation_tol as formulation_tol
 from udkjax.native.runs import RunStates as RunStates
 from udkjax.native.runs import RunWatched as RunWatched
 from udkjax.native.runs import Tableau as Tableau
-from udkjax.native.seldom import call_seldom as call_seldom
 from udkjax.native.wasm import compile_wasm as compile_wasm
 from udkjax.native.wasm import wasm_module as wasm_module
 from udkjax.native.wasm.object_code import LinkedModule as LinkedModule

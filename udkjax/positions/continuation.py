@@ -29,7 +29,7 @@ from udkjax.equations.control_flow import sequential
 from udkjax.equations.position_closure import CLOSED_TOL
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.structure import ArrayLibrary
-from udkjax.native.seldom import call_seldom
+from udkjax.native.base.host_function import call_seldom
 from udkjax.positions.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing, find_toggle
 from udkjax.positions.curve import AbstractCurve
 from udkjax.printing import PrintsWords

@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.equations.control_flow import sequential
-from udkjax.native.seldom import call_seldom
+from udkjax.native.base.host_function import call_seldom
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.positions.continuation import Points
 from udkjax.positions.crossing import FARTHEST_NODE, nodes, weights

@@ -5,6 +5,15 @@ waits for the first alone. So a program is evaluated by NumPy until that has tak
 then on XLA's program serves. Both agree to rounding.
 
 To JAX such a program is one operation, whose derivatives and batches are such programs again.
+
+Everything in the package that is to be done once, and what it is for:
+
+    deferred                        a program that users wait for: NumPy evaluates it at first
+    deferred_if_traced              the same, of a function whose concrete numbers decide something, or are checked
+    traced_once                     a function that larger programs call many times: one trace, compiled within each of them
+    equations.control_flow.solve    an algorithm too long to trace: Python's loops where all is concrete, else one program
+    native call_seldom              a part of a compiled program that is hardly ever reached: NumPy evaluates it there
+    scene cached_by_identity        a result that no number changes: found again for the same objects, without any program
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -15,6 +24,7 @@ from weakref import WeakKeyDictionary
 import equinox as eqx
 import jax
 import jax.extend.core
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
@@ -96,6 +106,26 @@ def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Argume
         return eqx.combine(traced, rest.value)
 
     return run
+
+
+def traced_once(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a function of a mechanism and of numbers that is traced once for each structure, however often programs take it.
+
+    One program takes Psi, its Jacobian and the loads dozens of times: in each stage, in projection, under each derivative. JAX
+    finds the trace of a function under `jit` again, and of its derivatives and batches too.
+    """
+    program: Callable[..., Any] = eqx.filter_jit(function)
+
+    @wraps(function)
+    def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        return program(*map(_as_traced, args), **{name: _as_traced(value) for name, value in kwargs.items()})
+
+    return run
+
+
+def _as_traced(value: Any) -> Any:
+    """Return a mechanism without its origin, and numbers as arrays: neither is part of what is traced."""
+    return value.without_origin if isinstance(value, eqx.Module) else jnp.asarray(value, jnp.result_type(float))
 
 
 class _ConcreteLeaf:
