@@ -1,6 +1,13 @@
-"""Annotated shapes of the textbook's functions and of the pseudoinverses, which beartype holds against the arrays."""
+"""Beartype checks the annotated shapes of the textbook and the pseudoinverses; each alias of types is defined once."""
 
+import ast
+from collections import Counter
+from pathlib import Path
+
+import udkjax
 from tests.fresh_process import python
+
+TYPES = "Any Array ArrayLike Bool Callable Float Int Iterable Literal Mapping PyTree Sequence dict list ndarray set tuple".split()
 
 CODE = """
 from jaxtyping import TypeCheckError, install_import_hook
@@ -43,3 +50,45 @@ for wrong in (lambda: constraints.psi_q(mech, 0.0, q.reshape(-1, 3)[:, :2]), lam
 
 def test_arrays_have_the_annotated_shapes():
     assert python(CODE).split() == ["refused", "refused"]
+
+
+def is_type(node: ast.expr) -> bool:
+    """True if an expression is made of types, as the value of an alias is."""
+    match node:
+        case ast.Subscript():
+            return is_type(node.value)
+        case ast.BinOp(op=ast.BitOr()):
+            return is_type(node.left) or is_type(node.right)
+        case ast.Name(id=name) | ast.Attribute(attr=name):
+            return name in TYPES
+        case ast.Call(func=ast.Name(id="TypeAliasType")):
+            return True
+    return False
+
+
+def aliases(text: str) -> list[str]:
+    """The aliases of types, and the classes, that a module defines. Type variables are its own."""
+    found = []
+    for node in ast.parse(text).body:
+        match node:
+            case ast.ClassDef(name=name):
+                found.append(name)
+            case ast.AnnAssign(target=ast.Name(id=name), annotation=ast.Name(id="TypeAlias")):
+                found.append(name)
+            case ast.Assign(targets=[ast.Name(id=name)], value=value) if is_type(value):
+                found.append(name)
+    return found
+
+
+def test_aliases_are_found():
+    text = 'A = Float[Array, "n"] | None\nB: TypeAlias = "C | D"\nC = TypeAliasType("C", int)\nD = f(int)\n'
+    text += 'T = TypeVar("T")\nE = 1 | 2\n'
+    assert aliases(text) == ["A", "B", "C"]
+
+
+def test_each_alias_has_one_meaning():
+    root = Path(udkjax.__file__).parent
+    files = [file for file in root.rglob("*.py") if file.parent != root / "cli"]  # types of options share their names
+    defined = Counter(name for file in files for name in aliases(file.read_text(encoding="utf-8")))
+    assert len(defined) > 500
+    assert [name for name, count in defined.items() if count > 1] == []

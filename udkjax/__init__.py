@@ -1,8 +1,8 @@
 """Planar mechanisms with any redundancy of constraints: simulated, batched and differentiated in JAX.
 
-Nothing is imported before it is used, so that the command line answers at once: the public names stand in `__init__.pyi`.
-Importing this package turns float64 on in JAX, unless the environment says `JAX_ENABLE_X64=0`, and lets Python end without
-looking for garbage among what JAX has made, which would take a third of a second; it does nothing else.
+Names are imported at first use, so that the command line starts quickly; `__init__.pyi` lists them. Importing this package
+enables float64 in JAX, unless the environment sets `JAX_ENABLE_X64=0`, and skips garbage collection when Python exits, which
+takes a third of a second with JAX; it does nothing else.
 """
 
 import atexit
@@ -20,7 +20,7 @@ atexit.register(gc.freeze)
 os.environ["JAX_ENABLE_X64"] = os.environ.get("JAX_ENABLE_X64") or "1"
 if "jax" in sys.modules:
     if os.environ["JAX_ENABLE_X64"].lower() not in ("0", "n", "no", "f", "false", "off"):
-        sys.modules["jax"].config.update("jax_enable_x64", True)  # it has read its environment already
-    # Equinox imports this, which adds to what JAX knows its traces by: a function that is traced when a name of this package is
-    # first asked for would be traced and compiled again on its second call.
+        sys.modules["jax"].config.update("jax_enable_x64", True)  # JAX has already read its environment
+    # Equinox imports this module, which changes the key of JAX's cache of traces. Imported later, at the first use of a name, a
+    # function that is traced by then would be traced and compiled again on its second call.
     import_module("jax.extend")

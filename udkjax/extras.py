@@ -1,9 +1,9 @@
-"""Packages that only some parts need, and how to get them where they are missing."""
+"""Optional packages, and how to install missing ones."""
 
 from importlib.util import find_spec
 from types import TracebackType
 
-# The extras of pyproject.toml by the top-level modules that they bring.
+# The extras of pyproject.toml by the top-level modules that they install.
 EXTRAS = {
     "PIL": "plot",
     "anywidget": "notebook",
@@ -25,13 +25,13 @@ EXTRAS = {
 
 
 class MissingExtraError(ModuleNotFoundError):
-    """A package is missing that an extra of udkjax brings."""
+    """A package is missing that an extra of udkjax installs."""
 
 
 class OptionalImport:
-    """Inside `with OptionalImport():`, a missing package of an extra raises an error that says how to install it.
+    """Inside `with OptionalImport():`, a missing package of an extra raises an error that tells how to install it.
 
-    Any other import error is passed on as it is.
+    Other import errors are passed on unchanged.
     """
 
     def __enter__(self) -> None:
@@ -43,14 +43,14 @@ class OptionalImport:
 
 
 def require(*packages: str) -> None:
-    """Raise `MissingExtraError` where one of these packages is missing: before work whose result needs them."""
+    """Raise `MissingExtraError` if one of these packages is missing, before work that needs them begins."""
     for package in packages:
         if find_spec(package) is None:
             raise MissingExtraError(cure(ModuleNotFoundError(name=package)), name=package)
 
 
 def cure(error: ModuleNotFoundError) -> str:
-    """Return the command that installs a missing package; an empty text where no extra brings it."""
+    """Return the command that installs a missing package; an empty text if no extra contains it."""
     missing = (error.name or "").partition(".")[0]
     if missing not in EXTRAS:
         return ""

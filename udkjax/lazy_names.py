@@ -1,4 +1,4 @@
-"""Packages whose names are imported when they are first asked for: they stand in the package's `__init__.pyi`."""
+"""Lazy packages, whose names are imported at first use, as listed in the package's `__init__.pyi`."""
 
 import pkgutil
 import re
@@ -10,10 +10,10 @@ from typing import Any
 
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package, from the imports of its stub, which editors read, too.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package, from the imports of its stub, which editors read as well.
 
-    A name of the stub stays what the stub says where a module of the package has the same name: `from udkjax.integrate import
-    simulate` is the function, whether or not `udkjax.integrate.simulate` is loaded already.
+    Names of the stub take precedence over modules of the same name: `from udkjax.integrate import simulate` is the function,
+    even if the module `udkjax.integrate.simulate` is already loaded.
     """
     stub = (pkgutil.get_data(package, "__init__.pyi") or b"").decode()
     homes = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)}

@@ -1,4 +1,4 @@
-"""Printing of the package's classes: short tables of numbers with their units, as text and, in notebooks, as HTML."""
+"""Printing of the package's classes: short tables of numbers with units, as text or, in notebooks, HTML."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -12,21 +12,21 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-MOST_ROWS = 14  # of a table as text, whose title and remarks fit on a screen beside it: further rows are counted
-MOST_HTML_ROWS = 30  # of a table in a notebook, which scrolls
-MOST_NUMBERS = 6  # numbers of an array that are written out; of more, their shape and range
-MOST_CHARACTERS = 96  # of a cell
-MOST_LINE = 400  # characters of what prints as one line
-DIGITS = 6  # of a number in a table: enough to compare runs by eye
-PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # of the largest number beside it: rounding of thousands of operations prints as 0
+MOST_ROWS = 14  # of a table as text, so that it fits on a screen with title and remarks; further rows are counted
+MOST_HTML_ROWS = 30  # of a table in a notebook, which can be scrolled
+MOST_NUMBERS = 6  # entries of an array that are printed; larger arrays print their shape and range
+MOST_CHARACTERS = 96  # in a cell
+MOST_LINE = 400  # characters of an object that prints on one line
+DIGITS = 6  # significant digits in tables, enough to compare runs by eye
+PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # relative to the largest nearby number: accumulated rounding errors print as 0
 
 Plain = bool | int | float | complex | np.ndarray | np.generic
 
 
 class PrintedTable(NamedTuple):
-    """A title, and cells row by row below the names of the columns; without these the first column names its row.
+    """A title, and rows of cells below the names of the columns; without these the first column names the rows.
 
-    Remarks, a sentence each, follow the rows.
+    Remarks, one sentence each, follow the rows.
     """
 
     title: str
@@ -36,7 +36,7 @@ class PrintedTable(NamedTuple):
 
 
 def text_table(table: PrintedTable, most: int = MOST_ROWS) -> str:
-    """Return a table as text, its columns below each other; of many rows the first ones, and how many more there are."""
+    """Return a table as text with aligned columns; of many rows, the first ones and the number of the others."""
     cells = [[_shorten(str(cell)) for cell in row] for row in table.rows[:most]]
     lines = align_columns([list(table.heads), *cells] if table.heads else cells)
     if len(table.rows) > most:
@@ -45,13 +45,13 @@ def text_table(table: PrintedTable, most: int = MOST_ROWS) -> str:
 
 
 def align_columns(cells: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table, its columns below each other."""
+    """Return the lines of a table with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  " + "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells]
 
 
 def html_table(table: PrintedTable) -> str:
-    """Return a table as HTML, whatever stands in its cells escaped; of many rows the first ones, and how many more there are."""
+    """Return a table as HTML, with escaped cells; of many rows, the first ones and the number of the others."""
     heads, rows = table.heads, table.rows
     head = "".join(f"<th>{escape(name)}</th>" for name in heads)
     body = "".join(
@@ -77,12 +77,12 @@ def _shorten(text: str) -> str:
 
 
 def units(**by_field: str) -> Mapping[str, str]:
-    """Return the units of fields by their names."""
+    """Return the units of fields by name."""
     return MappingProxyType(by_field)
 
 
 def has_numbers(value: object) -> bool:
-    """Return whether every number is there to be read: none is traced, or stands for a shape alone."""
+    """Return True if all numbers have values: none is traced or only a shape."""
     return all(isinstance(leaf, Plain | str) or _is_stored(leaf) for leaf in _leaves(value))
 
 
@@ -97,18 +97,18 @@ def _is_stored(leaf: object) -> bool:
 
 
 def format_number(value: Any, unit: str = "", scale: float = 0.0) -> str:
-    """Return one number to six digits with its unit; 0 where it is rounding beside `scale`, of the same unit."""
+    """Return one number with six digits and its unit; 0 if it is rounding relative to `scale`, in the same unit."""
     number = complex(value) if np.iscomplexobj(value) else float(value)
     text = f"{0.0 if abs(number) <= PRINTED_AS_ZERO * scale else number:.{DIGITS}g}"
     return f"{text} {unit}" if unit else text
 
 
 def format_numbers(value: Any, unit: str = "") -> str:
-    """Return a number or an array with its unit as text: few numbers, or the shape and range of many.
+    """Return a number or an array with its unit as text: a few entries, or the shape and range of many.
 
     Args:
-        value: an array, a number, a truth value, or None. Traced numbers are named as such, with their shape.
-        unit: of all its entries; several, such as "m, m, rad", of those along its last axis.
+        value: an array, a number, a boolean, or None. Traced numbers are marked as such, with their shape.
+        unit: unit of all entries, or units of the entries along the last axis, such as "m, m, rad".
     """
     if value is None:
         return "none"
@@ -149,7 +149,7 @@ def fields_of(record: Any) -> dict[str, Any]:
 
 
 def fields_table(record: Any, units: Mapping[str, str], title: str = "") -> PrintedTable:
-    """Return a table of the fields of a record, each with its unit or, where a field holds several by name, one row for each."""
+    """Return a table of the fields of a record with their units; a field that maps names to values has a row for each name."""
     rows: list[tuple[str, str]] = []
     for name, value in fields_of(record).items():
         words, unit = name.replace("_", " "), units.get(name, "")
@@ -161,7 +161,7 @@ def fields_table(record: Any, units: Mapping[str, str], title: str = "") -> Prin
 
 
 def format_field(value: Any, unit: str = "") -> str:
-    """Return the value of a field as text on one line: numbers with their unit, names, or what an object prints."""
+    """Return the value of a field as text on one line: numbers with their unit, names, or the text of an object."""
     if value is None or isinstance(value, Plain) or isinstance(getattr(value, "shape", None), tuple):
         return format_numbers(value, unit)
     if isinstance(value, str):
@@ -174,7 +174,7 @@ def format_field(value: Any, unit: str = "") -> str:
 
 
 def one_line(record: Any) -> str:
-    """Return a record as it would be written in Python, on one line; long arrays by their shape and range."""
+    """Return a record as a Python expression on one line, long arrays by their shape and range."""
     shown = [f"{name}={_literal(value)}" for name, value in fields_of(record).items() if value is not None]
     text = f"{type(record).__name__}({', '.join(shown)})"
     return text if len(text) <= MOST_LINE else text[: MOST_LINE - 5] + " ...)"
@@ -185,23 +185,23 @@ def _literal(value: Any) -> str:
 
 
 class PrintsLine(eqx.Module):
-    """A module that prints as it would be written in Python, with its numbers."""
+    """A module that prints as a Python expression."""
 
     def __repr__(self) -> str:
         return one_line(self)
 
 
 class PrintsTable(eqx.Module):
-    """A module that prints a table: that of `_table`, where all of its numbers can be read; else what shapes they have."""
+    """A module that prints as a table: of `_table` if all of its numbers have values, else of their shapes."""
 
-    _units: ClassVar[Mapping[str, str]] = units()  # of its fields
+    _units: ClassVar[Mapping[str, str]] = units()  # by field
 
     def _table(self) -> PrintedTable:
-        """Return the table to print. By default a row for each field."""
+        """Return the table to print, by default with a row for each field."""
         return fields_table(self, self._units)
 
     def _shapes(self) -> PrintedTable:
-        """Return the table to print if numbers cannot be read, as while they are traced."""
+        """Return the table to print if numbers have no values, as while they are traced."""
         return fields_table(self, self._units)
 
     def __repr__(self) -> str:
@@ -212,7 +212,7 @@ class PrintsTable(eqx.Module):
 
 
 class PrintsWords(IntEnum):
-    """A code that prints as its name in words; in arrays, such as those of a batch, it is its number."""
+    """A code that prints as its name in words; in arrays, as for a batch, it is a number."""
 
     @property
     def label(self) -> str:
@@ -233,7 +233,7 @@ Class = TypeVar("Class", bound=type)
 
 
 def prints_table(cls: Class) -> Class:
-    """Decorator of a named tuple with a method `_table` or with `_units`: what `PrintsTable` is to a module."""
+    """Decorate a named tuple that has a method `_table` or `_units`, so that it prints as a `PrintsTable` does."""
     setattr(cls, "__repr__", lambda self: text_table(_table_of(self)))  # noqa: B010  # no declared attribute of `type`
     setattr(cls, "_repr_html_", lambda self: html_table(_table_of(self)))  # noqa: B010
     return cls
@@ -242,7 +242,7 @@ def prints_table(cls: Class) -> Class:
 def _table_of(record: Any) -> PrintedTable:
     make = getattr(record, "_table" if has_numbers(record) else "_shapes", None)
     try:
-        with jax.ensure_compile_time_eval():  # known numbers are computed, also while something else is traced
+        with jax.ensure_compile_time_eval():  # concrete numbers stay concrete while something else is traced
             return fields_table(record, getattr(record, "_units", {})) if make is None else make()
-    except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError):  # JAX puts marks in the place of numbers
+    except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError):  # JAX replaces numbers by other objects
         return fields_table(record, getattr(record, "_units", {}))

@@ -1,4 +1,4 @@
-"""Progress of a long computation, reported the same way by every function that has a `progress` argument."""
+"""Progress of a long computation, reported alike by all functions with a `progress` argument."""
 
 import sys
 import threading
@@ -10,22 +10,22 @@ from typing import Any, Literal
 
 from typing_extensions import TypeAliasType
 
-PATIENCE = 2.0  # s: a computation that takes no longer needs no line to say so
-TERMINAL_INTERVAL, FILE_INTERVAL = 0.2, 15.0  # s between two states of a line that is written over, and of one that cannot be
+PATIENCE = 2.0  # s; shorter computations show no progress
+TERMINAL_INTERVAL, FILE_INTERVAL = 0.2, 15.0  # s between updates of a line in a terminal, and of lines in a file
 
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a computation, as a callable given as `progress=` receives it, once at least for everything that is done.
+    """Progress of a computation: the argument of a callable given as `progress=`, which is called at least once, at the end.
 
     Attributes:
         what: name of the computation, such as "identify".
-        done: part that is done, in the units of `total`.
-        total: amount to do; None where that is not known beforehand.
+        done: amount done, in the units of `total`.
+        total: amount to do; None if unknown.
         seconds: time since the computation began (s).
-        message: further words about its state.
+        message: a text about its state.
     """
 
     what: str
@@ -36,7 +36,7 @@ class Progress:
 
     @property
     def left(self) -> float | None:
-        """Time that the rest takes at the pace so far (s); None where it cannot be said."""
+        """Estimated time left (s), at the pace so far; None if unknown."""
         return self.seconds * (self.total / self.done - 1.0) if self.total and self.done > 0 else None
 
     def __str__(self) -> str:
@@ -49,7 +49,7 @@ ProgressOption = TypeAliasType("ProgressOption", Callable[[Progress], object] | 
 
 
 class Report:
-    """Function that a computation calls: `report(done, message)`; with None for `done`, as much is done as before."""
+    """The function that a computation calls, `report(done, message)`; None for `done` leaves it unchanged."""
 
     def __init__(self, show: Callable[[Progress], object], what: str, total: float | None):
         self.show, self.begun = show, time.monotonic()
@@ -70,14 +70,14 @@ def report_progress(
 
     Args:
         progress: None or "auto" writes a line to stderr if the computation takes longer than two seconds, True at once, False
-            never; a callable gets a `Progress` at each report. An exception from it ends the computation.
-        total: amount to do, in any unit; None where that is not known.
-        what: name of the computation, as it stands before the line.
-        patience: time (s) after which there is a line by default.
-        interval: time (s) between two states of the line; by default what suits a terminal, or a file.
+            never; a callable receives a `Progress` at each report. An exception in it ends the computation.
+        total: amount to do, in any unit; None if unknown.
+        what: name of the computation, at the beginning of the line.
+        patience: time (s) after which a line appears by default.
+        interval: time (s) between updates of the line; the default depends on whether it goes to a terminal or a file.
 
     Returns:
-        The function `report(done, message="")` to call whenever some of it is done.
+        The function `report(done, message="")`, to be called as the computation proceeds.
 
     Raises:
         TypeError: `progress` is none of these.
@@ -97,7 +97,7 @@ def report_progress(
 
 
 class _Line:
-    """A bar of tqdm on stderr, made by a timer: so it appears too while the first piece of work compiles."""
+    """A tqdm bar on stderr, made by a timer, so that it also appears while the first part of the work compiles."""
 
     def __init__(self, what: str, total: float | None, patience: float, interval: float | None):
         self.what, self.total, self.begun = what, total, time.time()

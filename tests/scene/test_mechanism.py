@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from tests.elements import P
-from udkjax.scene import given_elements
-from udkjax.scene.checks import traced_numbers_hold
+from udkjax.scene import element_setup
+from udkjax.scene.checks import traced_numbers_are_valid
 
 
 def test_the_order_is_the_users(everything):
@@ -243,7 +243,7 @@ def _requiring(element):
 
 def test_traced_numbers_are_checked_as_concrete_ones_are(everything):
     """One that must be positive is not; what must increase does not."""
-    hold = jax.jit(lambda element: traced_numbers_hold([element]))
+    hold = jax.jit(lambda element: traced_numbers_are_valid([element]))
     found = [one for element in everything.elements for one in _requiring(element)]
     assert len({(type(owner), name) for owner, name in found}) == 9
     for owner, name in {(type(owner), name): (owner, name) for owner, name in found}.values():
@@ -262,7 +262,7 @@ def test_what_takes_nothing_from_the_guess_is_not_completed_again(monkeypatch):
     }
     bodies = {"a": udk.Body(1.0, 1.0), "b": udk.Body(1.0, 1.0, [1.0, 0.0], 0.2)}
     mechanism = udk.Mechanism(bodies, joints)
-    monkeypatch.setattr(given_elements, "Frame", None)  # which completing an element asks for
+    monkeypatch.setattr(element_setup, "Frame", None)  # which completing an element asks for
     changed = mechanism.with_parameters({"body.a.mass": 2.0})
     assert_allclose(changed.joints["rod"].length, mechanism.joints["rod"].length)
     with pytest.raises(AttributeError):

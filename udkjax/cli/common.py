@@ -46,7 +46,6 @@ __all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene"]
 __all__ += ["channels_of", "choose_driver", "fail", "load", "measure_channels", "output_times", "refuse", "say", "show"]
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml")]
-JsonValue = dict[str, "JsonValue"] | list["JsonValue"] | str | float | bool | None
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="write the results as JSON.")]
 MOST_TIMES = 10**7  # output times of a command: some gigabytes for a few bodies
 Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not show how far it is.")]

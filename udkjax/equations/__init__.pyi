@@ -7,8 +7,6 @@ from udkjax.equations import udwadia_kalaba as udwadia_kalaba
 from udkjax.equations.abstract_system import AbstractSystem as AbstractSystem
 from udkjax.equations.abstract_system import MechanismSystem as MechanismSystem
 from udkjax.equations.abstract_system import TangentPart as TangentPart
-from udkjax.equations.abstract_system import Time as Time
-from udkjax.equations.abstract_system import Vector as Vector
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse
 from udkjax.equations.constraints import bodies as bodies

@@ -8,10 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from udkjax.annotations import Time, Vector
 from udkjax.equations.scales import Scales
-from udkjax.equations.structure import Time as Time
-
-Vector = Float[Array, "n"]
 
 
 class PseudoinverseOperator(Protocol):
@@ -45,7 +43,7 @@ class HasStates(Protocol):
         ...
 
 
-StateHistory: TypeAlias = HasStates | SimpleNamespace  # anything with these attributes
+HistoryLike: TypeAlias = HasStates | SimpleNamespace  # anything with these attributes
 
 
 class TangentPart(NamedTuple):

@@ -22,7 +22,7 @@ from udkjax.equations.scene_layout import (
     ConstraintGroup,
     arrays_of_solve,
 )
-from udkjax.equations.scene_terms import Parts, SceneTerms, compliance, dot
+from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, dot
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import absolute, greater, where
@@ -65,7 +65,7 @@ class BlockElimination:
 
     # --- programs
 
-    def factorize(self, dropping: bool) -> Parts:
+    def factorize(self, dropping: bool) -> ProgramParts:
         """Form Psi_q M^(-1) Psi_q^T of the entries in `psi_q`, and factorize it, with or without rows that depend on others."""
         if self._off_diagonal_size:
             yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
@@ -82,12 +82,12 @@ class BlockElimination:
             key = ("eliminate", e.size, e.later_sizes, dropping, first_mark)
             yield KernelLoop(self.terms.kernel(key, write), self._front_table(e))
 
-    def solve(self, solve: int = 0) -> Parts:
+    def solve(self, solve: int = 0) -> ProgramParts:
         """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
         yield from self.substitute(solve)
         yield from self.terms.jt(solve)
 
-    def substitute(self, solve: int) -> Parts:
+    def substitute(self, solve: int) -> ProgramParts:
         """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right."""
         names = arrays_of_solve(solve)
         yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
@@ -120,7 +120,7 @@ class BlockElimination:
 
         return self.terms.single_round("distance", write)
 
-    def rank(self) -> Parts:
+    def rank(self) -> ProgramParts:
         """Count the rows that the last factorization did not leave out."""
         yield Reset("rank", 0, 1)
         for p in sorted(set(self._sizes)):
@@ -134,7 +134,7 @@ class BlockElimination:
             blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
             yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
 
-    def independent(self) -> Parts:
+    def independent(self) -> ProgramParts:
         """Write `independent`: one for each row that the last factorization did not leave out, zero for the others."""
         starts: dict[int, list[list[int]]] = {}
         for block, (start, size) in enumerate(zip(self._diagonals, self._sizes, strict=True)):

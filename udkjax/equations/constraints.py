@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.annotations import Number
 from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
 from udkjax.programs.deferred import traced_once
-from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 
-State = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
+BodyArray = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
 
 
 @traced_once
-def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
+def psi(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m"]:
     """Psi(t, q), the residuals of all constraints, which are zero where all joints are closed.
 
     Args:
@@ -43,7 +43,7 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m"]:
 
 
 @traced_once
-def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
+def psi_q(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m n"]:
     """Return Psi_q = dPsi/dq, the Jacobian of the constraints.
 
     Args:
@@ -58,7 +58,7 @@ def psi_q(mechanism: Mechanism, t: ArrayLike, q: State) -> Float[Array, "m n"]:
 
 
 @traced_once
-def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
+def psi_dot(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
     """Return Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion.
 
     Args:
@@ -74,7 +74,7 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Arr
 
 
 @traced_once
-def gamma(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "m"]:
+def gamma(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
     """Return gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
 
     It is minus the rate of Psi_dot along the motion of constant v.
@@ -108,13 +108,13 @@ def _row_order(found: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
     return np.argsort(owner, kind="stable")
 
 
-def rate_along_motion(f: Callable[[Array, Array], Array], t: ArrayLike, q: State, v: State) -> Array:
+def rate_along_motion(f: Callable[[Array, Array], Array], t: ArrayLike, q: BodyArray, v: BodyArray) -> Array:
     """Return df/dt + (df/dq) v, the rate of f(t, q) along a motion with velocities v."""
     t, q, v = jnp.asarray(t, jnp.result_type(float)), vector(q), vector(v)
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]
 
 
-def bodies(state: State) -> Float[Array, "bodies 3"]:
+def bodies(state: BodyArray) -> Float[Array, "bodies 3"]:
     """Return q or v as an array (bodies, 3)."""
     return vector(state).reshape(-1, 3)
 

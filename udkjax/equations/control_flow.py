@@ -17,7 +17,7 @@ from udkjax.equations.structure import ArrayLibrary
 from udkjax.programs.deferred import deferred
 from udkjax.scene.fields import is_traced, is_within_jit
 
-State = TypeVar("State")
+Carry = TypeVar("Carry")
 Result = TypeVar("Result")
 
 
@@ -34,13 +34,13 @@ class ControlFlow(NamedTuple):
     call: Callable[..., Any]  # a function written for JAX, of some arguments
 
 
-def _while_loop(condition: Callable[[State], Any], body: Callable[[State], State], state: State) -> State:
+def _while_loop(condition: Callable[[Carry], Any], body: Callable[[Carry], Carry], state: Carry) -> Carry:
     while condition(state):
         state = body(state)
     return state
 
 
-def _cond(condition: Any, if_true: Callable[[], State], if_false: Callable[[], State]) -> State:
+def _cond(condition: Any, if_true: Callable[[], Carry], if_false: Callable[[], Carry]) -> Carry:
     return if_true() if condition else if_false()
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from udkjax.equations.abstract_system import Time
+from udkjax.annotations import Time
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scales import Scales, concrete_scales, mass_of
 from udkjax.equations.scene_arrays import arrays_in_time

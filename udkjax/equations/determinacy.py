@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.constraints import State
+from udkjax.equations.constraints import BodyArray
 from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
@@ -44,7 +44,7 @@ class LeftNullSpace(NamedTuple):
     rank: Int[Array, ""]
 
 
-def scaled_jacobian(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysis | None = None) -> Float[Array, "m n"]:
+def scaled_jacobian(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None) -> Float[Array, "m n"]:
     """Return J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit.
 
     Args:
@@ -60,7 +60,7 @@ def scaled_jacobian(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysi
     return constraints.psi_q(mechanism, t, q) * scales.coordinates(3 * len(mechanism.body_names)) / scales.rows[:, None]
 
 
-def singular_values(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysis | None = None) -> Float[Array, "k"]:
+def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None) -> Float[Array, "k"]:
     """Singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
 
     Args:
@@ -77,7 +77,7 @@ def singular_values(mechanism: Mechanism, t: Scalar, q: State, analysis: Analysi
 
 
 def left_null_space(
-    mechanism: Mechanism, t: Scalar, q: State, analysis: Analysis | None = None, rank_tol: Scalar = STATIC_RANK_TOL
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> LeftNullSpace:
     """Return N, J^T N = 0, its columns orthonormal; singular values up to `rank_tol` times the largest count as zero."""
     J = scaled_jacobian(mechanism, t, q, analysis)
@@ -90,7 +90,7 @@ def left_null_space(
 
 
 def uniqueness(
-    mechanism: Mechanism, t: Scalar, q: State, analysis: Analysis | None = None, rank_tol: Scalar = STATIC_RANK_TOL
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> Uniqueness:
     """Tell for each row of Psi whether its multiplier is unique: whether its row of N is zero.
 

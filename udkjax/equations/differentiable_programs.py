@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from udkjax.equations.implicit_terms import ImplicitTerms
 from udkjax.equations.scene_solver import SceneSolver, program
-from udkjax.equations.scene_terms import Parts
+from udkjax.equations.scene_terms import ProgramParts
 from udkjax.expressions.loop_derivative import COTANGENT, OTHER, SECOND, TANGENT, LoopDerivative
 from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
 
@@ -98,7 +98,7 @@ class DifferentiablePrograms:
     def _correction(self, x: str, solve: int) -> KernelLoop:
         return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
 
-    def _corrected(self, right: str, **names: str) -> Parts:
+    def _corrected(self, right: str, **names: str) -> ProgramParts:
         """Compute x0, which is known and changes by what two corrections change by, and jt_x0."""
         terms, implicit = self._solver.terms, self._implicit_terms
         yield Reset("x0", 0, terms.layout.sizes["x0"])

@@ -16,14 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.structure import Element, ElementStructure, NumericArray, Shapes, TreeDef
+from udkjax.annotations import NumericArray, TreeDef
+from udkjax.equations.structure import Element, ElementStructure, LeafShapes
 from udkjax.expressions import Differential, Graph, Scalar, operations, trace
-from udkjax.expressions.differential import Row
+from udkjax.expressions.differential import SparseRow
 from udkjax.scene.bodies import GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 
-Reader = Callable[..., list[np.ndarray]]  # of a traced function into a graph (`trace`)
+TraceFunction = Callable[..., list[np.ndarray]]  # of a traced function into a graph (`trace`)
 
 
 def as_scalar(array: NumericArray) -> Scalar:
@@ -46,17 +47,17 @@ def _frames(ground: tuple[bool, ...], q: Sequence[Array], v: Sequence[Array] | N
 
 def differentiate_constraint(
     graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
-) -> tuple[list[Scalar], list[Row], list[Scalar], list[Scalar]]:
+) -> tuple[list[Scalar], list[SparseRow], list[Scalar], list[Scalar]]:
     """Return Psi, the rows of Psi_q over the columns of q, Psi_dot and gamma of a constraint on scalars."""
     first_derivative, second_derivative = _trace_residual(*kind)
     one, zero = graph.constant(1.0), graph.constant(0.0)
 
-    def derivative(program: Reader, dt: Scalar, dq: list[Scalar]) -> list[list[Scalar]]:
+    def derivative(program: TraceFunction, dt: Scalar, dq: list[Scalar]) -> list[list[Scalar]]:
         return [list(o) for o in program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)])]
 
     value, rate = derivative(first_derivative, one, v)
     (acceleration,) = derivative(second_derivative, one, v)
-    rows: list[Row] = [{} for _ in value]
+    rows: list[SparseRow] = [{} for _ in value]
     for k in range(len(q)):
         unit = [one if i == k else zero for i in range(len(q))]
         for row, entry in zip(rows, derivative(first_derivative, zero, unit)[1], strict=True):
@@ -67,7 +68,7 @@ def differentiate_constraint(
     return value, rows, rate, [-s for s in acceleration]
 
 
-def _gamma_by_entries(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
+def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
     """Return (Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
     entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
     column = {s.index: j for j, s in enumerate(q)}
@@ -84,7 +85,7 @@ def _gamma_by_entries(graph: Graph, rows: list[Row], q: list[Scalar], v: list[Sc
     return total
 
 
-def _choose_shorter(graph: Graph, known: list[Row], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
+def _choose_shorter(graph: Graph, known: list[SparseRow], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
     """Return the one of two expressions of the same that takes fewer operations once the entries of the rows are known."""
     if other is None:
         return one
@@ -116,7 +117,7 @@ def trace_piece(
 
 
 @lru_cache(maxsize=256)
-def _trace_piece_number(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> Reader:
+def _trace_piece_number(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...]) -> TraceFunction:
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
@@ -136,7 +137,7 @@ def _residual(element: Constraint, ground: tuple[bool, ...], t: Array, q: Sequen
 
 
 @lru_cache(maxsize=256)
-def _trace_residual(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> tuple[Reader, Reader]:
+def _trace_residual(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...]) -> tuple[TraceFunction, TraceFunction]:
     """Trace a residual's first and second derivative along (dt, dq)."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
@@ -157,7 +158,7 @@ def _trace_residual(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> 
 
 
 @lru_cache(maxsize=256)
-def _trace_loads(tree: TreeDef, shapes: Shapes, ground: tuple[bool, ...]) -> tuple[Reader, Reader]:
+def _trace_loads(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...]) -> tuple[TraceFunction, TraceFunction]:
     """Trace a force element's generalized loads, -dV/dq of its potential plus what it states itself, and its potential."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
+from udkjax.annotations import Time, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
+from udkjax.annotations import Time, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse

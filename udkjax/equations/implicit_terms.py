@@ -1,7 +1,7 @@
 """Loops of derivatives of a linear system by the implicit rule: no factorization is differentiated."""
 
 from udkjax.equations.scene_layout import RIGHT, ConstraintGroup
-from udkjax.equations.scene_terms import Parts, SceneTerms, dot, read_bodies, rows, write_jt
+from udkjax.equations.scene_terms import ProgramParts, SceneTerms, dot, read_bodies, rows, write_jt
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
 
@@ -12,7 +12,7 @@ class ImplicitTerms:
     def __init__(self, terms: SceneTerms):
         self._terms = terms
 
-    def residuals(self, output: str, v: str = "v") -> Parts:
+    def residuals(self, output: str, v: str = "v") -> ProgramParts:
         """Compute right1 = b - Psi_q z, and jt_x0 = Psi_q^T x0, as functions of all but z = M^(-1) Psi_q^T x0 and x0."""
         yield Reset("jt_x0", 0, self._terms.layout.coordinate_count)
         for group in self._terms.layout.eliminated:
@@ -25,7 +25,7 @@ class ImplicitTerms:
 
             yield self._terms.over_group(("residual", output), group, write, fixed=("x0", "z"), v=v)
 
-    def transposed(self, **names: str) -> Parts:
+    def transposed(self, **names: str) -> ProgramParts:
         """Compute jt_x0 = Psi_q^T x0, with Psi_q as a function of the state."""
         yield Reset("jt_x0", 0, self._terms.layout.coordinate_count)
         for group in self._terms.layout.eliminated:
@@ -35,7 +35,7 @@ class ImplicitTerms:
 
             yield self._terms.over_group("transposed", group, write, **names)
 
-    def difference(self, output: str, solve: int, **names: str) -> Parts:
+    def difference(self, output: str, solve: int, **names: str) -> ProgramParts:
         """Compute right = b - Psi_q z of a linear system, with Psi_q and b as functions of the state."""
         for group in self._terms.layout.eliminated:
 
@@ -46,7 +46,7 @@ class ImplicitTerms:
 
             yield self._terms.over_group(("difference", output), group, write, right=f"right{solve}", **names)
 
-    def correct_solution(self, solve: int) -> Parts:
+    def correct_solution(self, solve: int) -> ProgramParts:
         """Compute x0 + x, with x of a linear system, in place of x0."""
         for group in self._terms.layout.eliminated:
 

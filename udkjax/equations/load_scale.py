@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Time
 from udkjax.equations import loads
 from udkjax.equations.constraints import bodies
 from udkjax.equations.scales import Scales
-from udkjax.equations.structure import Time, evaluate_by_kind
+from udkjax.equations.structure import evaluate_by_kind
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.constraints import State, bodies, vector
+from udkjax.equations.constraints import BodyArray, bodies, vector
 from udkjax.equations.structure import ElementKind, evaluate_by_kind
 from udkjax.programs.deferred import traced_once
 from udkjax.scene.bodies import Frame
@@ -32,7 +32,7 @@ def mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 
 @traced_once
-def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
+def force(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
     """Return F, -V_q and the loads of force elements.
 
     Args:
@@ -47,7 +47,7 @@ def force(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array
     return element_loads(mechanism, t, q, v) - jax.grad(lambda q: potential_energy(mechanism, t, q, v))(vector(q))
 
 
-def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
+def kinetic_energy(mechanism: Mechanism, v: BodyArray) -> Float[Array, ""]:
     """Return T = v^T M v / 2.
 
     Args:
@@ -61,7 +61,7 @@ def kinetic_energy(mechanism: Mechanism, v: State) -> Float[Array, ""]:
 
 
 @traced_once
-def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, ""]:
+def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, ""]:
     """Return V, the potential energy of gravity, zero at the origin, and of the force elements that have one.
 
     Args:
@@ -79,7 +79,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> 
 
 
 @traced_once
-def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Float[Array, "n"]:
+def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
     """Return the sum of the loads that force elements return by their method `loads`, without those of potentials."""
 
     time = jnp.asarray(t, jnp.result_type(float))
@@ -96,6 +96,6 @@ def element_loads(mechanism: Mechanism, t: ArrayLike, q: State, v: State) -> Flo
 
 
 def _evaluate_forces(
-    function: Callable[..., Array | None], mechanism: Mechanism, q: State, v: State
+    function: Callable[..., Array | None], mechanism: Mechanism, q: BodyArray, v: BodyArray
 ) -> list[tuple[ElementKind, Array | None]]:
     return evaluate_by_kind(function, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))

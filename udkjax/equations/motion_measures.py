@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
-from udkjax.expressions.differential import Differential, Row
+from udkjax.expressions.differential import Differential, SparseRow
 from udkjax.expressions.elimination import SymbolicFactors
 
 Scalars = Sequence[Scalar] | np.ndarray
@@ -106,7 +106,7 @@ class MotionMeasures:
             found.append(self._slope(row, moved))
         return found
 
-    def _slope(self, row: Row, variables: Scalars) -> list[Scalar]:
+    def _slope(self, row: SparseRow, variables: Scalars) -> list[Scalar]:
         zero = self._own.constant(0.0)
         return self._copy([row.get(v.index, zero) for v in variables])
 
@@ -136,7 +136,7 @@ def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar |
     return trace(function, *[jnp.zeros(a.shape) for a in given])(graph, *given)
 
 
-def _along(row: Row, variables: Scalars, tangents: Scalars, zero: Scalar) -> Scalar:
+def _along(row: SparseRow, variables: Scalars, tangents: Scalars, zero: Scalar) -> Scalar:
     """Return a row times tangents of some of its variables."""
     return sum((row[v.index] * t for v, t in zip(variables, tangents, strict=True) if v.index in row), zero)
 

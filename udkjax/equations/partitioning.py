@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, Time, Vector
+from udkjax.annotations import Time, Vector
+from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
 from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.pinv import SVD, Plus

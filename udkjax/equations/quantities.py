@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.annotations import Scalar
-from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem, StateHistory, Vector
+from udkjax.annotations import NumberLike, Vector
+from udkjax.equations.abstract_system import AbstractSystem, HistoryLike, MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
@@ -66,7 +66,7 @@ def equations_of(
 @overload
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
-    t: Scalar,
+    t: NumberLike,
     q: Float[ArrayLike, "bodies 3"],
     v: Float[ArrayLike, "bodies 3"],
     method: Pseudoinverse | None = None,
@@ -80,7 +80,7 @@ def accelerations(
 @overload
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
-    t: Scalar,
+    t: NumberLike,
     q: Float[ArrayLike, "bodies 3"],
     v: Float[ArrayLike, "bodies 3"],
     method: Pseudoinverse | None = None,
@@ -95,7 +95,7 @@ def accelerations(
 @checked
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
-    t: Scalar,
+    t: NumberLike,
     q: Float[ArrayLike, "bodies 3"],
     v: Float[ArrayLike, "bodies 3"],
     method: Pseudoinverse | None = None,
@@ -128,7 +128,7 @@ def accelerations(
 
 
 @checked
-def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) -> Float[Array, "T m"]:
+def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> Float[Array, "T m"]:
     """Return Psi at each time of a solution.
 
     Args:
@@ -142,7 +142,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory) 
 
 
 @checked
-def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
+def energy(mechanism: Mechanism, solution: HistoryLike) -> Energy:
     """Return T = v^T M v / 2 and V at each time of a solution.
 
     Args:
@@ -157,7 +157,7 @@ def energy(mechanism: Mechanism, solution: StateHistory) -> Energy:
 
 @checked
 def efforts(
-    mechanism: Mechanism, solution: StateHistory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+    mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
 ) -> dict[str, Float[Array, "T"]]:
     """Return the effort of each driver along its coordinate on its second body: -lambda of its row.
 
@@ -206,7 +206,7 @@ def _energy(equations: MechanismSystem, t: Array, q: Vector, v: Vector) -> Energ
     return Energy(*equations.energy(t, q, v))
 
 
-def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: StateHistory, quantity: Callable[..., Result]) -> Result:
+def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike, quantity: Callable[..., Result]) -> Result:
     analysis = None
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism), mechanism.without_origin

@@ -20,9 +20,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import Number, NumberLike, Time
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.abstract_system import StateHistory, Time
+from udkjax.equations.abstract_system import HistoryLike
 from udkjax.equations.analysis import analyse
 from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
@@ -34,7 +34,6 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Number
 from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
@@ -49,12 +48,12 @@ COMPLIANCE_TOL = 1e-10
 @checked
 def reactions(
     mechanism: Mechanism,
-    solution: StateHistory,
+    solution: HistoryLike,
     method: Pseudoinverse | None = None,
     stabilization: Baumgarte | None = None,
     frame: Axes = "ground",
     about: About = "centre",
-    compliances: Mapping[str, Scalar] | None = None,
+    compliances: Mapping[str, NumberLike] | None = None,
 ) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load -Psi_q^T lambda of each joint and driver on each of its bodies: `reactions(mech, sol)["A"]["link1"]`.
 
@@ -87,10 +86,10 @@ def reactions(
 @checked
 def unique_reactions(
     mechanism: Mechanism,
-    solution: StateHistory,
+    solution: HistoryLike,
     frame: Axes = "ground",
     about: About = "centre",
-    rank_tol: Scalar = STATIC_RANK_TOL,
+    rank_tol: NumberLike = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
     """Decide the components of `reactions` that equilibrium alone determines: those with c^T N = 0.
 
@@ -186,7 +185,7 @@ def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | No
     return frames[holder].point(points[holder])
 
 
-def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, Scalar]) -> Float[Array, "m"]:
+def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, NumberLike]) -> Float[Array, "m"]:
     known, counts = mechanism.constraints, {}
     for name, _ in analyse(mechanism).row_names:
         counts[name] = counts.get(name, 0) + 1
@@ -202,7 +201,7 @@ def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, Scalar]) ->
     return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
 
-def _states(solution: StateHistory) -> tuple[Array, Array, Array]:
+def _states(solution: HistoryLike) -> tuple[Array, Array, Array]:
     ts = jnp.asarray(solution.ts)
     return ts, jnp.asarray(solution.q).reshape(len(ts), -1), jnp.asarray(solution.v).reshape(len(ts), -1)
 

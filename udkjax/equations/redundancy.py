@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from udkjax.equations.abstract_system import Time
+from udkjax.annotations import Time
 from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE, KinematicRows
 from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.equations.scales import Scales

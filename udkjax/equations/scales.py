@@ -14,9 +14,10 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.annotations import AnyArray, NumericArray
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import AnyArray, ArrayLibrary, NumericArray, join_concrete_numbers, numbers_as_vector
+from udkjax.equations.structure import ArrayLibrary, join_concrete_numbers, numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred

@@ -12,6 +12,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
+from udkjax.annotations import TreeDef
 from udkjax.equations.element_programs import (
     ConstraintPrograms,
     ElementPrograms,
@@ -19,7 +20,7 @@ from udkjax.equations.element_programs import (
     constraint_programs,
     force_programs,
 )
-from udkjax.equations.structure import ElementKind, Shapes, TreeDef, element_kinds
+from udkjax.equations.structure import ElementKind, LeafShapes, element_kinds
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import KernelWriter
 from udkjax.scene.mechanism import Mechanism
@@ -212,6 +213,6 @@ class SceneLayout:
         return row.astype(int), column.astype(int), place.astype(int), factor
 
 
-def abstract_mechanism(tree: TreeDef, shapes: Shapes) -> Mechanism:
+def abstract_mechanism(tree: TreeDef, shapes: LeafShapes) -> Mechanism:
     """Return the mechanism of a structure, with shapes in place of its numbers."""
     return jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes])

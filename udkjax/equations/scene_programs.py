@@ -11,13 +11,14 @@ from functools import cached_property, lru_cache
 import jax
 import numpy as np
 
+from udkjax.annotations import TreeDef
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import SceneTerms, compliance
-from udkjax.equations.structure import Shapes, TreeDef, structure, whole_structure
+from udkjax.equations.structure import LeafShapes, structure, whole_structure
 from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
@@ -42,7 +43,7 @@ class ScenePrograms:
     def __init__(
         self,
         tree: TreeDef,
-        shapes: Shapes,
+        shapes: LeafShapes,
         redundant_rows: tuple[int, ...] | None,
         baumgarte: bool,
         policy: RankPolicy,
@@ -307,7 +308,7 @@ class ScenePrograms:
 
 @lru_cache(maxsize=16)
 def _scene_programs(
-    tree: TreeDef, shapes: Shapes, redundant_rows: tuple[int, ...] | None, baumgarte: bool, policy: RankPolicy
+    tree: TreeDef, shapes: LeafShapes, redundant_rows: tuple[int, ...] | None, baumgarte: bool, policy: RankPolicy
 ) -> ScenePrograms:
     return ScenePrograms(tree, shapes, redundant_rows, baumgarte, policy)
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from udkjax.equations.block_elimination import BlockElimination
-from udkjax.equations.scene_terms import Parts, SceneTerms
+from udkjax.equations.scene_terms import ProgramParts, SceneTerms
 from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
 
@@ -24,12 +24,12 @@ class SceneSolver:
         self.solve = self.elimination.solve
 
     @property
-    def factorize(self) -> Parts:
+    def factorize(self) -> ProgramParts:
         """The factorization of accelerations, under the policy."""
         return self.elimination.factorize(self.policy.drops)
 
     @property
-    def factorize_dropping(self) -> Parts:
+    def factorize_dropping(self) -> ProgramParts:
         """The factorization of corrections, without rows that depend on others."""
         return self.elimination.factorize(True)
 
@@ -53,7 +53,7 @@ class SceneSolver:
         step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
         return [*self.position_terms("psi_q", residual), *factorize, *step]
 
-    def refined_solve(self, solve: int, further: int) -> Parts:
+    def refined_solve(self, solve: int, further: int) -> ProgramParts:
         """Solve a linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
         yield from self.solve(solve)
         for _ in range(REFINEMENTS):
@@ -77,7 +77,7 @@ class SceneSolver:
         solve = [*self.solve(1), terms.add("a", start="free", solution=1), self.safe]
         return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
 
-    def tangent_parts(self, solve: int) -> Parts:
+    def tangent_parts(self, solve: int) -> ProgramParts:
         """Compute dq1 and dv1, the parts of dq and dv within the manifold, by the systems `solve` and `solve` + 1; distance."""
         for k, change in enumerate(("dq", "dv"), solve):
             yield from self.terms.rates(change, k)

@@ -24,7 +24,7 @@ from udkjax.equations.scene_layout import (
 from udkjax.expressions import Graph, Scalar, trace
 from udkjax.expressions.loop_program import ADD, SET, Kernel, KernelLoop, KernelWriter, Reset
 
-Parts = Iterator[KernelLoop | Reset]
+ProgramParts = Iterator[KernelLoop | Reset]
 Write = Callable[[KernelWriter], None]
 
 
@@ -94,7 +94,7 @@ class SceneTerms:
 
         return self.over_bodies("sincos", write, q=q, sines=sines)
 
-    def free_accelerations(self, v: str) -> Parts:
+    def free_accelerations(self, v: str) -> ProgramParts:
         """Compute a_F, where there are force elements: without them it is gravity."""
         if not self.layout.forces:
             return
@@ -128,7 +128,7 @@ class SceneTerms:
         solve: int = 0,
         groups: Sequence[ConstraintGroup] | None = None,
         **names: str,
-    ) -> Parts:
+    ) -> ProgramParts:
         """Compute Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and those after it.
 
         `groups` are those whose rows are eliminated, unless others are given.
@@ -147,12 +147,12 @@ class SceneTerms:
             named = {f"right{k}": f"right{solve + k}" for k in range(len(rights))}
             yield self.over_group(outputs, group, write, v=v, **named, **names)
 
-    def every_entry(self) -> Parts:
+    def every_entry(self) -> ProgramParts:
         """Compute Psi_q of all rows; behind its entries a one, for those that are constants."""
         yield Reset("psi_q", self.layout.one, 1, 1.0)
         yield from self.element_terms(("psi_q",), groups=self.layout.constraints)
 
-    def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> Parts:
+    def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> ProgramParts:
         """Compute Psi, Psi_dot or b of all rows in their order, into an array."""
         for group in self.layout.constraints:
 
@@ -162,7 +162,7 @@ class SceneTerms:
 
             yield self.over_group((name, start), group, write, to=array, **names)
 
-    def energy(self) -> Parts:
+    def energy(self) -> ProgramParts:
         """Compute v^T M v / 2, and the potential energy of gravity and of the force elements."""
         yield Reset("energy", 0, 2)
 
@@ -183,7 +183,7 @@ class SceneTerms:
 
             yield self.over_group("potential", group, write_potential)
 
-    def pieces(self) -> Parts:
+    def pieces(self) -> ProgramParts:
         """Return the number of the smooth piece of each element that has several."""
         for group, places in self.layout.pieces:
             base = group.table.shape[1]
@@ -196,7 +196,7 @@ class SceneTerms:
 
     # --- products with Psi_q and its transpose, of the eliminated rows
 
-    def rates(self, change: str, solve: int, subtract: bool = False) -> Parts:
+    def rates(self, change: str, solve: int, subtract: bool = False) -> ProgramParts:
         """Compute Psi_q times a change of coordinates, as the right-hand side of a linear system, or subtracted from that."""
         for group in self.layout.eliminated:
 
@@ -209,7 +209,7 @@ class SceneTerms:
             names = {"change": change, "right": f"right{solve}"}
             yield KernelLoop(self.kernel(("rates", group, subtract), write), group.table, names)
 
-    def jt(self, solve: int) -> Parts:
+    def jt(self, solve: int) -> ProgramParts:
         """Compute jt_x = Psi_q^T x of a linear system."""
         names = arrays_of_solve(solve)
         yield Reset(names["jt_x"], 0, self.layout.coordinate_count)
@@ -220,7 +220,7 @@ class SceneTerms:
 
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
-    def remainder(self, solve: int, to: int) -> Parts:
+    def remainder(self, solve: int, to: int) -> ProgramParts:
         """Return the remainder right - Psi_q M^(-1) Psi_q^T x of a linear system, as the right-hand side of another one."""
         for group in self.layout.eliminated:
 
@@ -267,7 +267,7 @@ class SceneTerms:
             key, write, fixed, to=to, **{"start": start} if start else {}, **{"change": added} if added else {}
         )
 
-    def multipliers(self, solution: int) -> Parts:
+    def multipliers(self, solution: int) -> ProgramParts:
         """Compute multipliers, lambda = -x of a linear system, by rows of Psi; zero of those that are left out."""
         yield Reset("multipliers", 0, self.layout.row_count)
         for group in self.layout.eliminated:

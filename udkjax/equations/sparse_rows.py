@@ -17,7 +17,7 @@ from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from udkjax.equations.abstract_system import Time
+from udkjax.annotations import Time
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE, RowTerms
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scale_program import RANK_TOL

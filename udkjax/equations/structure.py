@@ -15,35 +15,32 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.annotations import NumericArray, TreeDef
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
+from udkjax.scene.element_setup import attached_bodies
 from udkjax.scene.forces import ForceElement
-from udkjax.scene.given_elements import attached_bodies
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
-Time: TypeAlias = Float[ArrayLike, ""]  # s
-TreeDef: TypeAlias = Hashable  # JAX's description of a tree without its leaves
-Shapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # the shape and the type of each number of a tree
+LeafShapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # the shape and the type of each number of a tree
 ArrayLibrary: TypeAlias = ModuleType  # numpy or jax.numpy
-NumericArray: TypeAlias = Array | np.ndarray  # of JAX, perhaps traced, or of NumPy where it is known
-AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # of the one library or of the other
 Element: TypeAlias = Constraint | ForceElement
 Result = TypeVar("Result")
 
 
 @cached_by_identity  # also of traced numbers: what is stored holds none of them
-def structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
+def structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     """Return the tree of a mechanism, and the shape and the type of each of its numbers: the same for any number of samples."""
     return _structure(mechanism.without_origin.without_samples)
 
 
-def _structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
+def _structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     leaves, tree = jax.tree.flatten(mechanism)
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
-def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, Shapes]:
+def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     """Return the same of a mechanism with all of its samples, whose programs are functions of time throughout."""
     return _structure(mechanism.without_origin)
 
@@ -71,7 +68,7 @@ class ElementStructure(NamedTuple):
     """The part of an element that is traced once for many: all but the names of its bodies and the values of its numbers."""
 
     tree: TreeDef
-    shapes: Shapes
+    shapes: LeafShapes
     ground: tuple[bool, ...]  # of each of its frames: whether it is the ground's
 
     @property

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udkjax.annotations import Time, Vector
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart, Time, Vector
+from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import Scales
 from udkjax.equations.udwadia_kalaba import Baumgarte

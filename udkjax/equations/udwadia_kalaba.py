@@ -24,9 +24,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations import constraints, loads
-from udkjax.equations.constraints import State, vector
+from udkjax.equations.constraints import BodyArray, vector
 from udkjax.pinv import Plus, Pseudoinverse
 from udkjax.printing import PrintsLine
 from udkjax.scene.fields import number_called
@@ -48,22 +48,22 @@ class Baumgarte(PrintsLine):
     alpha: Float[Array, ""]
     beta: Float[Array, ""]
 
-    def __init__(self, alpha: Scalar = 5.0, beta: Scalar = 5.0):
+    def __init__(self, alpha: NumberLike = 5.0, beta: NumberLike = 5.0):
         self.alpha, self.beta = number_called("alpha")(alpha), number_called("beta")(beta)
 
 
-def D(mechanism: Mechanism, t: Scalar, q: State, w: Weights = None) -> Float[Array, "m n"]:
+def D(mechanism: Mechanism, t: NumberLike, q: BodyArray, w: Weights = None) -> Float[Array, "m n"]:
     """Return D = Psi_q M^(-1/2)."""
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
-def a_F(mechanism: Mechanism, t: Scalar, q: State, v: State) -> Float[Array, "n"]:
+def a_F(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
     """Return a_F = M^(-1) F: the accelerations without constraints."""
     return loads.force(mechanism, t, q, v) / loads.mass(mechanism)
 
 
 def b(
-    mechanism: Mechanism, t: Scalar, q: State, v: State, baumgarte: Baumgarte | None = None, w: Weights = None
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, baumgarte: Baumgarte | None = None, w: Weights = None
 ) -> Float[Array, "m"]:
     """Return b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
     b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v)
@@ -75,9 +75,9 @@ def b(
 
 def accelerations(
     mechanism: Mechanism,
-    t: Scalar,
-    q: State,
-    v: State,
+    t: NumberLike,
+    q: BodyArray,
+    v: BodyArray,
     method: Pseudoinverse,
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
@@ -89,9 +89,9 @@ def accelerations(
 
 def multipliers(
     mechanism: Mechanism,
-    t: Scalar,
-    q: State,
-    v: State,
+    t: NumberLike,
+    q: BodyArray,
+    v: BodyArray,
     method: Pseudoinverse,
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
@@ -102,7 +102,7 @@ def multipliers(
 
 
 def project(
-    mechanism: Mechanism, t: Scalar, q: State, v: State, method: Pseudoinverse, w: Weights = None, steps: int = 2
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, method: Pseudoinverse, w: Weights = None, steps: int = 2
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Return a state to the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
 
@@ -120,7 +120,7 @@ def project(
 
 
 def tangent_part(
-    mechanism: Mechanism, t: Scalar, q: State, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
 ) -> Float[Array, "n"]:
     """Return (I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which projection leaves."""
     matrix = D(mechanism, t, q, w)

@@ -14,19 +14,17 @@ from udkjax.equations.scene_programs import RESULTS, ScenePrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loop_derivative import COTANGENT, OTHER, SECOND, TANGENT
 from udkjax.expressions.loop_program import LoopProgram
-from udkjax.expressions.unroll import Arrays, unroll
+from udkjax.expressions.unroll import ArrayPlace, Arrays, unroll
 
 WITH_ENTRIES = ("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v")  # programs that return Psi_q
-
-Place = tuple[str, int]  # a number of an array: the array, and its place there
 
 
 class WrittenOutProgram(NamedTuple):
     """A program, and where each of its inputs and outputs is."""
 
     program: ScalarProgram
-    inputs: list[Place]
-    outputs: list[Place]
+    inputs: list[ArrayPlace]
+    outputs: list[ArrayPlace]
 
 
 class WrittenOutDerivative(NamedTuple):
@@ -99,7 +97,7 @@ class WrittenOut:
 
     def evaluations(self, names: Sequence[str]) -> WrittenOutProgram:
         """Return the numbers that derivatives of several programs need of one state, as "stored" and a program's name."""
-        found: dict[Place, Scalar] = {}
+        found: dict[ArrayPlace, Scalar] = {}
         for name in names:
             evaluation = self.derivative(name).evaluation
             scalars = zip(evaluation.outputs, evaluation.program.outputs, strict=True)
@@ -113,7 +111,7 @@ class WrittenOut:
         variables = [s for s, is_active in zip(self.numbers, active, strict=False) if is_active]
         values = [layout[k] for k in self.moving]
 
-        def seeds_of(name: str, places: Sequence[int]) -> dict[Scalar, Place]:
+        def seeds_of(name: str, places: Sequence[int]) -> dict[Scalar, ArrayPlace]:
             return {graph.input((name, k), "tangent"): (name, k) for k in places}
 
         if mode == REVERSE:
@@ -133,7 +131,7 @@ class WrittenOut:
         program = ScalarProgram(graph, [*numbers, *seeds], list(outputs.values()))
         return WrittenOutProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
 
-    def _program(self, outputs: dict[Place, Scalar], further: dict[Scalar, Place]) -> WrittenOutProgram:
+    def _program(self, outputs: dict[ArrayPlace, Scalar], further: dict[Scalar, ArrayPlace]) -> WrittenOutProgram:
         inputs = self._inputs | further
         program = ScalarProgram(self.graph, list(inputs), list(outputs.values()))
         return WrittenOutProgram(program, list(inputs.values()), list(outputs))
@@ -142,11 +140,13 @@ class WrittenOut:
         return unroll(program, self._arrays | (further or {}), self.graph, linear)
 
     @cached_property
-    def _seeds(self) -> dict[Scalar, Place]:
+    def _seeds(self) -> dict[Scalar, ArrayPlace]:
         """The inputs of derivatives that are tangents or cotangents."""
         return {}
 
-    def _differentiate(self, given: DifferentiableProgram, n: int, mode: str) -> tuple[dict[Place, Scalar], dict[Place, Scalar]]:
+    def _differentiate(
+        self, given: DifferentiableProgram, n: int, mode: str
+    ) -> tuple[dict[ArrayPlace, Scalar], dict[ArrayPlace, Scalar]]:
         """Return the results, and their changes, or the cotangents of what they depend on."""
         arrays = self._unroll(given.program)
         results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
@@ -166,7 +166,7 @@ class WrittenOut:
         return _entries(arrays, ("a", "safe")), changes
 
 
-def _entries(arrays: Arrays, names: Sequence[str]) -> dict[Place, Scalar]:
+def _entries(arrays: Arrays, names: Sequence[str]) -> dict[ArrayPlace, Scalar]:
     return {(name, k): s for name in names for k, s in sorted(arrays.get(name, {}).items())}
 
 

@@ -1,4 +1,4 @@
-"""Graphs of scalar expressions, recorded once: structural zeros vanish, and equal expressions are computed once."""
+"""Graphs of scalar expressions: structural zeros vanish, and equal expressions are computed once."""
 
 from udkjax.lazy_names import lazy_names
 

@@ -3,7 +3,7 @@
 from udkjax.expressions.complex_scalars import ComplexScalar as ComplexScalar
 from udkjax.expressions.complex_scalars import solve_complex as solve_complex
 from udkjax.expressions.differential import Differential as Differential
-from udkjax.expressions.differential import Row as Row
+from udkjax.expressions.differential import SparseRow as SparseRow
 from udkjax.expressions.differential import cotangents as cotangents
 from udkjax.expressions.differential import tangents as tangents
 from udkjax.expressions.elimination import SymbolicFactors as SymbolicFactors

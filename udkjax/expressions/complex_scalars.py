@@ -1,4 +1,4 @@
-"""Complex numbers of scalars, and linear systems of them with pivots that each member of a batch chooses for itself."""
+"""Complex numbers made of scalars, and complex linear systems with pivots chosen separately for each member of a batch."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from udkjax.expressions.selection import absolute, greater, where
 
 
 class ComplexScalar(NamedTuple):
-    """A complex number: its real and its imaginary part."""
+    """A complex number by its real and imaginary parts."""
 
     re: Scalar
     im: Scalar
@@ -47,7 +47,7 @@ class ComplexScalar(NamedTuple):
 def solve_complex(
     matrix: Sequence[Sequence[ComplexScalar]], right: Sequence[Sequence[ComplexScalar]]
 ) -> list[list[ComplexScalar]]:
-    """Return X of A X = B by Gauss's elimination; rows are swapped, member by member, where that makes a pivot larger.
+    """Solve A X = B by Gaussian elimination with partial pivoting, separately for each member of a batch.
 
     Args:
         matrix: The rows of A (n, n).
@@ -75,7 +75,7 @@ def solve_complex(
 
 
 def _larger_first(a: list[ComplexScalar], b: list[ComplexScalar], k: int) -> tuple[list[ComplexScalar], list[ComplexScalar]]:
-    """Return two rows, the one with the larger entry k first: entries before that are done with."""
+    """Return two rows, the one with the larger entry k first, without their entries before k."""
     swap = greater(absolute(b[k].re) + absolute(b[k].im), absolute(a[k].re) + absolute(a[k].im))
 
     def choose(yes: ComplexScalar, no: ComplexScalar) -> ComplexScalar:

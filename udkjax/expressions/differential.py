@@ -1,11 +1,11 @@
-"""Differentiate a graph: the chain rule, gathered into one sparse matrix of expressions.
+"""Differentiate a graph: the chain rule gives a sparse Jacobian of expressions.
 
-A differential is a combination of those of the inputs, d f = sum (df/dx) dx, kept as a row {x: df/dx}. The partial derivatives
-are expressions of the same graph, so that what they share with the function, a cosine, say, is one node, and what is zero
-vanishes. They hold for any number of directions at once, and transposed for reverse mode: neither is taken through the nodes.
+A differential is a linear combination of the differentials of the inputs, d f = sum (df/dx) dx, stored as a row {x: df/dx}. The
+partial derivatives are expressions of the same graph: a cosine that they share with the function is one node, and zeros vanish.
+They serve any number of directions at once, and transposed, reverse mode.
 
-Results of an opaque node (an array primitive, `call`) count as further inputs, whose differentials
-follow from those of its arguments by JAX's own rule for the primitive, forward or transposed.
+Results of an opaque node (an array primitive, `call`) count as additional inputs. Their differentials follow from those of its
+arguments by JAX's rule for the primitive, forward or transposed.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -17,40 +17,40 @@ import numpy as np
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 from udkjax.expressions.jaxpr_reader import ClosedJaxpr, read_jaxpr
 
-Row = dict[int, Scalar]  # partial derivatives, by the index of the node with respect to which they are taken
+SparseRow = dict[int, Scalar]  # partial derivatives by the index of the variable's node
 
 
 class Differential:
-    """The differentials of `outputs` along `inputs`.
+    """The differentials of `outputs` with respect to `inputs`.
 
-    Nodes on which `inputs` and `fixed` depend are not differentiated, and `fixed` is constant.
+    `fixed` scalars are constant. Nodes on which `inputs` and `fixed` depend are not differentiated.
     """
 
     def __init__(self, graph: Graph, outputs: Iterable[Scalar], inputs: Sequence[Scalar], fixed: Iterable[Scalar] = ()):
         self.graph, self.inputs = graph, list(inputs)
         given = {s.index for s in (*self.inputs, *fixed)}
-        self._rows: dict[int, Row] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
-        self._calls: dict[int, list[int]] = {}  # opaque nodes that move, and their results
+        self._rows: dict[int, SparseRow] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
+        self._calls: dict[int, list[int]] = {}  # opaque nodes that are not constant, and their results
         for index in graph.dependencies((s.index for s in outputs), given):
             row = self._differentiate(index)
             if row:
                 self._rows[index] = row
 
-    def row(self, output: Scalar) -> Row:
+    def row(self, output: Scalar) -> SparseRow:
         """Return the partial derivatives of one output."""
         row = self._rows.get(output.index, {})
         return row if output.sign > 0 else {k: -p for k, p in row.items()}
 
-    def forward(self, tangents: Mapping[int, Scalar]) -> Row:
-        """Return the tangents of all nodes that rows refer to, from those of inputs, by index; others are constant."""
+    def forward(self, tangents: Mapping[int, Scalar]) -> SparseRow:
+        """Return the tangents of all nodes that rows refer to, by index, from those of inputs; other inputs are constant."""
         known = {k: t for k, t in tangents.items() if not t.is_zero}
         for call, results in self._calls.items():
             arguments = [product(self.row(a), known, self.graph) for a in self.graph.nodes[call].arguments]
             known.update(_push_forward(self.graph, call, results, arguments))
         return known
 
-    def reverse(self, cotangents: Row) -> list[Scalar]:
-        """Return the cotangents of the inputs, from those of all nodes that rows refer to, by index."""
+    def reverse(self, cotangents: SparseRow) -> list[Scalar]:
+        """Return the cotangents of the inputs from the cotangents, by index, of all nodes that rows refer to."""
         known = dict(cotangents)
         for call, results in reversed(self._calls.items()):
             seeds = {k: known.pop(k) for k in results if k in known}
@@ -61,7 +61,7 @@ class Differential:
                     accumulate(known, self.row(argument), cotangent)
         return [known.get(s.index, self.graph.constant(0.0, s.node.dtype)) for s in self.inputs]
 
-    def _differentiate(self, index: int) -> Row:
+    def _differentiate(self, index: int) -> SparseRow:
         graph, node = self.graph, self.graph.nodes[index]
         if node.kind in ("input", "constant", "call") or not np.issubdtype(node.dtype, np.floating):
             return {}
@@ -73,14 +73,14 @@ class Differential:
             return {index: graph.constant(1.0, node.dtype)}
         if node.kind == "apply" and node.detail.primitive.name == "select_n":
             return self._differentiate_choice(node)
-        result: Row = {}
+        result: SparseRow = {}
         for k, argument in enumerate(node.arguments):
             row = self.row(argument)
             if row:
                 accumulate(result, row, _partial(graph, index, node, k))
         return {k: p for k, p in result.items() if not p.is_zero}
 
-    def _differentiate_choice(self, node: Node) -> Row:
+    def _differentiate_choice(self, node: Node) -> SparseRow:
         which, *cases = node.arguments
         rows, zero = [self.row(a) for a in cases], self.graph.constant(0.0, node.dtype)
         parts = {k: (which, *(row.get(k, zero) for row in rows)) for row in rows for k in row}
@@ -98,7 +98,7 @@ def tangents(
         graph: The graph of all scalars.
         outputs: The functions f.
         seeds: The tangents dx by input; an input without one is constant.
-        given: Nodes that are known; with them a factor that all df/dx of an x hold is taken out of the sums, and multiplies dx.
+        given: Nodes already computed. If given, a factor common to all df/dx of an x is taken out of the sums and multiplies dx.
 
     Returns:
         The tangent of each output.
@@ -124,7 +124,7 @@ def cotangents(
         outputs: The functions.
         seeds: The cotangent of each output.
         inputs: The variables.
-        given: Nodes that are known; see `tangents`.
+        given: Nodes already computed; see `tangents`.
 
     Returns:
         The cotangent of each input.
@@ -137,17 +137,19 @@ def cotangents(
     return [c if s.sign > 0 else -c for c, s in zip(differential.reverse(found), inputs, strict=True)]
 
 
-def _factored(differential: Differential, outputs: Sequence[Scalar], given: Collection[int] | None) -> tuple[list[Row], Row]:
+def _factored(
+    differential: Differential, outputs: Sequence[Scalar], given: Collection[int] | None
+) -> tuple[list[SparseRow], SparseRow]:
     rows = [differential.row(s) for s in outputs]
     return (rows, {}) if given is None else common_factors(rows, given)
 
 
-def product(row: Row, known: Mapping[int, Scalar], graph: Graph) -> Scalar:
-    """Return a row times a vector."""
+def product(row: SparseRow, known: Mapping[int, Scalar], graph: Graph) -> Scalar:
+    """Return the product of a row and a vector."""
     return sum((p * known[k] for k, p in row.items() if k in known), graph.constant(0.0))
 
 
-def accumulate(total: Row, row: Row, factor: Scalar) -> None:
+def accumulate(total: SparseRow, row: SparseRow, factor: Scalar) -> None:
     """Add a multiple of a row to another one."""
     if factor.is_zero:
         return
@@ -155,16 +157,16 @@ def accumulate(total: Row, row: Row, factor: Scalar) -> None:
         total[k] = total[k] + p * factor if k in total else p * factor
 
 
-def common_factors(rows: Sequence[Row], given: Collection[int] = ()) -> tuple[list[Row], Row]:
-    """Divide each column of a matrix by a factor that all its entries hold; return the factors, by column, too.
+def common_factors(rows: Sequence[SparseRow], given: Collection[int] = ()) -> tuple[list[SparseRow], SparseRow]:
+    """Divide each column of a matrix by the common factor of its entries; return the rows and the factors by column.
 
-    A product for each entry becomes one for the whole column, which its tangent takes. Nodes that are given are not taken apart.
+    One product with the tangent of a column replaces a product for each entry. `given` nodes are not factored.
     """
     columns: dict[int, list[Scalar]] = {}
     for row in rows:
         for k, entry in row.items():
             columns.setdefault(k, []).append(entry)
-    factors: Row = {}
+    factors: SparseRow = {}
     for k, entries in columns.items():
         splits = [e.node.kind == "mul" and e.index not in given for e in entries]
         held = [{a.index for a in e.node.arguments} if split else set() for e, split in zip(entries, splits, strict=True)]
@@ -200,7 +202,7 @@ def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
     return slope.item()
 
 
-# --- by JAX's own rules
+# --- by JAX's rules
 
 
 @lru_cache(maxsize=256)
@@ -214,7 +216,7 @@ def _slope(detail: BoundPrimitive, dtypes: tuple[np.dtype, ...], k: int) -> Clos
     return jax.make_jaxpr(slope)(*(jax.ShapeDtypeStruct((), d) for d in dtypes))
 
 
-def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Sequence[Scalar]) -> Row:
+def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Sequence[Scalar]) -> SparseRow:
     """Return the tangents of the results of an opaque node."""
     node = graph.nodes[call]
     arrays, dots = _arrays(node, node.arguments), _arrays(node, tangents)
@@ -231,8 +233,8 @@ def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Seq
     return {k: _pick(graph, k, found) for k in results if not _pick(graph, k, found).is_zero}
 
 
-def _pull_back(graph: Graph, call: int, seeds: Row, flags: Sequence[bool]) -> list[Scalar]:
-    """Return the cotangents of the arguments of an opaque node, from those of its results."""
+def _pull_back(graph: Graph, call: int, seeds: SparseRow, flags: Sequence[bool]) -> list[Scalar]:
+    """Return the cotangents of the arguments of an opaque node from the cotangents of its results."""
     node = graph.nodes[call]
     arrays, wanted = _arrays(node, node.arguments), _outputs(graph, list(seeds))
     active = [k for k, flags in enumerate(_arrays(node, flags)) if flags.any()]
@@ -255,7 +257,7 @@ def _pull_back(graph: Graph, call: int, seeds: Row, flags: Sequence[bool]) -> li
 def _restrict(
     detail: BoundPrimitive, arrays: Sequence[jax.Array], active: Sequence[int], wanted: Sequence[int]
 ) -> Callable[..., list[jax.Array]]:
-    """Return an array primitive as a function of some of its arguments, with some of its results."""
+    """Return an array primitive as a function from some of its arguments to some of its results."""
 
     def function(*some):
         values = list(arrays)

@@ -1,22 +1,22 @@
-"""Linear systems of expressions, solved once and for all: a sparse matrix of scalars, factored while the graph is built.
+"""Symbolic factorization of a sparse matrix of scalars, done while the graph is built.
 
-Entries that are known numbers are pivots first, the sparsest rows and columns before others: no number of a run can make them
-small. The rest of the matrix A (m, n), m >= n, of full column rank, is rotated to a triangle (Givens), which needs no choice
-of pivots either: in lanes, all members take the same operations. With E for the row operations, E A = [U, V; 0, B], B = Q R,
+Constant entries are the first pivots, in the sparsest rows and columns: no number of a run can make them small. The rest of the
+matrix A (m, n), m >= n, of full column rank, is triangularized by Givens rotations, which need no pivoting either: in lanes, all
+members take the same operations. With E for the row operations, E A = [U, V; 0, B], B = Q R,
 
     A x = b:      B x_2 = (E b)_2 by R x_2 = Q^T (E b)_2, then U x_1 = (E b)_1 - V x_2,
     A^T y = c:    the same operations transposed, in the reverse order.
 
-Of redundant rows that contradict each other x is the least-squares solution of what the pivots leave.
+If redundant rows contradict each other, x solves the remaining rows by least squares.
 """
 
 from collections.abc import Sequence
 
-from udkjax.expressions.differential import Row
+from udkjax.expressions.differential import SparseRow
 from udkjax.expressions.graph import Graph, Scalar
 
-Vector = list[Scalar]
-# Of the largest known entry that its row had: the cosine of a right angle, 6e-17, is no pivot, and others lose three digits.
+# Smallest constant pivot, relative to the largest constant entry of its row: the cosine of a right angle, 6e-17, is not a pivot.
+# Other pivots lose at most three digits.
 LEAST_PIVOT = 1e-3
 
 
@@ -32,14 +32,14 @@ class SymbolicFactors:
         ValueError: There are fewer rows than columns, or a column that no row can determine.
     """
 
-    def __init__(self, graph: Graph, rows: Sequence[Row], columns: int):
+    def __init__(self, graph: Graph, rows: Sequence[SparseRow], columns: int):
         if len(rows) < columns:
             raise ValueError(f"{len(rows)} rows cannot determine {columns} unknowns")
         self._graph = graph
         self._rows = [{k: x for k, x in row.items() if not x.is_zero} for row in rows]
         self._sizes = [max((abs(x.constant) for x in row.values() if x.constant is not None), default=0.0) for row in self._rows]
         self._pivots: list[tuple[int, int]] = []
-        self._operations: list[tuple[int, int, Scalar]] = []  # row i loses so many times row r
+        self._operations: list[tuple[int, int, Scalar]] = []  # (i, r, factor): row i minus factor times row r
         while (place := self._sparsest_constant()) is not None:
             self._eliminate(*place)
         taken = {c for _, c in self._pivots}
@@ -52,8 +52,8 @@ class SymbolicFactors:
         self._rotations: list[tuple[int, int, Scalar, Scalar]] = []
         self.triangle = self._rotate([list(row) for row in self.block])
 
-    def solve(self, right: Sequence[Scalar]) -> Vector:
-        """Return x of A x = b."""
+    def solve(self, right: Sequence[Scalar]) -> list[Scalar]:
+        """Solve A x = b for x."""
         b = list(right)
         for i, r, factor in self._operations:
             b[i] = b[i] - factor * b[r]
@@ -70,8 +70,8 @@ class SymbolicFactors:
             x[c] = (b[r] - rest) / row[c]
         return [x[c] for c in range(len(x))]
 
-    def solve_transposed(self, right: Sequence[Scalar]) -> Vector:
-        """Return y of A^T y = c; of more rows than columns, with the least norm in those that are left."""
+    def solve_transposed(self, right: Sequence[Scalar]) -> list[Scalar]:
+        """Solve A^T y = c for y; with more rows than columns, its entries in the rows of B have least norm."""
         c, y = list(right), [self._graph.constant(0.0)] * len(self._rows)
         for r, k in self._pivots:
             y[r] = c[k] / self._rows[r][k]
@@ -84,7 +84,7 @@ class SymbolicFactors:
             y[r] = y[r] - factor * y[i]
         return y
 
-    def block_transposed(self, right: Sequence[Scalar]) -> Vector:
+    def block_transposed(self, right: Sequence[Scalar]) -> list[Scalar]:
         """Return y = Q R^(-T) c, for which B^T y = c."""
         R, count = self.triangle, len(self.open_columns)
         y = [*right, *[self._graph.constant(0.0)] * (len(self._open_rows) - count)]
@@ -95,7 +95,7 @@ class SymbolicFactors:
         return y
 
     def _sparsest_constant(self) -> tuple[int, int] | None:
-        """Return the place of the known entry that fills in least."""
+        """Return the position of the constant entry that causes the least fill."""
         used = {r for r, _ in self._pivots}
         counts: dict[int, int] = {}
         left = [(r, row) for r, row in enumerate(self._rows) if r not in used]
@@ -123,8 +123,8 @@ class SymbolicFactors:
                     row[j] = row[j] - factor * a if j in row else -(factor * a)
             self._rows[i] = {k: x for k, x in row.items() if not x.is_zero}
 
-    def _rotate(self, a: list[Vector]) -> list[Vector]:
-        """Rotate pairs of rows until B is a triangle R."""
+    def _rotate(self, a: list[list[Scalar]]) -> list[list[Scalar]]:
+        """Rotate pairs of rows until B is upper triangular."""
         graph = self._graph
         for k in range(len(self.open_columns)):
             for j in range(k + 1, len(a)):

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike
 
 
 class Node(NamedTuple):
-    """One operation; `detail` identifies it besides its arguments: a name, a value, a primitive's parameters."""
+    """One operation, identified by its arguments and `detail`: a name, a value or the parameters of a primitive."""
 
     kind: (
         str  # input, constant, add, sub, mul, div, sqrt, apply (a JAX primitive on scalars), call (on arrays), pick (from a call)
@@ -40,7 +40,7 @@ class Scalar:
 
     @property
     def constant(self) -> Any:
-        """The value where it is known, else None."""
+        """The value of a constant, else None."""
         node = self.node
         if node.kind != "constant":
             return None
@@ -101,12 +101,12 @@ class Graph:
     def input(self, name: Hashable, group: str, dtype: DTypeLike | None = None) -> Scalar:
         """Add an input, identified by its group and its name.
 
-        The group says what kind of quantity it is, so that a program can be split by what depends on it.
+        The group is the kind of quantity, so that a program can be split by the groups that its nodes depend on.
         """
         return Scalar(self, self._node("input", (), (group, name), np.dtype(dtype or self.dtype), frozenset([group])))
 
     def constant(self, value: Any, dtype: DTypeLike | None = None) -> Scalar:
-        """Add a known value."""
+        """Add a constant."""
         dtype = np.dtype(dtype or self.dtype)
         value = dtype.type(value).item()
         if dtype.kind == "f" and math.copysign(1.0, value) < 0:
@@ -114,7 +114,7 @@ class Graph:
         return Scalar(self, self._node("constant", (), value, dtype, frozenset()))
 
     def scalar(self, value: "Scalar | float") -> Scalar:
-        """Return a scalar of this graph: `value` itself, or the constant."""
+        """Return `value` as a scalar of this graph."""
         return value if isinstance(value, Scalar) else self.constant(value)
 
     # --- arithmetic
@@ -183,10 +183,10 @@ class Graph:
             parameters: Its parameters, as in a jaxpr.
             arguments: The scalars.
             dtype: The type of the result.
-            fold: A function of arrays that computes the result where all arguments are known.
+            fold: A function of arrays that computes the result if all arguments are constants.
 
         Returns:
-            The result; a constant where all arguments are.
+            The result; a constant if all arguments are.
         """
         if all(a.constant is not None for a in arguments):
             return self.constant(np.asarray(fold(*(np.asarray(a.constant, a.node.dtype) for a in arguments))).item(), dtype)
@@ -196,7 +196,7 @@ class Graph:
     def call(
         self, detail: "BoundPrimitive", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], DTypeLike]]
     ) -> list[np.ndarray]:
-        """Apply a JAX primitive to whole arrays: one opaque node, and a pick for each element of its results."""
+        """Apply a JAX primitive to whole arrays, as one opaque node and a `pick` for each element of its results."""
         index = self._operation("call", arguments, detail, np.dtype(object))
         arrays = []
         for k, (shape, dtype) in enumerate(outputs):
@@ -208,9 +208,9 @@ class Graph:
         return arrays
 
     def dependencies(self, wanted: Iterable[int], given: Collection[int] = (), group: str | None = None) -> list[int]:
-        """Return the nodes on which some nodes depend, in an order of evaluation, but not `given` and its dependencies.
+        """Return the nodes on which some nodes depend, in order of evaluation, without `given` and its dependencies.
 
-        With a `group` of inputs: of those alone that depend on it.
+        With a `group` of inputs, return only those that depend on it.
         """
         nodes, found, stack = self.nodes, set(), list(wanted)
         while stack:
@@ -221,7 +221,7 @@ class Graph:
         return sorted(found)
 
     def copy(self, program: "Expressions", known: Mapping[int, Scalar]) -> list[Scalar]:
-        """Return the outputs of a program of another graph, with scalars of this one for its inputs, by their index there."""
+        """Copy a program of another graph into this one and return its outputs; its inputs, by index, are replaced by scalars."""
         found = dict(known)
 
         def here(a: Scalar) -> Scalar:
@@ -263,7 +263,7 @@ class Graph:
 
 
 class Expressions(Protocol):
-    """Some nodes of a graph in an order of evaluation, and the outputs among them."""
+    """Some nodes of a graph in order of evaluation, and the outputs among them."""
 
     graph: Graph
     order: list[int]
@@ -271,7 +271,7 @@ class Expressions(Protocol):
 
 
 class BoundPrimitive:
-    """A primitive with its parameters, and for arrays the shapes of its arguments; equal where the computation is."""
+    """A primitive with its parameters and, for arrays, the shapes of its arguments; equal if the computations are equal."""
 
     def __init__(self, primitive: Primitive, parameters: dict, shapes: tuple = ()):
         self.primitive, self.parameters, self.shapes = primitive, parameters, shapes

@@ -1,8 +1,8 @@
 """Read a jaxpr into a graph of scalars.
 
-An array is a NumPy array of Scalars, so that reshaping, slicing and broadcasting cost nothing and vanish, and whatever acts
-element by element becomes scalar operations that the graph can simplify. A primitive that does neither becomes one opaque
-node with the arrays it needs: anything that JAX can trace can be read.
+An array is a NumPy array of Scalars: reshaping, slicing and broadcasting vanish, and elementwise primitives become scalar
+operations, which the graph can simplify. Any other primitive becomes one opaque node with its arrays: all that JAX can trace can
+be read.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,9 +17,9 @@ from jax.typing import ArrayLike
 from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
 
 ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
-Equation: TypeAlias = Any  # its annotations leave the shapes of its variables out
+Equation: TypeAlias = Any  # its annotations omit the shapes of its variables
 Dimensions = tuple[Sequence[int], Sequence[int]]
-DimensionNumbers = tuple[Dimensions, Dimensions]  # of `dot_general`: those contracted, those of the batch, of each operand
+DimensionNumbers = tuple[Dimensions, Dimensions]  # of `dot_general`: contracted and batch dimensions of each operand
 
 _INLINED = (
     "jit",
@@ -34,9 +34,9 @@ _INLINED = (
     "remat2",
     "checkpoint",
 )
-POWERS = 20  # of two that are summed exactly, also in single precision
-UNROLLED_OPERATIONS = 20_000  # operations of a loop of known length, of all rounds together: beyond it takes too long to compile
-# Primitives that put elements into an array: which of their inputs these are, and which are the indices.
+POWERS = 20  # powers of two whose sum is exact, also in single precision
+UNROLLED_OPERATIONS = 20_000  # most operations of an unrolled loop, over all its iterations: more take too long to compile
+# Positions of the updates and of the indices among the inputs of primitives that put elements into an array.
 _REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.ndarray]]]] = {
     "scatter": lambda inputs: (inputs[2], [inputs[1]]),
     "dynamic_update_slice": lambda inputs: (inputs[1], inputs[2:]),
@@ -49,7 +49,7 @@ _ELEMENTWISE = frozenset(
 
 
 def trace(function: Callable, *examples: object) -> Callable[..., list[np.ndarray]]:
-    """Trace a function once, to read it into graphs as often as wanted.
+    """Trace a function once, to read it into any number of graphs.
 
     Args:
         function: A function of arrays.
@@ -129,7 +129,7 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [np.asarray(_select(equation, inputs), object)]
     if name in _REPLACING and all(s.constant is not None for i in _REPLACING[name](inputs)[1] for s in i.flat):
         return [np.asarray(_replace(equation, inputs), object)]
-    if name in ("pad", "tile"):  # where elements go, JAX tells of their places; after them comes that of what pads
+    if name in ("pad", "tile"):  # JAX moves the indices of the elements; the index of the padding follows them
         places, size = np.arange(inputs[0].size).reshape(inputs[0].shape), inputs[0].size
         taken = _fold(equation.primitive, parameters, [places, *(np.asarray(size) for _ in inputs[1:])])
         return [np.concatenate([i.reshape(-1) for i in inputs])[np.asarray(taken)]]
@@ -151,10 +151,10 @@ def _read_inner(graph: Graph, jaxpr: core.Jaxpr | ClosedJaxpr, inputs: Sequence[
 
 
 def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Evaluate a loop of known length, round by round."""
+    """Unroll a loop of known length, iteration by iteration."""
     body, order = equation.params["jaxpr"], range(equation.params["length"])
     inner = getattr(body, "jaxpr", body)
-    # Inputs of each round have one dimension more outside; fixed ones and those handed on come before them.
+    # Constants and carry come first; the scanned inputs have a leading dimension, one entry per iteration.
     rows = sum(a.aval.shape != b.aval.shape for a, b in zip(equation.invars, inner.invars, strict=True))
     carries = sum(a.aval.shape == b.aval.shape for a, b in zip(equation.outvars, inner.outvars, strict=True))
     ends = np.cumsum([len(inputs) - carries - rows, carries])
@@ -190,8 +190,8 @@ def _fold(primitive: core.Primitive, parameters: dict, values: Sequence[ArrayLik
 
 
 def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Evaluate a primitive on known values, such as indices."""
-    values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty one has no type
+    """Evaluate a primitive on constants, such as indices."""
+    values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty array has no type
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)
     return [_constants(graph, r) for r in (results if equation.primitive.multiple_results else [results])]
@@ -203,7 +203,7 @@ def _values(array: np.ndarray) -> np.ndarray:
 
 
 def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
-    """Put elements of one array into another at known indices: JAX does so with their places, as numbers of the same type."""
+    """Put elements of one array into another at constant indices, by letting JAX put their positions, as the same dtype."""
     updates, indices = _REPLACING[equation.primitive.name](inputs)
     elements = np.concatenate([inputs[0].ravel(), updates.ravel()])
     places = np.arange(elements.size, dtype=equation.outvars[0].aval.dtype)
@@ -214,7 +214,7 @@ def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
 
 
 def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates: np.ndarray) -> np.ndarray:
-    """Add the elements of one array to another at known indices: where each goes, JAX tells of powers of two, which sums hold."""
+    """Add the elements of one array to another at constant indices: JAX adds powers of two, whose sums tell the elements."""
     found, dtype = array.copy(), equation.outvars[0].aval.dtype
     for first in range(0, updates.size, POWERS):
         powers = np.zeros(updates.size, dtype)
@@ -227,9 +227,9 @@ def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates:
 
 
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
-    """Select the elements of an indexing with known indices: JAX selects them from an array of their places."""
+    """Select elements by constant indices, by letting JAX select from an array of their positions."""
     array, *indices = inputs
-    places, outside = np.arange(array.size).reshape(array.shape), array.size  # a place for indices beyond the end
+    places, outside = np.arange(array.size).reshape(array.shape), array.size  # the position of indices out of bounds
     parameters = {**equation.params, "fill_value": outside} if "fill_value" in equation.params else equation.params
     taken = _fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
     if not np.any(taken == outside):

@@ -1,7 +1,7 @@
-"""Derivatives of programs of loops, forward and reverse: kernel by kernel.
+"""Forward and reverse derivatives of loop programs, kernel by kernel.
 
-Every array x has another one, for its changes (named d_x) or for its cotangents (bar_x). Intermediate results of a program
-must still be there: no number is written again once it has been read.
+Every array x has an array of its tangents (d_x) or cotangents (bar_x). Intermediate results of a program must persist: no number
+is overwritten once it has been read.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -15,11 +15,11 @@ from udkjax.expressions.loop_program import ADD, SET, Address, Kernel, KernelLoo
 from udkjax.expressions.scalar_program import ScalarProgram
 
 TANGENT, COTANGENT = "d_", "bar_"
-OTHER, SECOND = "e_", "de_"  # the changes along another direction, and along both
+OTHER, SECOND = "e_", "de_"  # tangents along another direction, and along both
 
 
 class LoopDerivative:
-    """The derivative of some loops with respect to all arrays but those that are `fixed`."""
+    """The derivative of loops with respect to all arrays that are not `fixed`."""
 
     def __init__(self, parts: Sequence[KernelLoop | Reset], fixed: Collection[str]):
         self._parts, self._fixed = list(parts), frozenset(fixed)
@@ -27,7 +27,7 @@ class LoopDerivative:
 
     @property
     def forward(self) -> LoopProgram:
-        """The program of the changes of all arrays, from those of its inputs."""
+        """The program of the tangents of all arrays, from the tangents of its inputs."""
         parts: list[KernelLoop | Reset] = []
         for part in self._parts:
             if isinstance(part, Reset):
@@ -39,7 +39,7 @@ class LoopDerivative:
 
     @property
     def reverse(self) -> LoopProgram:
-        """The program of the cotangents of all arrays, from those of its results."""
+        """The program of the cotangents of all arrays, from the cotangents of its results."""
         parts: list[KernelLoop | Reset] = []
         for part in reversed(self._parts):
             if isinstance(part, KernelLoop):
@@ -47,10 +47,10 @@ class LoopDerivative:
         return LoopProgram(parts)
 
     def second(self, settled: Collection[str]) -> LoopProgram:
-        """Return the program of the changes of all arrays along two directions and along both: d x, e x, and d(e x).
+        """Return the program of the tangents of all arrays along two directions and along both: d x, e x, and d(e x).
 
-        Each kernel finds the three of its results at once, so that a number may be added to once it has been read. Arrays
-        that are `settled` change to second order alone.
+        Each kernel computes the three for its results at once, so that a number that has been read may still be added to. The
+        `settled` arrays have only second-order tangents.
         """
         parts: list[KernelLoop | Reset] = []
         for part in self._parts:
@@ -106,7 +106,7 @@ Addressed = list[tuple[Scalar, Address]]
 def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed, Addressed]:
     """Return the inputs and the outputs that have derivatives.
 
-    An input that is fixed but computed from others, as a sine is of an angle, is differentiated with respect to them.
+    A fixed input that is computed from others, such as the sine of an angle, is differentiated with respect to them.
     """
     inputs, outputs = (
         zip(kernel.program.inputs, kernel.inputs, strict=True),
@@ -133,12 +133,12 @@ def _push_twice(kernel: Kernel, constant_arrays: frozenset[str], still: frozense
 
 
 def _prefixed(addressed: Addressed, prefix: str) -> Addressed:
-    """Return the same of arrays with a prefix."""
+    """Return the addresses with a prefix to the names of their arrays."""
     return [(s, address._replace(array=prefix + address.array)) for s, address in addressed]
 
 
 def _kernel(kernel: Kernel, seeds: Addressed, outputs: Addressed) -> Kernel | None:
-    """Return a kernel that also takes `seeds`, and writes other results."""
+    """Return a kernel that also takes `seeds` and writes different results."""
     if not outputs:
         return None
     inputs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))

@@ -1,7 +1,7 @@
-"""Programs of scenes: loops over elements that are alike, each running a small straight-line program.
+"""Loop programs: loops over elements of one kind, each running a small straight-line program.
 
-A `Kernel` is the program with the addresses of its inputs and outputs, relative to some bases; a `KernelLoop` runs it for every
-row of a table of bases, in order. The code grows with the number of kinds of elements, the tables with the number of elements.
+A `Kernel` is this program with the addresses of its inputs and outputs relative to base addresses; a `KernelLoop` runs it for
+each row of a table of bases, in order. The code grows with the number of kinds, the tables with the number of elements.
 """
 
 import math
@@ -18,7 +18,7 @@ from jaxtyping import Array
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
-# Ways to write an output over the number in its place: replace it, add to it, keep the larger one, or whichever is false.
+# Ways to update a number with an output: replace it, add to it, take the maximum, or the conjunction.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
 _BY_ARRAYS = {ADD: np.add, MAXIMUM: np.maximum, ALL: np.minimum}
 _BY_FLOATS = {  # NaN stays
@@ -27,12 +27,12 @@ _BY_FLOATS = {  # NaN stays
     ALL: lambda a, b: a if a <= b or a != a else b,
 }
 _NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
-FEW_ROWS = 8  # up to which Python's floats, 0.05 us an operation and row, are faster than NumPy's arrays, 0.6 us an operation
-MOST_TURNS = 8  # updates of one place by a loop, in a program of JAX: each is an operation of it, or all are a loop
+FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
+MOST_TURNS = 8  # updates of one place that JAX makes one by one; more become a loop
 
 
 class Address(NamedTuple):
-    """The address of a number: `offset` places behind a base in an array, a column of the table (None: the array's start)."""
+    """The address of a number in an array: `offset` from a base, which is a column of the table (None: the array's start)."""
 
     array: str
     base: int | None
@@ -41,7 +41,7 @@ class Address(NamedTuple):
 
 
 class Kernel:
-    """A straight-line program of one element among many that are alike."""
+    """A straight-line program for one element of a kind."""
 
     def __init__(self, program: ScalarProgram, inputs: Sequence[Address], outputs: Sequence[Address]):
         self.program, self.inputs, self.outputs = program, list(inputs), list(outputs)
@@ -51,7 +51,7 @@ class Kernel:
 
 
 class KernelWriter:
-    """Writes a kernel: its inputs, the graph that computes its outputs, and the addresses of both."""
+    """Builds a kernel: its graph, and the addresses of its inputs and outputs."""
 
     def __init__(self, graph: Graph | None = None):
         self.graph = Graph() if graph is None else graph
@@ -59,13 +59,13 @@ class KernelWriter:
         self._outputs: list[tuple[Scalar, Address]] = []
 
     def read(self, array: str, base: int | None, offset: int = 0) -> Scalar:
-        """Read a number of an array."""
+        """Read a number from an array."""
         s = self.graph.input((array, base, offset), array)
         self._inputs[s] = Address(array, base, offset)
         return s
 
     def bind(self, s: Scalar, array: str, base: int | None, offset: int = 0) -> None:
-        """Read an input that the graph has already."""
+        """Read an input that is already in the graph."""
         self._inputs[s] = Address(array, base, offset)
 
     def write(self, s: Scalar, array: str, base: int | None, offset: int = 0, update: str = SET) -> None:
@@ -79,15 +79,15 @@ class KernelWriter:
 
 
 class KernelLoop(NamedTuple):
-    """A kernel for every row of a table of bases (things, columns)."""
+    """A kernel, run for every row of a table of bases (elements, columns)."""
 
     kernel: Kernel
     table: np.ndarray
-    names: Mapping[str, str] = {}  # from the kernel's names of arrays to the program's, where they differ
-    fixed: Collection[str] = ()  # the kernel's names of arrays that its derivative takes as fixed
+    names: Mapping[str, str] = {}  # names of arrays in the program by their names in the kernel, where they differ
+    fixed: Collection[str] = ()  # arrays of the kernel that are constant in its derivative
 
     def array(self, name: str) -> str:
-        """Return the program's name of one of the kernel's arrays."""
+        """Return the name in the program of an array of the kernel."""
         return self.names.get(name, name)
 
 
@@ -101,7 +101,7 @@ class Reset(NamedTuple):
 
 
 class LoopProgram(NamedTuple):
-    """Loops one after another."""
+    """Loops, run one after another."""
 
     parts: Sequence[KernelLoop | Reset]
 
@@ -113,18 +113,18 @@ class LoopProgram(NamedTuple):
 
 
 class LaidOutPart(NamedTuple):
-    """A part of a program with the places of all its numbers, one for each row of its table."""
+    """A part of a program with the places of each of its numbers, one for each row of its table."""
 
-    run: ScalarProgram | float  # a number: what a part of an array is set to
-    inputs: list[tuple[str, Any]]  # the array of each, "" if it is not used
-    outputs: list[tuple[str, Any, str]]  # the array of each, and what is done with the number there
+    run: ScalarProgram | float  # a float: the constant that part of an array is set to
+    inputs: list[tuple[str, Any]]  # array ("" if unused) and places of each
+    outputs: list[tuple[str, Any, str]]  # array, places and update of each
     count: int  # of rows
 
 
 class ArrayLoops:
-    """A program of loops as a function of its arrays, by NumPy or JAX; no row of a loop may read what another writes.
+    """A loop program as a function of its arrays, by NumPy or JAX; no row of a loop may read a number that another row writes.
 
-    The places of all numbers are found once, for as many calls as there are.
+    The places of all numbers are found once, for all calls.
     """
 
     def __init__(self, program: LoopProgram, xp: ModuleType):
@@ -136,7 +136,7 @@ class ArrayLoops:
         self._short_parts = list(map(_with_lists, self._parts)) if is_short else None
 
     def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the arrays as the program leaves them; what is given stays as it is."""
+        """Return the arrays after a run of the program; the given arrays do not change."""
         if self._xp is jnp:
             found = dict(arrays)
             for part in self._parts:
@@ -145,7 +145,7 @@ class ArrayLoops:
         if self._short_parts:
             try:
                 return self._run_on_floats(arrays, self._short_parts)
-            except (ArithmeticError, ValueError):  # where arrays have a number that is not finite
+            except (ArithmeticError, ValueError):  # from a number that is not finite
                 pass
         found = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
         for part in self._parts:
@@ -175,7 +175,7 @@ def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:
 
 
 def _with_lists(part: LaidOutPart) -> LaidOutPart:
-    """Return a part whose places are lists, of arrays that are lists."""
+    """Return a part with lists in place of arrays."""
     if not isinstance(part.run, ScalarProgram):
         return part
     inputs = [(name, places.tolist()) for name, places in part.inputs]
@@ -212,7 +212,7 @@ def _run_on_floats(part: LaidOutPart, found: dict[str, list[float]]) -> None:
 
 
 def _run_by_jax(part: LaidOutPart, found: dict[str, Array]) -> None:
-    """Run a part: what it reads of an array, and what it writes to one, is one operation: XLA takes milliseconds for each."""
+    """Run a part, with one operation for all reads from an array and one for all writes: XLA takes milliseconds for each."""
     if not isinstance(part.run, ScalarProgram):
         for name, places, _ in part.outputs:
             x = found[name]
@@ -234,7 +234,7 @@ def _run_by_jax(part: LaidOutPart, found: dict[str, Array]) -> None:
 
 
 def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tuple]]]:
-    """Return numbered items by their first entries."""
+    """Group items, with their indices, by their first entries."""
     found: dict[tuple, list[tuple[int, tuple]]] = {}
     for k, item in enumerate(items):
         found.setdefault(item[:heads], []).append((k, item))
@@ -242,7 +242,7 @@ def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tu
 
 
 def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
-    """Return numbers of an array, in the shape of their places."""
+    """Return the numbers at places of an array, in the shape of the places."""
     flat = places.ravel()
     if np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
         return x[flat[0] : flat[0] + flat.size].reshape(places.shape)
@@ -250,11 +250,11 @@ def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
 
 
 def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.Array:
-    """Return an array after an update of some places: by taking, as scattering is a loop to compile for XLA."""
+    """Return an array with some places updated: by a gather, since XLA compiles a scatter into a loop."""
     order = np.argsort(places, kind="stable")
     first = np.searchsorted(places[order], places[order])
     turn = np.empty(len(places), int)
-    turn[order] = np.arange(len(places)) - first  # earlier updates of the same place
+    turn[order] = np.arange(len(places)) - first  # number of earlier updates of the same place
     if turn.max() >= MOST_TURNS:
         at = x.at[places]
         write = {SET: at.set, ADD: at.add, MAXIMUM: at.max, ALL: at.min}[update]

@@ -1,7 +1,7 @@
-"""Scalar programs: functions of scalars that compute some outputs of a graph, and nothing else.
+"""Scalar programs: functions that compute outputs of a graph, and only the nodes that these need.
 
-On JAX scalars it is traced (under vmap each scalar becomes one vector over the batch, the layout that vectorizes); on Python
-floats it is evaluated at once, which is how a scene is analysed without compiling anything.
+With JAX scalars a program is traced (under vmap each scalar becomes a vector over the batch, the layout that vectorizes); with
+Python floats it is evaluated at once, so that a scene is analysed without compiling anything.
 """
 
 import math
@@ -15,25 +15,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
-from udkjax.expressions.written_steps import Value, WrittenSteps
+from udkjax.expressions.written_steps import Operand, WrittenSteps
 
 _SINE_AND_COSINE = ("sin", "cos")
-_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # the standard library's math and NumPy have them under the same names
-# Of Python's numbers: the computation of other primitives, without a call of JAX, which takes some hundred times as long.
+_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # under the same names in `math` and NumPy
+# Other primitives on Python numbers: a call of JAX takes about a hundred times as long.
 _NUMBER_FUNCTIONS: dict[str, Callable] = {
     **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")},
     "abs": abs,
     "atan2": math.atan2,
     "floor": lambda x: float(math.floor(x)),
     "integer_pow": lambda x, y: x**y,
-    "max": lambda a, b: a if a > b or a != a else b,  # not a number where one of both is not
+    "max": lambda a, b: a if a > b or a != a else b,  # NaN if either is NaN
     "min": lambda a, b: a if a < b or a != a else b,
     "neg": operator.neg,
     "select_n": lambda which, *cases: cases[int(which)],
     "sign": lambda x: x if x != x else float((x > 0) - (x < 0)),
     "square": lambda x: x * x,
 }
-# The same of NumPy's arrays, element by element.
+# The same on NumPy arrays, element by element.
 _ARRAY_FUNCTIONS: dict[str, Callable] = {
     **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_", "neg")},
     "abs": np.abs,
@@ -47,7 +47,7 @@ _ARRAY_FUNCTIONS: dict[str, Callable] = {
     "sign": np.sign,
     "square": np.square,
 }
-# On floats, and traced: by what jax.lax has, since each operator on a JAX array is a function call, ten times as long to trace.
+# Operators on floats, and functions of jax.lax for tracing: an operator on a JAX array takes ten times as long to trace.
 _OPERATORS: dict[str, tuple[Callable, Callable]] = {
     "add": (operator.add, jax.lax.add),
     "sub": (operator.sub, jax.lax.sub),
@@ -70,17 +70,17 @@ class ScalarProgram:
                 n.arguments[0].index for n in nodes if n.kind == "apply" and n.detail.primitive.name in _SINE_AND_COSINE
             )
         )
-        self._traced = jax.jit(self._run)  # traced once, wherever and however often it is called and differentiated
+        self._traced = jax.jit(self._run)  # traced once for all calls and derivatives
 
     def uses(self, scalar: Scalar) -> bool:
-        """Return whether the program uses an input."""
+        """Return True if the program uses an input."""
         return scalar.index in self.last_use
 
-    def __call__(self, values: Sequence[Value]) -> list[Value]:
+    def __call__(self, values: Sequence[Operand]) -> list[Operand]:
         if all(isinstance(v, float | int) for v in values):
             try:
                 return self.on_floats(values)
-            except (ArithmeticError, ValueError):  # 1/0, an overflow, sin(inf): in JAX no errors, but values that are not finite
+            except (ArithmeticError, ValueError):  # 1/0, overflow, sin(inf): not errors in JAX, which returns inf or NaN
                 with np.errstate(all="ignore"):
                     return self._steps_on_arrays([np.float64(v) for v in values])
         return self._traced(self._typed(values))
@@ -89,7 +89,7 @@ class ScalarProgram:
         """Evaluate the program on arrays (rows,), element by element, without compiling anything."""
         shape = (len(values[0]) if values else 1,)
         with np.errstate(all="ignore"):
-            if self._calls_arrays:  # one row after the other
+            if self._calls_arrays:  # row by row
                 found = [self([float(v[k]) for v in values]) for k in range(shape[0])]
                 return [np.array(x, float) for x in zip(*found, strict=True)]
             found = self._steps_on_arrays(values)
@@ -97,28 +97,28 @@ class ScalarProgram:
 
     @cached_property
     def _calls_arrays(self) -> bool:
-        """True if the program calls primitives of whole arrays."""
+        """True if the program calls primitives on whole arrays."""
         return any(self.graph.nodes[i].kind == "call" for i in self.order)
 
-    def _typed(self, values: Sequence[Value]) -> list[Value]:
+    def _typed(self, values: Sequence[Operand]) -> list[Operand]:
         given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
         return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]
 
-    def _run(self, values: Sequence[Value]) -> list[Value]:
-        known: dict[int, Value] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
+    def _run(self, values: Sequence[Operand]) -> list[Operand]:
+        known: dict[int, Operand] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         for index in self.order:
             node = self.graph.nodes[index]
             known[index] = _evaluate(node, [_signed(known, a) for a in node.arguments])
         return [_signed(known, s) for s in self.outputs]
 
     @cached_property
-    def on_floats(self) -> Callable[[Sequence[float]], list[Value]]:
-        """The program on Python's floats, with its errors where a result is not finite."""
+    def on_floats(self) -> Callable[[Sequence[float]], list[Operand]]:
+        """The program on Python floats, which raises errors where a result is not finite."""
         return self._steps(_function_of_floats)
 
     @cached_property
     def is_plain(self) -> bool:
-        """True if Python's own functions of floats compute all of it, without calls of JAX."""
+        """True if Python's float functions suffice, without calls of JAX."""
         nodes = (self.graph.nodes[i] for i in self.order)
         return all(n.kind == "constant" or _plain_function(n, math, _NUMBER_FUNCTIONS) for n in nodes)
 
@@ -156,15 +156,14 @@ class ScalarProgram:
 
 
 def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bool]) -> list[Scalar]:
-    """Return the nodes that an early program must hand to a later one: the early nodes that outputs or later nodes use.
+    """Return the nodes that an early program must pass to a later one: the early nodes that outputs or later nodes use.
 
-    Where the early nodes are those that depend on parameters alone, the early program runs once, the later one whenever the
-    state changes.
+    If the early nodes depend on parameters alone, the early program runs once, and the later one whenever the state changes.
 
     Args:
         graph: The graph.
         outputs: The outputs of the later program.
-        early: Whether a node belongs to the early program.
+        early: Function that returns True for a node of the early program.
 
     Returns:
         The nodes, in the order of the graph.
@@ -177,12 +176,12 @@ def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bo
 
 
 def operations(graph: Graph, given: Sequence[Scalar], outputs: Sequence[Scalar]) -> int:
-    """Count the nodes that outputs take once `given`, with its dependencies, is known.
+    """Count the nodes that must be evaluated for the outputs once `given` and its dependencies are computed.
 
     Args:
         graph: The graph.
-        given: Scalars that are known.
-        outputs: Scalars that are wanted.
+        given: Scalars already computed.
+        outputs: Scalars to compute.
 
     Returns:
         The number of nodes.
@@ -198,16 +197,16 @@ def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
     return needed
 
 
-def _signed(known: dict[int, Value], scalar: Scalar) -> Value:
+def _signed(known: dict[int, Operand], scalar: Scalar) -> Operand:
     value = known[scalar.index]
     return value if scalar.sign > 0 else _negative(value)
 
 
-def _negative(value: Value) -> Value:
+def _negative(value: Operand) -> Operand:
     return jax.lax.neg(value) if isinstance(value, jax.Array) else -value
 
 
-def _evaluate(node: Node, values: list[Value]) -> Value:
+def _evaluate(node: Node, values: list[Operand]) -> Operand:
     match node.kind:
         case "constant":
             return node.detail
@@ -230,19 +229,19 @@ def _evaluate(node: Node, values: list[Value]) -> Value:
 
 
 def _function_of_floats(node: Node) -> Callable:
-    """Return the function that computes a node of Python's floats: chosen once, since many programs run thousands of times."""
+    """Return the function that computes a node on Python floats; chosen once, as many programs run thousands of times."""
     return _plain_function(node, math, _NUMBER_FUNCTIONS) or (lambda *values: _evaluate(node, list(values)))
 
 
 def _function_of_arrays(node: Node) -> Callable:
-    """Return the function that computes a node of NumPy's arrays, or of floats, as constants are."""
+    """Return the function that computes a node on NumPy arrays or float constants."""
     if node.kind == "constant":
         return lambda: np.float64(node.detail) if isinstance(node.detail, float) else node.detail
     return _plain_function(node, np, _ARRAY_FUNCTIONS) or (lambda *values: _evaluate_by_jax(node, values))
 
 
 def _plain_function(node: Node, library: ModuleType, others: Mapping[str, Callable]) -> Callable | None:
-    """Return the operator, or the function of a library or of a table, that computes a node; None where there is none."""
+    """Return the operator, library function or table entry that computes a node; None if JAX must."""
     if node.kind in _OPERATORS:
         return _OPERATORS[node.kind][0]
     if node.kind == "sqrt":
@@ -260,11 +259,11 @@ def _evaluate_by_jax(node: Node, values: Sequence[np.ndarray]) -> np.ndarray | l
         return found if isinstance(found, list) else np.asarray(found)[()]
 
 
-def _library(x: Value) -> ModuleType:
+def _library(x: Operand) -> ModuleType:
     return np if isinstance(x, np.floating | np.ndarray) else math
 
 
-def _apply(node: Node, values: list[Value]) -> Value:
+def _apply(node: Node, values: list[Operand]) -> Operand:
     name = node.detail.primitive.name
     if name in _LIBRARY_FUNCTIONS and isinstance(values[0], float | np.ndarray):
         return getattr(_library(values[0]), name)(values[0])
@@ -279,10 +278,10 @@ def _apply(node: Node, values: list[Value]) -> Value:
     with jax.ensure_compile_time_eval():
         known = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
         found = np.asarray(primitive.bind(*known, **parameters))
-        return found[()] if any(isinstance(v, np.generic) for v in values) else found.item()  # Python's floats raise where 1/0 is
+        return found[()] if any(isinstance(v, np.generic) for v in values) else found.item()  # Python floats raise on 1/0
 
 
-def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Value]) -> list[Value]:
+def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Operand]) -> list[Operand]:
     primitive, parameters = details.primitive, details.parameters
     if not all(isinstance(v, float | int | bool | np.generic) for v in values):
         result = primitive.bind(*_arrays(details, arguments, values), **parameters)
@@ -292,7 +291,7 @@ def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Val
         return [np.asarray(r) for r in (result if primitive.multiple_results else [result])]
 
 
-def _arrays(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Value]) -> list[Value]:
+def _arrays(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Operand]) -> list[Operand]:
     arrays, start = [], 0
     for shape in details.shapes:
         size = int(np.prod(shape))

@@ -29,5 +29,5 @@ def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
 
 
 def both(a: Scalar, b: Scalar) -> Scalar:
-    """Return whether two conditions hold."""
+    """Return True if two conditions hold."""
     return a.graph.apply(lax.and_p, {}, (a, b), bool, np.logical_and)

@@ -1,24 +1,24 @@
-"""Write a program of loops out: as expressions of one graph, on arrays of scalars.
+"""Unroll a loop program into expressions of one graph, on arrays of scalars.
 
-A number that is stored and read again passes as an argument then, not through memory. Equal expressions of different elements are
-one node, and what is zero vanishes, as everywhere in a graph.
+A number that is stored and read again becomes an argument instead of passing through memory. Equal expressions of different
+elements become one node, and zeros vanish, as everywhere in a graph.
 """
 
 from collections.abc import Callable, Collection, Mapping
 
-from udkjax.expressions.differential import Row, accumulate, product
+from udkjax.expressions.differential import SparseRow, accumulate, product
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, LoopProgram, Reset
 from udkjax.expressions.selection import both, maximum
 
-Arrays = dict[str, dict[int, Scalar]]  # the numbers of each array, by their places; all others are zero
+Arrays = dict[str, dict[int, Scalar]]  # the nonzero numbers of each array by index
 
 
-Place = tuple[str, int]  # a number: its array, and its place there
+ArrayPlace = tuple[str, int]  # the name of an array and an index into it
 
 
 class _Joined(list[Scalar]):
-    """Numbers of which the largest, or the conjunction, is asked for: joined by halves, so that few wait for others."""
+    """Numbers whose maximum or conjunction is wanted, joined as a balanced tree, for short chains of dependence."""
 
     def __init__(self, join: Callable[[Scalar, Scalar], Scalar], first: Scalar | None):
         super().__init__([] if first is None else [first])
@@ -32,22 +32,22 @@ class _Joined(list[Scalar]):
 
 
 def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], graph: Graph, linear: str | None = None) -> Arrays:
-    """Return the arrays as a program leaves them; the given arrays stay as they are.
+    """Return the arrays after a run of the program; the given arrays do not change.
 
     Args:
         program: The program.
         arrays: Its inputs by array.
         graph: The graph of all scalars.
-        linear: A group of inputs in which the program is linear, such as tangents: a sum has one product for each number that it
-            depends on, whose coefficients are added up beforehand.
+        linear: A group of inputs in which the program is linear, such as tangents: the coefficients of each are added up
+            first, so that a sum has one product for each number that it depends on.
     """
     found: dict[str, dict[int, Scalar]] = {name: dict(x) for name, x in arrays.items()}
-    joined: dict[Place, _Joined] = {}
+    joined: dict[ArrayPlace, _Joined] = {}
     zero = graph.constant(0.0)
 
-    # Places that numbers were added to since they were read, in order: equal programs are equal texts, which are compiled once.
-    sums: dict[Place, None] = {}
-    atoms: set[int] = set()  # numbers of a linear program that sums are combinations of
+    # Places added to since they were last read. In order (a dict), so that equal programs have equal texts, compiled once.
+    sums: dict[ArrayPlace, None] = {}
+    atoms: set[int] = set()  # numbers of a linear program, whose combinations the sums are
 
     def read(name: str, place: int) -> Scalar:
         if (name, place) in joined:
@@ -98,11 +98,11 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
 
 
 def collect(s: Scalar, group: str, atoms: Collection[int]) -> Scalar:
-    """Return a linear combination of atoms, and of inputs of a group, with one product for each."""
+    """Write a scalar as a linear combination of atoms and of inputs of a group, with one product for each."""
     graph, one = s.graph, s.graph.constant(1.0)
-    forms: dict[int, Row] = {}
+    forms: dict[int, SparseRow] = {}
 
-    def form(a: Scalar, factor: Scalar) -> tuple[Row, Scalar]:
+    def form(a: Scalar, factor: Scalar) -> tuple[SparseRow, Scalar]:
         return forms.get(a.index, {a.index: one}), factor if a.sign > 0 else -factor
 
     for index in graph.dependencies([s.index], atoms, group):
@@ -115,7 +115,7 @@ def collect(s: Scalar, group: str, atoms: Collection[int]) -> Scalar:
             accumulate(total, *form(b, one if node.kind == "add" else -one))
         else:
             one_side, factor = (a, b) if group in a.node.depends else (b, a)
-            is_factored = one_side.index in forms and one_side.node.kind != "mul"  # a sum with a factor taken out stays as it is
+            is_factored = one_side.index in forms and one_side.node.kind != "mul"  # a factored sum stays as it is
             if is_factored or group in factor.node.depends:
                 continue
             accumulate(total, *form(one_side, factor))

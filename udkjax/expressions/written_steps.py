@@ -1,42 +1,42 @@
-"""Steps on numbers, run one by one at first, and as one function of Python once they have run often."""
+"""Steps on numbers: run one by one at first, and as one generated Python function once they have run often."""
 
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
-Value: TypeAlias = Any  # a number of Python, NumPy or JAX, or an array: each has its own operators
+Operand: TypeAlias = Any  # a number or array of Python, NumPy or JAX, each with its own operators
 
 _SYMBOLS: dict[Callable, str] = {operator.add: "+", operator.sub: "-", operator.mul: "*", operator.truediv: "/"}
-# Runs of steps one by one that take as long as writing them as a function of Python, which is three times as fast.
+# Runs of single steps that take as long as generating a Python function, which is three times as fast.
 _WORTH_WRITING = 20
 
 
 class WrittenSteps:
-    """Functions that are called one after another, each with numbers among the given ones and the results so far.
+    """Functions called one after another, each with arguments among the given numbers and the earlier results.
 
     Args:
         given: the count of given numbers.
-        steps: each function, and the places of its arguments: of a given number, or behind these of a result.
-        outputs: the places of the results that are returned.
+        steps: each function, and the indices of its arguments: given numbers come first, results after them.
+        outputs: the indices of the results that are returned.
     """
 
     def __init__(self, given: int, steps: list[tuple[Callable, list[int]]], outputs: list[int]):
         self._given, self._steps, self._outputs = given, steps, outputs
         self._runs, self._function = 0, None
 
-    def __call__(self, values: Sequence[Value]) -> list[Value]:
+    def __call__(self, values: Sequence[Operand]) -> list[Operand]:
         if self._function is None:
             self._runs += 1
             if self._runs <= _WORTH_WRITING:
-                known: list[Value] = [*values]
+                known: list[Operand] = [*values]
                 for function, places in self._steps:
                     known.append(function(*[known[k] for k in places]))
                 return [known[k] for k in self._outputs]
             self._function = self._write()
         return self._function(values)
 
-    def _write(self) -> Callable[[Sequence[Value]], list[Value]]:
-        """Return the steps as one function of Python."""
+    def _write(self) -> Callable[[Sequence[Operand]], list[Operand]]:
+        """Return the steps as one Python function."""
         lines = ["def run(values):"]
         if self._given:
             lines.append(f" {''.join(f'x{k}, ' for k in range(self._given))} = values")

@@ -41,13 +41,13 @@ def differentiable(problem: Problem, has_concrete_times: bool = False) -> Integr
 
 
 def _integrate(problem: Problem) -> IntegratorOutput:
-    problem_of, xs = split_numbers(problem)
-    return _run(DifferentiableRun(problem_of, problem.compiled.plan.is_native), xs)
+    problem_of, inputs = split_numbers(problem)
+    return _run(DifferentiableRun(problem_of, problem.compiled.plan.is_native), inputs)
 
 
 @eqx.filter_custom_jvp
-def _run(function: "DifferentiableRun", xs: list[Array]) -> IntegratorOutput:
-    return function.fast(xs)
+def _run(function: "DifferentiableRun", inputs: list[Array]) -> IntegratorOutput:
+    return function.fast(inputs)
 
 
 @_run.def_jvp
@@ -60,13 +60,13 @@ def _(primals, tangents):
     def in_parts(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
         """Return the run, and a linear map of the direction."""
         raw, recorded = at[0].recorded(stop_gradients(at[1]), active)
-        linear = Linear(function=at[0], xs=at[1], run=recorded, active=active)
+        linear = Linear(function=at[0], inputs=at[1], run=recorded, active=active)
         return list(_as_run(*at, raw)), linear.applied(direction)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
         """Return both by forward mode."""
-        function, xs = at
-        raw, change = function.run_and_jvp(xs, active, direction)
+        function, inputs = at
+        raw, change = function.run_and_jvp(inputs, active, direction)
         return list(raw), change
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
@@ -77,9 +77,9 @@ def _(primals, tangents):
 
 
 @eqx.filter_custom_jvp
-def _as_run(function: "DifferentiableRun", xs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
+def _as_run(function: "DifferentiableRun", inputs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
     """Return the results of a run, with the derivatives of the run."""
-    del function, xs
+    del function, inputs
     return raw
 
 
@@ -105,68 +105,73 @@ class DifferentiableRun(DifferentiableFunction):
         operation = self.problem.rest.compiled.plan.operation if self.native else None
         return 0 if operation is None else 1 if operation.sampled else 2
 
-    def fast(self, xs: list[Array]) -> IntegratorOutput:
+    def fast(self, inputs: list[Array]) -> IntegratorOutput:
         """Return the run by machine code, which has no derivatives, if that serves."""
-        problem = self.problem(xs)
+        problem = self.problem(inputs)
         return native_engine.integrate(problem) if self.native else _integrate_by_diffrax(problem)
 
-    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
+    def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
         del run
-        return self.run_and_jvp(xs, active, vs)[1]
+        return self.run_and_jvp(inputs, active, tangents)[1]
 
-    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
-        problem, which = self.problem(xs), self.problem.marks(active)
-        if self._is_native(xs, active):
-            run = self.recorded(xs, active)[1] if run is None else run
-            q, v, y = ws
+    def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
+        problem, which = self.problem(inputs), self.problem.marks(active)
+        if self._is_native(inputs, active):
+            run = self.recorded(inputs, active)[1] if run is None else run
+            q, v, y = cotangents
             found = native_engine.vjp(problem, which, run, jnp.concatenate([q, v], axis=1), y)
             pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
             return [bar for m, bar in pairs if m is True]
         if run is None:
-            return self.pull(xs, active, ws)
+            return self.pull(inputs, active, cotangents)
 
         def function(some: list[Array]) -> list[Array]:
-            raw = _integrate_by_diffrax(self.problem(replaced(xs, active, some)), "RecursiveCheckpointAdjoint")
+            raw = _integrate_by_diffrax(self.problem(replaced(inputs, active, some)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
-        return jax.vjp(function, select(xs, active))[1](ws)[0]
+        return jax.vjp(function, select(inputs, active))[1](cotangents)[0]
 
-    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
-        either, problem = tuple(map(operator.or_, active, others)), self.problem(xs)
+    def twice(
+        self, inputs: list[Array], active: Mask, tangents: list[Array], others: Mask, other_tangents: list[Array]
+    ) -> list[Array]:
+        either, problem = tuple(map(operator.or_, active, others)), self.problem(inputs)
         which = self.problem.marks(either)
         moves_samples = any(x is True for x in jax.tree.leaves(which.textbook.mechanism.samples))
-        if moves_samples or not self._is_native(xs, either):  # splines are not linear in their knots
-            return super().twice(xs, active, vs, others, us)
-        changes = ((self.problem.marks(which), self.problem.changes(which, dxs)) for which, dxs in ((active, vs), (others, us)))
+        if moves_samples or not self._is_native(inputs, either):  # splines are not linear in their knots
+            return super().twice(inputs, active, tangents, others, other_tangents)
+        changes = (
+            (self.problem.marks(which), self.problem.changes(which, dxs))
+            for which, dxs in ((active, tangents), (others, other_tangents))
+        )
         return list(native_engine.second_derivative(problem, which, *changes))
 
-    def run_and_jvp(self, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
+    def run_and_jvp(self, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """Return the run, and the change of its states along v of those of x that are active: by machine code, if that serves."""
-        if self._is_native(xs, active):
-            change = self.problem.changes(active, vs)
-            raw, found = native_engine.jvp(self.problem(xs), self.problem.marks(active), change)
+        if self._is_native(inputs, active):
+            change = self.problem.changes(active, tangents)
+            raw, found = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
             return raw, list(found)
-        raw, change = change_along(lambda xs: _integrate_by_diffrax(self.problem(xs)), xs, active, vs)
+        raw, change = change_along(lambda inputs: _integrate_by_diffrax(self.problem(inputs)), inputs, active, tangents)
         return raw, [change[k] for k in SMOOTH]
 
-    def recorded(self, xs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
+    def recorded(self, inputs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
         """Return the run and what it leaves to walk back from, by the machine code of reverse mode, if that serves.
 
         No other is compiled. Diffrax leaves nothing.
         """
-        if self._is_native(xs, active):
-            return native_engine.integrate_for_vjp(self.problem(xs), self.problem.marks(active))
-        return _integrate_by_diffrax(self.problem(xs)), ()
+        if self._is_native(inputs, active):
+            return native_engine.integrate_for_vjp(self.problem(inputs), self.problem.marks(active))
+        return _integrate_by_diffrax(self.problem(inputs)), ()
 
-    def _is_native(self, xs: list[Array], active: Mask) -> bool:
+    def _is_native(self, inputs: list[Array], active: Mask) -> bool:
         return self.native and native_engine.serves_derivatives(self.problem.marks(active))
 
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        raw = _integrate_by_diffrax(self.problem(xs))
+    def __call__(self, inputs: list[Array]) -> list[Array]:
+        raw = _integrate_by_diffrax(self.problem(inputs))
         return [raw[k] for k in SMOOTH]
 
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        problem = self.problem(xs)
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
+        problem = self.problem(inputs)
         (times,), (n,) = problem.ts.shape, problem.q.shape
         return [(times, n), (times, n), (2 * n,)]
 

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart, Time, Vector
+from udkjax.annotations import Time, Vector
+from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.analysis import analyse
 from udkjax.equations.formulations import WrappedSystem
 from udkjax.equations.scales import Scales

@@ -20,7 +20,7 @@ from udkjax.integrate.solvers import is_explicit
 from udkjax.native.base.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
-from udkjax.scene.checks import traced_numbers_hold
+from udkjax.scene.checks import traced_numbers_are_valid
 from udkjax.scene.fields import number
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
@@ -146,7 +146,7 @@ def prepare_run(
         numbers: Any = (start.q, start.v, rtol, atol, choices.drift_tol, choices.dt0)
         good = usable(*stop_gradients(numbers)) | ~start.is_closed
         if analysis is not None:
-            good = good & stop_gradients(traced_numbers_hold(compiled.textbook.mechanism.elements))
+            good = good & stop_gradients(traced_numbers_are_valid(compiled.textbook.mechanism.elements))
             good = good & jnp.isfinite(compiled.textbook.scales.mass)
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))

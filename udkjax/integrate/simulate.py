@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from udkjax.annotations import Numbers, Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
@@ -48,15 +48,15 @@ def simulate(
     mechanism: Mechanism | ConstrainedSystem,
     ts: Numbers | Sequence[float],
     state: State | Closure | None = None,
-    rtol: Scalar = 1e-8,
-    atol: Scalar = 1e-8,
+    rtol: NumberLike = 1e-8,
+    atol: NumberLike = 1e-8,
     method: Pseudoinverse | None = None,
     stabilization: Projection | Baumgarte | None = Projection(),
     solver: "diffrax.AbstractSolver | None" = None,
     adjoint: "diffrax.AbstractAdjoint | None" = None,
     max_steps: int = MAX_STEPS,
-    drift_tol: Scalar | None = None,
-    dt0: Scalar | None = None,
+    drift_tol: NumberLike | None = None,
+    dt0: NumberLike | None = None,
     formulation: Formulation | None = None,
     throw: bool = True,
     progress: Any = None,

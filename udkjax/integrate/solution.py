@@ -11,12 +11,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from udkjax.annotations import Numbers
 from udkjax.equations.quantities import efforts
 from udkjax.extras import OptionalImport
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
 from udkjax.scene.bodies import COORDINATES, Frame, frame_over_time
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from udkjax.annotations import Numbers, Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -35,10 +35,10 @@ def step(
     mechanism: Mechanism,
     state: State,
     inputs: Mapping[str, Numbers] | None,
-    dt: Scalar,
-    t: Scalar = 0.0,
-    rtol: Scalar = 1e-8,
-    atol: Scalar = 1e-8,
+    dt: NumberLike,
+    t: NumberLike = 0.0,
+    rtol: NumberLike = 1e-8,
+    atol: NumberLike = 1e-8,
     max_steps: int = MOST_STEPS_OF_INTERVAL,
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax"] = "auto",
@@ -92,7 +92,7 @@ def _advance(
     analysis: Analysis,
     state: State,
     values: Mapping[str, Numbers],
-    numbers: Mapping[str, Scalar],
+    numbers: Mapping[str, NumberLike],
     max_steps: int,
     engine: str,
     has_concrete_times: bool,

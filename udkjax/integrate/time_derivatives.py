@@ -84,42 +84,42 @@ class StateAfter(DifferentiableFunction):
     def orders(self) -> int:
         return 1
 
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        s, *x = xs
+    def __call__(self, inputs: list[Array]) -> list[Array]:
+        s, *x = inputs
         return _after(self.rates, x, s)[1:3]
 
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return [x.shape for x in xs[2:4]]
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
+        return [x.shape for x in inputs[2:4]]
 
-    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: PyTree) -> list[Array]:
+    def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: PyTree) -> list[Array]:
         del run
-        given = iter(vs)
+        given = iter(tangents)
         ds, _, *changes = [next(given) if m else None for m in active[:4]]
-        changes = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(xs[2:4], changes, strict=True)]
+        changes = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(inputs[2:4], changes, strict=True)]
         if ds is None:
             return changes
-        return [dx + rate * ds for dx, rate in zip(changes, self.rates(xs[1:])[1:3], strict=True)]
+        return [dx + rate * ds for dx, rate in zip(changes, self.rates(inputs[1:])[1:3], strict=True)]
 
-    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: PyTree) -> list[Array]:
+    def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: PyTree) -> list[Array]:
         del run
-        bars = [jnp.zeros_like(x) for x in xs]
-        bars[2:4] = ws
+        bars = [jnp.zeros_like(x) for x in inputs]
+        bars[2:4] = cotangents
         if active[0]:
-            bars[0] = sum((jnp.vdot(w, rate) for w, rate in zip(ws, self.rates(xs[1:])[1:3], strict=True)), bars[0])
+            bars[0] = sum((jnp.vdot(w, rate) for w, rate in zip(cotangents, self.rates(inputs[1:])[1:3], strict=True)), bars[0])
         return select(bars, active)
 
 
 @eqx.filter_custom_jvp
-def _state_after(function: StateAfter, xs: list[Array]) -> list[Array]:
+def _state_after(function: StateAfter, inputs: list[Array]) -> list[Array]:
     del function
-    return xs[2:4]
+    return inputs[2:4]
 
 
 @_state_after.def_jvp
 def _(primals, tangents):
-    function, xs = primals
+    function, inputs = primals
     active = tuple(dx is not None for dx in tangents[1])
-    linear = Linear(function=function, xs=xs, run=(), active=active)
+    linear = Linear(function=function, inputs=inputs, run=(), active=active)
     return _state_after(*primals), linear.applied(select(tangents[1], active))
 
 

@@ -29,8 +29,6 @@ from udkjax.native.run.state_functions import StateAccelerations, StateFunction,
 from udkjax.native.watching.conditions import Conditions
 from udkjax.native.watching.event_states import EventStates
 
-Shape = tuple[int, ...]
-
 
 @dataclass(frozen=True)
 class Operation(ABC):
@@ -65,10 +63,10 @@ class Operation(ABC):
         """
 
     @abstractmethod
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         """Return the shapes of the outputs, of one member."""
 
-    def shapes(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def shapes(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         """Return the shapes of the outputs, from inputs."""
         members = max([x.shape[0] for x in inputs])
         return [(members, *shape) for shape in self.outputs(inputs, times)]
@@ -126,7 +124,7 @@ class StateOperation(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         return [(len(self.function.found) * self.code.coordinate_count,)]
 
 
@@ -160,7 +158,7 @@ class EvaluateEvents(StateOperation):
         plan = self.pseudoinverse, self.formulation, width, vector
         return EventStates(self.code, self.conditions, self.impacts, *plan)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
         directions = len(self.impacts) * self.code.coordinate_count
         return [(self.code.coordinate_count + len(self.conditions.at_state.outputs) + directions,)]
@@ -175,7 +173,7 @@ class MarkRows(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return RowMarks(self.code, width, vector)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         return [(self.code.row_count,)]
 
 
@@ -191,5 +189,5 @@ class FindScales(Operation):
     def module(self, width: int, beside: int, vector: int) -> Memory:
         return ScaleCode(self.code)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         return [(self.code.scale_count,)]

@@ -8,7 +8,7 @@ from udkjax.native.base.module import Module
 from udkjax.native.closing.closing import Closing
 from udkjax.native.closing.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
 from udkjax.native.closing.marching import Marching
-from udkjax.native.operations import Operation, Shape
+from udkjax.native.operations import Operation
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Close(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Closing(self.code, vector)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         return [(2 * self.code.coordinate_count,), (2 * self.code.row_count,), (1,)]
 
 
@@ -39,7 +39,7 @@ class CloseTangents(Close):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingForward(self.code, vector, self.active)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         return [*super().outputs(inputs, times), (inputs[-1].shape[1], 2 * self.code.coordinate_count)]
 
 
@@ -64,7 +64,7 @@ class CloseCotangents(Close):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return ClosingReverse(self.code, vector, self.active)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         n = self.code.coordinate_count
         return [*super().outputs(inputs, times), (self.code.number_count,), (n,), (n,)]
 
@@ -78,5 +78,5 @@ class March(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Marching(self.code, width, vector)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         return [*[(times, self.code.coordinate_count)] * 3, (times,), (1,)]

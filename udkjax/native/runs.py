@@ -12,7 +12,7 @@ from udkjax.native.base.tableau import Method
 from udkjax.native.derivatives.backpropagation import Reverse
 from udkjax.native.derivatives.record import STORED, record_length
 from udkjax.native.derivatives.tangents import Forward, ForwardTwice
-from udkjax.native.operations import Operation, Shape
+from udkjax.native.operations import Operation
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.trajectory import Trajectory
@@ -88,7 +88,7 @@ class RunStates(Operation):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         n = self.code.coordinate_count
         return [(times, n), (times, n), (times,), (len(INFO) + 2 * n,)]
 
@@ -103,7 +103,7 @@ class RunWatched(RunStates):
         assert self.conditions is not None
         return Watching(self.plan(width, vector), self.conditions)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
         return [*super().outputs(inputs, times), (self.conditions.output_count(self.code.coordinate_count),)]
 
@@ -121,7 +121,7 @@ class RunTangents(RunStates):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Forward(self.plan(width, vector), self.active, max(width, beside))
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         directions, n = inputs[-1].shape[1], self.code.coordinate_count
         changes = [(directions, times, 2 * n), (directions, 2 * n)]
         return [*super().outputs(inputs, times), *changes]
@@ -150,9 +150,9 @@ class RunCotangents(RunStates):
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Reverse(self.plan(width, vector), self.active)
 
-    def outputs(self, inputs: Sequence[Any], times: int) -> list[Shape]:
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         n, is_first = self.code.coordinate_count, not inputs[-1].shape[0]  # without cotangents
-        bars: list[Shape] = [(self.code.number_count,), (n,), (n,)]
+        bars: list[tuple[int, ...]] = [(self.code.number_count,), (n,), (n,)]
         if self.sampled:
             bars.append((0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
         record = (record_length(n, self.points) if is_first else 0,)

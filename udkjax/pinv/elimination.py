@@ -1,7 +1,7 @@
 """Elimination: D^+ from the triangular factors of D D^T. Fast, and as accurate as cond(D)^2 allows.
 
-Rows that depend on those before them show by a pivot of rounding errors and are dropped. With K the rows kept and L the factor,
-D = C D_K for C = L L_K^(-1), which holds a unit row for each row kept, so
+A row that depends on earlier rows has a pivot of rounding size and is dropped. With K the rows kept and L the factor,
+D = C D_K for C = L L_K^(-1), which has a unit row for each row kept, so
 
     D^+ = D_K^+ C^+ = D_K^T (L_K L_K^T)^(-1) (C^T C)^(-1) C^T.
 """
@@ -32,9 +32,9 @@ class EliminationFactors(NamedTuple):
 class Elimination(Dense):
     """Eliminate D D^T by its largest pivots; a pivot whose square root is at most the threshold is dropped.
 
-    Each row is compared with what remains of it when those before are taken out, so that rows of unlike sizes, as of masses far
-    apart, do no harm. Errors grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding of a dependent row stays well
-    below it, and pivots below it have lost most of their digits.
+    A pivot is compared with its own row, so that rows of very different sizes, as from very different masses, do no harm. Errors
+    grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding of a dependent row stays well below it, and pivots below
+    it have lost most of their digits.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> EliminationFactors:
@@ -69,7 +69,7 @@ def _cholesky(
 ) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
     """Return L with L L^T = gram, by the largest pivot left; which pivots exceed their thresholds; and the order of the rows.
 
-    L[order] is a lower triangle. A pivot that does not count leaves a zero column.
+    L[order] is lower triangular. A dropped pivot leaves a zero column.
     """
     m = len(gram)
 

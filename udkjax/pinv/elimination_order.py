@@ -1,4 +1,4 @@
-"""Orders of least fill in which the rows of D D^T, or its blocks, are eliminated. Rows meet where they hold the same column."""
+"""Elimination orders of least fill for the rows or blocks of D D^T. Two rows meet if both have an entry in the same column."""
 
 from collections.abc import Sequence, Set
 from heapq import heapify, heappop, heappush
@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 
 def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
-    """Order rows so that eliminating D D^T fills little: always the row that meets the fewest others.
+    """Order rows by minimum degree, for little fill in D D^T: the row that meets the fewest others comes next.
 
-    Of several the one that waits for the fewest before it (ties: the first): rows that do not wait are computed side by side.
+    Ties go to the row that waits for the fewest earlier rows, then to the first: rows that do not wait can run in parallel.
     """
     meets: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
@@ -16,12 +16,12 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
             meets.setdefault(k, set()).add(i)
     near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
     order: list[int] = []
-    wait = [0] * len(rows)  # number of others that come before, one after the other
+    wait = [0] * len(rows)  # length of the longest chain of earlier rows
     queue, left = [(len(others), 0, i) for i, others in enumerate(near)], set(range(len(rows)))
     heapify(queue)
     while left:
         *known, i = heappop(queue)
-        if i not in left or known != [len(near[i]), wait[i]]:  # counted anew since
+        if i not in left or known != [len(near[i]), wait[i]]:  # an outdated entry of the queue
             continue
         left.remove(i)
         order.append(i)
@@ -33,19 +33,18 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
 
 
 class Fronts(NamedTuple):
-    """Blocks that are eliminated one after the other by the same operations: fronts of the same sizes."""
+    """Blocks eliminated consecutively by the same operations: fronts of equal sizes."""
 
     size: int  # rows of each block
     later_sizes: tuple[int, ...]  # rows of the later blocks that each of them meets
     blocks: list[int]
-    later: list[list[int]]  # of each block, in the order of elimination
+    later: list[list[int]]  # the later blocks that each block meets, in the order of elimination
 
 
 def order_blocks(sizes: Sequence[int], holds: Sequence[Set[int]]) -> list[Fronts]:
-    """Return an order of least fill, in runs of blocks that are alike. Blocks meet where they hold the same thing.
+    """Return an elimination order of least fill, grouped into runs of equal blocks. Two blocks meet if they share an entry.
 
-    A block waits for those before it that meet it, and for nothing else: of those that need not wait, as many that are alike come
-    next as there are.
+    A block waits only for the earlier blocks that it meets. The next run is the largest group of equal blocks that are ready.
     """
     place = {k: i for i, k in enumerate(minimum_degree([set(h) for h in holds]))}
     order = sorted(place, key=lambda k: place[k])

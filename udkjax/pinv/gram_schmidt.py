@@ -12,24 +12,24 @@ from udkjax.pinv.rule import dot, exceeds
 class GramSchmidt(Orthogonal):
     """D = Q R with column pivoting, then R^T = Z U: D^+ = Z U^(-T) Q^T, both by modified Gram-Schmidt.
 
-    With `twice` each column is made orthogonal to the previous ones a second time when its turn comes: the error then is of the
-    order of eps cond(D), as with Householder. Without it Q is orthogonal to eps cond(D) only, and the error can be of the order
-    of eps cond(D)^2. The threshold is on the diagonal of R, its scale the largest column norm.
+    With `twice` each column is reorthogonalized when its turn comes: the error is then of the order of eps cond(D), as with
+    Householder. Without it Q is orthogonal only to eps cond(D), and the error can be of the order of eps cond(D)^2. The threshold
+    applies to the diagonal of R, relative to the largest column norm.
 
     Args:
-        twice: whether each column is made orthogonal a second time.
+        twice: whether each column is reorthogonalized.
     """
 
     twice: bool = eqx.field(static=True, default=True)
 
     def factor(self, D: Float[Array, "m n"]) -> OrthogonalFactors:
         q, r, _, rank = gram_schmidt(D, self.threshold(D, jnp.linalg.norm(D, axis=0).max()), self.twice)
-        z, u, order, _ = gram_schmidt(r.T, jnp.zeros((), D.dtype), self.twice)  # the rank is decided: leave out zero rows only
+        z, u, order, _ = gram_schmidt(r.T, jnp.zeros((), D.dtype), self.twice)  # rank already decided: drop only zero rows
         return OrthogonalFactors(divide(u[:, order], z.T, rank).T, q[:, order], rank)
 
 
 def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: bool) -> PivotedQR:
-    """Modified Gram-Schmidt; each step takes the column with the largest rest, and stops where it is at most `threshold`."""
+    """Modified Gram-Schmidt; each step takes the column with the largest remainder and stops once that is at most `threshold`."""
     rows, columns = D.shape
     steps = min(rows, columns)
     column = jnp.arange(columns)

@@ -23,12 +23,12 @@ class Greville(Dense):
         p = c / (c^T c)            if c is not zero: a is independent of the rows before it,
         p = P d / (1 + d^T d)      if c is zero.
 
-    (T. N. E. Greville, SIAM Review 2 (1960) 15, for columns.) The threshold is on |c|, its scale the largest row norm.
+    (T. N. E. Greville, SIAM Review 2 (1960) 15, for columns.) The threshold applies to |c|, relative to the largest row norm.
 
-    Error of the order of eps cond(D)^2, because P is wrong by eps cond(D) |P|, and that enters c. So the residue of a dependent
-    row is of this order too, while an independent row may be as near as 1/cond(D). Hence the default `rank_tol` is eps^(1/3),
-    where the two meet; beyond cond(D) = eps^(-1/3) no threshold is right. One dependent row that passes for independent makes
-    the result wrong by any factor.
+    The error is of the order of eps cond(D)^2, because the error of P, eps cond(D) |P|, enters c. The remainder of a dependent
+    row is of this order too, while that of an independent row may be as small as 1/cond(D). Hence the default `rank_tol`
+    eps^(1/3), where the two are equal; beyond cond(D) = eps^(-1/3) no threshold is right. A dependent row taken for independent
+    can make the result wrong by any factor.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> GrevilleFactors:
@@ -39,7 +39,7 @@ class Greville(Dense):
             plus, rank = state
             a, e = row  # the row of D, and its unit vector
             d = dot(a, plus)
-            c = a - dot(d, D)  # d is zero from this row on, because the columns of plus still are
+            c = a - dot(d, D)  # d is zero from this row on, as are the columns of plus
             independent = exceeds(jnp.linalg.norm(c), threshold)
             cc = jnp.where(independent, dot(c, c), 1)
             p = jnp.where(independent, c / cc, dot(plus, d) / (1 + dot(d, d)))

@@ -1,4 +1,4 @@
-"""D^+ b by Householder's QR: a basic solution, freed of its part in the null space."""
+"""D^+ b by Householder's QR: a basic solution minus its component in the null space."""
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,9 @@ class Householder(Orthogonal):
 
     E T^(-1) Q^T b is one least-squares solution. The columns of I - E G span the null space of D; with V an orthonormal basis of
     them, by QR once more, x = (I - V V^T) E T^(-1) Q^T b is the shortest solution (Golub and Van Loan, Matrix Computations,
-    4th ed., section 5.5). The threshold is on the diagonal of T, its scale the largest column norm.
+    4th ed., section 5.5). The threshold applies to the diagonal of T, relative to the largest column norm.
 
-    Error of the order of eps cond(D).
+    The error is of the order of eps cond(D).
     """
 
     def factor(self, D: Float[Array, "m n"]) -> OrthogonalFactors:
@@ -32,7 +32,7 @@ class Householder(Orthogonal):
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Householder's QR; each step takes the column with the largest remaining norm, and stops where it is at most `threshold`."""
+    """Householder's QR; each step takes the column with the largest remaining norm and stops once that is at most `threshold`."""
     q, r, order, rank = complete_qr(D, threshold)
     significant = jnp.arange(len(order)) < rank
     return PivotedQR(
@@ -41,9 +41,9 @@ def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR
 
 
 def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Householder's QR with all of Q (m, m) and the remainder of R (m, n): from `rank` on, the columns of Q span what D does not.
+    """Householder's QR with the full Q (m, m) and R (m, n); from `rank` on, the columns of Q span the complement of D's range.
 
-    Columns stay in their place, only their order is noted. (The pivoted QR of jax.scipy needs MAGMA on a GPU.)
+    Columns are not moved; their order is returned. (The pivoted QR of jax.scipy needs MAGMA on a GPU.)
     """
     rows, columns = D.shape
     steps = min(rows, columns)

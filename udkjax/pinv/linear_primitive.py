@@ -1,4 +1,4 @@
-"""Primitives of JAX that are linear in their last argument: an operator, and the vector that it is applied to."""
+"""Primitives of JAX that apply an operator to a vector, and are linear in the vector."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -14,17 +14,17 @@ from udkjax.programs.varying_axes import zero_of
 
 
 def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Callable, transpose: Callable) -> Primitive:
-    """Make a primitive of four rules for one operator and one vector; batches map them.
+    """Make a primitive from four rules for one operator and one vector; batches map them.
 
-    `equinox.internal.create_vprim` does so, but its transpose does not sum the cotangents of a vector that all operators of a
-    batch share: here such a vector is broadcast before, and the transpose of that is the sum.
+    `equinox.internal.create_vprim` does so too, but its transpose does not sum the cotangents of a vector shared by a batch of
+    operators. Here such a vector is broadcast first, and the transpose of broadcasting is the sum.
 
     Args:
         name: Name in printed programs of JAX.
         apply: (operator, vector) -> vector.
         shape: The same for shapes.
-        derivative: The rule of forward mode.
-        transpose: The rule of reverse mode, of the vector.
+        derivative: The forward-mode rule.
+        transpose: The reverse-mode rule for the vector.
 
     Returns:
         The primitive, for `equinox.internal.filter_primitive_bind`.

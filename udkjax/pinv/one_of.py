@@ -1,4 +1,4 @@
-"""D^+ by one of several methods, chosen by a number."""
+"""D^+ by one of several methods, chosen by its index."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.pinv.gram_schmidt import GramSchmidt
 from udkjax.pinv.greville import Greville
 from udkjax.pinv.householder import Householder
@@ -21,7 +21,7 @@ from udkjax.pinv.varga import Varga
 
 
 class OneOfFactors(NamedTuple):
-    """The factors of each method: zeros, but those of the chosen one."""
+    """The factors of each method; all but those of the chosen one are zero."""
 
     of_each: tuple[Any, ...]
 
@@ -30,7 +30,7 @@ class OneOfFactors(NamedTuple):
         return sum((factors.rank for factors in self.of_each), jnp.array(0))
 
 
-def _number(value: Scalar) -> Float[Array, ""]:
+def _number(value: NumberLike) -> Float[Array, ""]:
     """Make an array of a number, as `number` does of one that may be missing."""
     found = number(value)
     if found is None:
@@ -39,14 +39,14 @@ def _number(value: Scalar) -> Float[Array, ""]:
 
 
 class OneOf(Dense):
-    """One of several methods, chosen by a number that may be traced and batched: one compiled program serves all of them.
+    """One of several methods, chosen by an index that may be traced and batched: one compiled program serves all of them.
 
-    The threshold is the same for all. In machine code each lane has a method of its own, and what no lane has chosen is not
-    executed; under `vmap` over the number of a program without machine code all methods are.
+    All share one threshold. In machine code each lane has its own method, and a method that no lane has chosen is not executed.
+    In a program without machine code, `vmap` over the index executes all methods.
 
     Args:
         methods: the methods, without thresholds of their own; by default the five of the paper.
-        number: index of the method, from zero; one that is traced and lies outside stands for the first or the last.
+        number: index of the method, from zero; a traced index out of range is clipped to the first or the last.
     """
 
     methods: tuple[Dense, ...] = eqx.field(converter=tuple, default=(SVD(), Varga(), Greville(), Householder(), GramSchmidt()))

@@ -10,7 +10,7 @@ from udkjax.pinv.rule import Dense, dot
 
 
 class PivotedQR(NamedTuple):
-    """D = Q R with k = min(m, n): R[:, order] is upper triangular with a falling diagonal. From `rank` on, Q and R are zero."""
+    """D = Q R with k = min(m, n): R[:, order] is upper triangular, its diagonal decreasing. From `rank` on, Q and R are zero."""
 
     q: Float[Array, "m k"]
     r: Float[Array, "k n"]
@@ -39,7 +39,7 @@ class Orthogonal(Dense):
 def divide(t: Float[Array, "k k"], b: Float[Array, "k s"], rank: Int[Array, ""]) -> Float[Array, "k s"]:
     """T^(-1) b for the leading triangle T of t of size `rank`, with zeros below.
 
-    (Not LAPACK: two of its batched calls at a time bring jax 0.10 to a standstill on a machine of two cores.)
+    (LAPACK is avoided: two concurrent batched calls deadlock jax 0.10 on a machine with two cores.)
     """
     size = len(t)
 

@@ -2,19 +2,19 @@
 
 D D^T = L diag(p) L^T. The pivot p_i, relative to its row's diagonal entry of D D^T, is the square of the sine of the angle
 between row i and the rows eliminated before it: a rounding error where the row depends on them, small near a singular
-configuration. Elimination loses digits by the factor 1 / p_i. Two thresholds meet it, both numbers that may be traced:
+configuration. Elimination loses digits by the factor 1 / p_i. It is compared with two thresholds, which may be traced:
 
-    drop_tol    at or below it the row counts as dependent: it is left out, with zero for 1 / p_i;
-    safe_tol    at or below it the result is not to be trusted: the program says so by its last output, `safe`.
+    drop_tol    at or below it the row counts as dependent and is left out, with zero for 1 / p_i;
+    safe_tol    at or below it the result cannot be trusted, which the last output of the program, `safe`, reports.
 
-The policy is static: it decides which of the two a program looks at.
+The policy is static: it decides which of the two thresholds a program uses.
 """
 
 from enum import Enum
 
 
 class RankPolicy(Enum):
-    """The treatment of a pivot below a threshold."""
+    """Treatment of pivots below a threshold."""
 
     REFUSE = "refuse"
     """Look at no pivot while eliminating, and report whether all exceed `safe_tol`. A step that is not safe is refused; machine

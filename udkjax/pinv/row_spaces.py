@@ -4,23 +4,23 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 
-SMALLEST_COEFFICIENT = 1e-5  # of the largest coefficient: zero, in directions found from differences that are good to 1e-8
+SMALLEST_COEFFICIENT = 1e-5  # relative to the largest; directions found from differences are accurate to 1e-8
 
 
 def null_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray, "D K"]:
-    """Return an orthonormal basis, as rows, of what a matrix maps to zero; singular values up to `tol` count as zero."""
+    """Return an orthonormal basis of the null space of a matrix, as rows; singular values up to `tol` count as zero."""
     _, sigma, vt = np.linalg.svd(matrix)
     return vt[int(np.sum(sigma > tol)) :]
 
 
 def row_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray, "D K"]:
-    """Return the span of the rows of a matrix, in reduced echelon form."""
+    """Return a basis of the row space of a matrix, in reduced echelon form."""
     _, sigma, vt = np.linalg.svd(matrix, full_matrices=False)
     return echelon(vt[: int(np.sum(sigma > tol))])
 
 
 def echelon(rows: Float[np.ndarray, "R K"], tol: float = SMALLEST_COEFFICIENT) -> Float[np.ndarray, "D K"]:
-    """Return independent rows in reduced echelon form; entries below `tol`, relative to a row's largest, are made zero."""
+    """Return independent rows in reduced echelon form; entries below `tol` times the largest in their row become zero."""
     rows, done = np.array(rows, float), 0
     for column in range(rows.shape[1]):
         if done == len(rows):
@@ -38,7 +38,7 @@ def echelon(rows: Float[np.ndarray, "R K"], tol: float = SMALLEST_COEFFICIENT) -
 
 
 def connected_columns(relations: Float[np.ndarray, "R K"]) -> list[list[int]]:
-    """Return the sets of columns that rows connect; columns of zeros are in none."""
+    """Return the sets of columns that rows connect, without columns of zeros."""
     nonzero = np.asarray(relations) != 0.0
     _, label = connected_components(nonzero.T.astype(int) @ nonzero, directed=False)
     return [np.flatnonzero(label == k).tolist() for k in np.unique(label[nonzero.any(0)])]

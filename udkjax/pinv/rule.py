@@ -1,7 +1,7 @@
-"""The interface of all pseudoinverses, and the one derivative that they share.
+"""The interface of all pseudoinverses, and the derivative rule that they share.
 
-A method says how to factorize D, how to apply the factors, and where its rank threshold lies. That is all: D^+ b, D^+ itself
-and every derivative, forward or reverse and of any order, follow from here. No factorization is ever differentiated.
+A method defines how to factorize D, how to apply the factors, and its rank threshold. D^+ b, D^+ itself and derivatives of any
+order, forward or reverse, follow from these. No factorization is ever differentiated.
 """
 
 from abc import abstractmethod
@@ -18,7 +18,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from udkjax.annotations import Numbers, Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
 from udkjax.programs.varying_axes import result_type
@@ -27,7 +27,7 @@ from udkjax.programs.varying_axes import result_type
 dot = partial(jnp.matmul, precision="highest")
 
 
-Operator: TypeAlias = PyTree[Array]  # a matrix, or what stands for one in a method
+Operator: TypeAlias = PyTree[Array]  # a matrix, or a method's representation of one
 
 
 class Factors(Protocol):
@@ -38,14 +38,14 @@ class Factors(Protocol):
 
 
 class LeastSquaresSolution(NamedTuple):
-    """The minimum-norm least-squares solution of D x = b, and the rank that was decided on the way."""
+    """The minimum-norm least-squares solution of D x = b, and the numerical rank of D."""
 
     x: Float[Array, "n *k"]
     rank: Int[Array, ""]
 
 
-def number(value: Scalar | None) -> Float[Array, ""] | None:
-    """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
+def number(value: NumberLike | None) -> Float[Array, ""] | None:
+    """Convert a number to an array leaf: a Python float as a field would be static, and each new value would recompile."""
     dtype = jnp.result_type(float)
     if isinstance(value, float | int | np.number):
         value = np.asarray(value, dtype)  # JAX would compile a program to convert it
@@ -62,12 +62,13 @@ class Pseudoinverse(PrintsLine):
     """A method to apply the Moore-Penrose pseudoinverse D^+ of an (m, n) operator D, truncated at a numerical rank.
 
     With `relative=True` a number counts as zero if it is at most `rank_tol` times the method's scale of D (the largest singular
-    value, or the largest norm of a column or row in its place); with `relative=False` if it is at most `rank_tol`, in the units
+    value, or instead the largest norm of a column or row); with `relative=False` if it is at most `rank_tol`, in the units
     of D. `rank_tol=None` stands for max(m, n) eps, eps the rounding unit of D: right for data that is exact up to rounding.
-    (For Greville it is eps^(1/3).) `rank_tol` is an array leaf: it may be traced and batched; its derivative is zero.
+    (For Greville and elimination it is eps^(1/3).) `rank_tol` is an array leaf: it may be traced and batched; its derivative is
+    zero.
 
-    Methods for any operator: the matrix as a pytree, everything else as the seven functions below. Derivatives assume that the
-    rank stays constant nearby; where it jumps no derivative exists.
+    The operator may be any pytree, defined by the seven functions below. Derivatives assume that the rank is constant nearby;
+    where it jumps, no derivative exists.
 
     Args:
         rank_tol: threshold of the rank, relative to the method's scale of D; None: rounding.
@@ -82,15 +83,15 @@ class Pseudoinverse(PrintsLine):
             raise ValueError("an absolute rank threshold has no default: give rank_tol, in the units of the matrix")
 
     @classmethod
-    def absolute(cls, rank_tol: Scalar, **choices: object) -> Self:
-        """Threshold in the units of D, whatever its size. The paper's own rule takes the tolerance of the integration."""
+    def absolute(cls, rank_tol: NumberLike, **choices: object) -> Self:
+        """Return the method with a threshold in the units of D. The paper uses the tolerance of the integration."""
         return cls(rank_tol=rank_tol, relative=False, **choices)
 
     # The functions of a method. They are linear in b, x, c and y, and written in ordinary jax.numpy.
 
     @abstractmethod
     def admit(self, D: Operator) -> Operator:
-        """Return the operator as arrays; raise an error that names the method where it is not one."""
+        """Return the operator as arrays; raise an error that names the method if it is not valid."""
 
     @abstractmethod
     def shape(self, D: Operator) -> tuple[int, int]:
@@ -132,7 +133,7 @@ class Pseudoinverse(PrintsLine):
         return LeastSquaresSolution(plus @ jnp.asarray(b), plus.rank)
 
     def rank(self, D: Operator) -> Int[Array, ""]:
-        """Return the numerical rank: how many directions lie above the threshold."""
+        """Return the numerical rank: the number of directions above the threshold."""
         return self.plus(D).rank
 
     def __call__(self, D: Operator) -> Float[Array, "n m"]:
@@ -168,7 +169,7 @@ class Dense(Pseudoinverse):
     def threshold(self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None) -> Float[Array, ""]:
         """Return the threshold at or below which a singular value, or its substitute in this method, counts as zero.
 
-        Where no `rank_tol` is given: `default`, else max(m, n) eps: rounding errors of a factorization relative to its matrix.
+        Without a `rank_tol` it is `default`, else max(m, n) eps: the relative rounding error of a factorization.
         """
         if self.rank_tol is None:
             return scale * (max(D.shape) * float(jnp.finfo(D.dtype).eps) if default is None else default)
@@ -177,7 +178,7 @@ class Dense(Pseudoinverse):
 
 
 def exceeds(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
-    """Return whether a size counts. NaN counts: an invalid matrix gives NaN, not a rank of zero and a plausible answer."""
+    """Return whether a size counts as nonzero. NaN does: an invalid matrix gives NaN, not rank zero and a plausible answer."""
     return ~(size <= threshold)
 
 
@@ -220,9 +221,9 @@ class Plus(eqx.Module):
 #
 # Only D^+ and its transpose are applied, by the factors at hand; no difference of singular values is ever divided by. Since
 # (D^+)^T = (D^T)^+, the same rule holds for the transpose, with D and D^T exchanged. And D^+ b is linear in b with the
-# transpose D^+^T: this is all that reverse mode wants to know. Both rules are written with D^+ applied, and so are
-# themselves differentiable: this gives all higher orders. It is a primitive of its own because a jax.custom_jvp is
-# forgotten in the linear part of a reverse pass, whose second derivative would then go through the factorization.
+# transpose D^+^T, which is all that reverse mode needs. Both rules apply D^+, and so are themselves differentiable, to any
+# order. This is a primitive because a jax.custom_jvp is lost in the linear part of a reverse pass, whose second derivative
+# would then go through the factorization.
 
 
 def _apply(plus: Plus, b):
@@ -241,7 +242,7 @@ def _shape_of_apply(plus, b):
 def _derivative(primals, tangents):
     plus, b = primals
     d_plus, db = tangents
-    dD = d_plus.matrix  # factors and method carry no tangent: they are functions of D, and its tangent says all
+    dD = d_plus.matrix  # factors and method carry no tangent: as functions of D they follow its tangent
     x = _bind(plus, b)
     s = jnp.zeros_like(b) if db is None else db
     if not jtu.tree_leaves(dD):

@@ -12,15 +12,15 @@ class SVDFactors(NamedTuple):
     """D^+ = V S^+ U^T."""
 
     u: Float[Array, "m k"]
-    inverse: Float[Array, "k"]  # 1/sigma, zero for what is truncated
+    inverse: Float[Array, "k"]  # 1/sigma, zero where truncated
     v: Float[Array, "n k"]
     rank: Int[Array, ""]
 
 
 class SVD(Dense):
-    """D = U S V^T, D^+ = V S^+ U^T: the reference, and the only method whose threshold meets the singular values themselves.
+    """D = U S V^T, D^+ = V S^+ U^T: the reference, and the only method whose threshold applies to the singular values themselves.
 
-    Error of the order of eps cond(D), cond over the kept singular values.
+    The error is of the order of eps cond(D), cond taken over the kept singular values.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> SVDFactors:

@@ -21,7 +21,7 @@ from udkjax.positions.channels import POINT_UNITS as POINT_UNITS
 from udkjax.positions.channels import RATES as RATES
 from udkjax.positions.channels import UNITS as UNITS
 from udkjax.positions.channels import Channel as Channel
-from udkjax.positions.channels import Point as Point
+from udkjax.positions.channels import LocalPoint as LocalPoint
 from udkjax.positions.channels import Quantity as Quantity
 from udkjax.positions.channels import StateHistory as StateHistory
 from udkjax.positions.channels import channel_of as channel_of

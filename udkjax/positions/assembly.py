@@ -20,7 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.annotations import Numbers, Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
@@ -92,7 +92,7 @@ class Closure(NamedTuple):
 
 @checked
 def assemble(
-    mechanism: Mechanism, t: Scalar = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
+    mechanism: Mechanism, t: NumberLike = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
 ) -> State:
     """Close a mechanism at time t (s), from `state` or from the initial guess of its bodies.
 
@@ -109,7 +109,7 @@ def assemble(
 
 def close(
     mechanism: Mechanism,
-    t: Scalar = 0.0,
+    t: NumberLike = 0.0,
     state: State | None = None,
     analysis: Analysis | None = None,
 ) -> Closure:
@@ -154,7 +154,7 @@ def _close_concrete(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarra
     return SparseRows(mechanism).assemble(t, q, v)
 
 
-def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | None) -> Closure:
+def _close(mechanism: Mechanism, analysis: Analysis, t: NumberLike, state: State | None) -> Closure:
     guess = State(mechanism.q0, mechanism.v0) if state is None else state
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
     close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
@@ -166,7 +166,7 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: Scalar, state: State | N
 _close_compiled = deferred(_close)
 
 
-def require_closed(mechanism: Mechanism, closure: Closure, t: Scalar = 0.0, guess: State | None = None) -> None:
+def require_closed(mechanism: Mechanism, closure: Closure, t: NumberLike = 0.0, guess: State | None = None) -> None:
     """Raise an `AssemblyError` where a closure at time t (s) from a guess is not closed; traced values pass."""
     closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:

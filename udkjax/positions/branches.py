@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import Scales
 from udkjax.positions.assembly import State, close
@@ -22,10 +22,10 @@ from udkjax.scene.mechanism import Mechanism
 def branches(
     mechanism: Mechanism,
     driver: Drive,
-    value: Scalar,
+    value: NumberLike,
     starts: int = 400,
     seed: int = 0,
-    held: Mapping[str, Scalar] | None = None,
+    held: Mapping[str, NumberLike] | None = None,
 ) -> Float[Array, "k bodies 3"]:
     """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
 

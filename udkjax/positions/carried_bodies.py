@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSED_TOL
@@ -59,7 +59,7 @@ class CarriedBodies(NamedTuple):
         return xp.where(is_reached, found, xp.inf)
 
 
-def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping[str, Scalar] | None) -> CarriedBodies:
+def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping[str, NumberLike] | None) -> CarriedBodies:
     """Return the bodies that hang on a single other one, where something is free to move while a coordinate is driven.
 
     Where all numbers of a mechanism are traced it is not known what is free: none.

@@ -19,15 +19,16 @@ from typing import Literal, Protocol
 
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Numbers
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import number
 from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism
 
 Needs = Literal["states", "accelerations", "reactions"]
-Point = tuple[float, float]  # in a body's own frame (m)
-_CENTRE: Point = (0.0, 0.0)  # of mass: the origin of a body's frame
+LocalPoint = tuple[float, float]  # in a body's own frame (m)
+_CENTRE: LocalPoint = (0.0, 0.0)  # of mass: the origin of a body's frame
 POINT_UNITS = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s2", "ay": "m/s2"}
 _ANGLE_UNITS = {"angle": "rad", "omega": "rad/s", "alpha": "rad/s2"}
 LOADS = {"fx": "N", "fy": "N", "torque": "N m"}
@@ -59,7 +60,7 @@ class Channel:
     section: str  # body, joint, pin, driver or distance
     owner: str  # the joint or driver; else empty
     bodies: tuple[str, ...]  # the bodies that it belongs to: two for an angle at a joint, or a distance
-    points: tuple[Point, ...] = ()  # of each body
+    points: tuple[LocalPoint, ...] = ()  # of each body
     quantity: str = ""
 
 
@@ -253,7 +254,7 @@ def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
     raise ValueError(f"no {kind} named {quote(given)}{suggestion(given, names) or known}")
 
 
-def _split_point(text: str, default: Point | None = None) -> tuple[Point, str]:
+def _split_point(text: str, default: LocalPoint | None = None) -> tuple[LocalPoint, str]:
     """Split a text into the point that it begins with and what follows it."""
     if not text.startswith("("):
         if default is None:
@@ -277,5 +278,5 @@ def _check_quantity(owner: str, text: str, known: Iterable[str], more: Iterable[
     raise ValueError(f"{owner} has no {quote(name)}{near}" if name else f"{owner}: name one of {', '.join([*known, *more])}")
 
 
-def _with_point(name: str, point: Point) -> str:
+def _with_point(name: str, point: LocalPoint) -> str:
     return f"{name}({point[0]!r}, {point[1]!r})"

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from udkjax.annotations import Number
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, TracedRows, close_position, damped_step
 from udkjax.equations.scales import Scales
@@ -14,7 +15,6 @@ from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
 from udkjax.positions import native_closing
 from udkjax.scene.drivers import Motion
-from udkjax.scene.fields import Number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.linear_map import DifferentiableFunction, Linear
 from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
@@ -50,8 +50,8 @@ def close_by_machine_code(
     mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
 ) -> Closed:
     """Return the same as `close_by_jax`, by machine code."""
-    guess, xs = split_numbers((mechanism, analysis, t, q, v))
-    return _close_by_code(AssemblyFunction(guess), xs)
+    guess, inputs = split_numbers((mechanism, analysis, t, q, v))
+    return _close_by_code(AssemblyFunction(guess), inputs)
 
 
 class AssemblyFunction(DifferentiableFunction):
@@ -68,42 +68,44 @@ class AssemblyFunction(DifferentiableFunction):
         """True where machine code has second derivatives: where no rows contradict each other beside the manifold."""
         return self.guess.rest[1].redundant_rows == ()
 
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        return list(close_by_jax(*self.guess(xs))[:2])
+    def __call__(self, inputs: list[Array]) -> list[Array]:
+        return list(close_by_jax(*self.guess(inputs))[:2])
 
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        *_, q, v = self.guess(xs)
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
+        *_, q, v = self.guess(inputs)
         return [q.shape, v.shape]
 
-    def forward(self, xs: list[Array], has_tangent: Mask, vs: list[Array], run: PyTree) -> list[Array]:
-        guess, which = self._native(xs, has_tangent)
+    def forward(self, inputs: list[Array], has_tangent: Mask, tangents: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(inputs, has_tangent)
         if guess is None:
-            return super().forward(xs, has_tangent, vs, run)
-        change = self.guess.changes(has_tangent, vs)
+            return super().forward(inputs, has_tangent, tangents, run)
+        change = self.guess.changes(has_tangent, tangents)
         return list(native_closing.close_jvp(guess, _native_inputs(which), _native_inputs(change)))
 
-    def backward(self, xs: list[Array], has_tangent: Mask, ws: list[Array], run: PyTree) -> list[Array]:
-        guess, which = self._native(xs, has_tangent)
+    def backward(self, inputs: list[Array], has_tangent: Mask, cotangents: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(inputs, has_tangent)
         if guess is None:
-            return super().backward(xs, has_tangent, ws, run)
-        found = native_closing.close_vjp(guess, _native_inputs(which), *ws)
+            return super().backward(inputs, has_tangent, cotangents, run)
+        found = native_closing.close_vjp(guess, _native_inputs(which), *cotangents)
         pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
         return [bar for m, bar in pairs if m is True]
 
-    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
-        guess, which = self._native(xs, tuple(map(operator.or_, active, others)))
+    def twice(
+        self, inputs: list[Array], active: Mask, tangents: list[Array], others: Mask, other_tangents: list[Array]
+    ) -> list[Array]:
+        guess, which = self._native(inputs, tuple(map(operator.or_, active, others)))
         if guess is None or not self._has_second:
-            return super().twice(xs, active, vs, others, us)
+            return super().twice(inputs, active, tangents, others, other_tangents)
         changes = (
             (_native_inputs(self.guess.marks(mask)), _native_inputs(self.guess.changes(mask, dxs)))
-            for mask, dxs in ((active, vs), (others, us))
+            for mask, dxs in ((active, tangents), (others, other_tangents))
         )
         return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
 
-    def _native(self, xs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
+    def _native(self, inputs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
         """Return the arguments of machine code and the inputs with tangents; None where it has no such derivatives."""
         which = self.guess.marks(has_tangent)
-        mechanism, analysis, t, q, v = self.guess(xs)
+        mechanism, analysis, t, q, v = self.guess(inputs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
         if others or not native_closing.can_close(mechanism):
             return None, None
@@ -117,17 +119,17 @@ def _native_inputs(tree: PyTree) -> PyTree:
 
 
 @eqx.filter_custom_jvp
-def _close_by_code(function: AssemblyFunction, xs: list[Array]) -> Closed:
-    mechanism, analysis, t, q, v = function.guess(xs)
+def _close_by_code(function: AssemblyFunction, inputs: list[Array]) -> Closed:
+    mechanism, analysis, t, q, v = function.guess(inputs)
     return native_closing.close(mechanism, analysis.scales, t, q, v)
 
 
 @_close_by_code.def_jvp
 def _(primals, tangents):
-    function, xs = primals
-    found = _close_by_code(function, xs)
+    function, inputs = primals
+    found = _close_by_code(function, inputs)
     has_tangent = tuple(dx is not None for dx in tangents[1])
-    linear = Linear(function=function, xs=xs, run=(), active=has_tangent)
+    linear = Linear(function=function, inputs=inputs, run=(), active=has_tangent)
     return found, (*linear.applied(select(tangents[1], has_tangent)), None, None, None)
 
 

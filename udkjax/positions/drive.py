@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
@@ -26,7 +26,7 @@ from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import Numbers, is_traced, names, number, number_called
+from udkjax.scene.fields import is_traced, names, number, number_called
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
 from udkjax.scene.wording import join_names
@@ -76,7 +76,7 @@ class ValueMotion(Motion):
 
     origin: Float[Array, ""] = eqx.field(converter=number_called("origin"), default=0.0)
 
-    def __call__(self, t: Scalar) -> Float[Array, ""]:
+    def __call__(self, t: NumberLike) -> Float[Array, ""]:
         return self.origin + t
 
 
@@ -106,7 +106,7 @@ class Driven(NamedTuple):
         return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
 
 
-def drive(mechanism: Mechanism, driver: Drive, t: Scalar = 0.0, held: Mapping[str, Scalar] | None = None) -> Driven:
+def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mapping[str, NumberLike] | None = None) -> Driven:
     """Return the mechanism driven by one coordinate; other drivers hold the value that they have at time t (s).
 
     `held` gives other values, of drivers or of further coordinates, by their names. Raises `SceneError` where there is no such
@@ -117,7 +117,7 @@ def drive(mechanism: Mechanism, driver: Drive, t: Scalar = 0.0, held: Mapping[st
         return _drive(*given)
 
 
-def _drive(mechanism: Mechanism, driver: Drive, t: Scalar, held: Mapping[str, Scalar] | None) -> Driven:
+def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str, NumberLike] | None) -> Driven:
     if driver is None:
         if held:
             problem = "held is given with driver=None, where all drivers go along time: name the one that drives"
@@ -227,7 +227,7 @@ def choose_name(name: str, taken: Container[str]) -> str:
     return name
 
 
-def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar) -> Mechanism:
+def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberLike) -> Mechanism:
     """Return the mechanism with a driver of this name that goes along its own value; all others hold theirs."""
     concrete = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
@@ -235,12 +235,12 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: Scalar)
     return with_drivers(mechanism, {**_halted(mechanism, t), name: element.driver(ValueMotion())}, origin=origin)
 
 
-def with_halted_drivers(mechanism: Mechanism, t: Scalar) -> Mechanism:
+def with_halted_drivers(mechanism: Mechanism, t: NumberLike) -> Mechanism:
     """Return the mechanism whose drivers stand still where they are at time t (s)."""
     return with_drivers(mechanism, _halted(mechanism, t))
 
 
-def _halted(mechanism: Mechanism, t: Scalar) -> dict[str, Driver]:
+def _halted(mechanism: Mechanism, t: NumberLike) -> dict[str, Driver]:
     return {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
 
 
@@ -295,7 +295,7 @@ def _constant(value: Numbers) -> Polynomial:
     return Polynomial(jnp.stack([value]) if isinstance(value, Tracer) else np.reshape(value, 1))
 
 
-def _value_or(x: Scalar, otherwise: float) -> Scalar:
+def _value_or(x: NumberLike, otherwise: float) -> NumberLike:
     return otherwise if isinstance(x, Tracer) else x
 
 

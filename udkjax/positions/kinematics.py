@@ -1,7 +1,6 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.positions.assembly import State, assemble
@@ -26,14 +25,12 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import Numbers, library_for, number, stored
+from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
 UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
 FULL_TURN = 2.0 * np.pi  # rad
-
-Rows: TypeAlias = Float[Array, "T n"]
 
 
 class Kinematics(PrintsTable):
@@ -150,7 +147,7 @@ def kinematics(
     state: State | None = None,
     rate: Float[ArrayLike, "*T"] = 1.0,
     acceleration: Float[ArrayLike, "*T"] = 0.0,
-    held: Mapping[str, Scalar] | None = None,
+    held: Mapping[str, NumberLike] | None = None,
 ) -> Kinematics:
     """Return the positions Psi(s, q) = 0 of a mechanism over the values s of a driver, one after another on one branch.
 
@@ -194,7 +191,9 @@ def kinematics(
 
 
 @checked
-def travel(mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, Scalar] | None = None) -> Travel:
+def travel(
+    mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, NumberLike] | None = None
+) -> Travel:
     """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
 
     Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. Bodies that hang on a single other
@@ -235,7 +234,7 @@ def _kinematics(
     return Kinematics(values, q, v, a, rate, points.status, points.limit, limit_q, bodies, unit)
 
 
-def _travel(driven: Driven, q: Float[Array, "n"], far: Scalar, by: ControlFlow) -> Travel:
+def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFlow) -> Travel:
     xp, s = by.xp, driven.value(q)
     ways = xp.array([-1.0, 1.0])
     down_up = by.vmap(lambda way: _solve(driven, s, q, stop_gradients(xp.asarray(s + way * far)[None]), by, False))(ways)
@@ -246,7 +245,7 @@ def _travel(driven: Driven, q: Float[Array, "n"], far: Scalar, by: ControlFlow) 
 
 
 def _start(
-    mechanism: Mechanism, driver: Drive, start: Scalar, state: State | None, held: Mapping[str, Scalar] | None
+    mechanism: Mechanism, driver: Drive, start: NumberLike, state: State | None, held: Mapping[str, NumberLike] | None
 ) -> tuple[Driven, Float[Array, "n"]]:
     """Return the mechanism driven, and the closed position that it starts from; at time `start`, if that drives it."""
     driven = drive(mechanism, driver, 0.0, held)
@@ -259,7 +258,7 @@ def _start(
     return driven, q
 
 
-def _assemble(mechanism: Mechanism, t: Scalar, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
+def _assemble(mechanism: Mechanism, t: NumberLike, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
     q = assemble(mechanism, t, state, throw=False, analysis=analysis).q
     return library_for(q).ravel(q)
 

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
+from udkjax.annotations import NumberLike, NumericArray
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.position_operations import March
@@ -17,8 +18,6 @@ from udkjax.native.primitive import call_concrete, native_p, unsupported
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
-Scalar = Float[ArrayLike, ""]
-Vector = Float[Array, "..."] | Float[np.ndarray, "..."]
 APPROACH = 16  # steps from where the mechanism is to the first value
 MOST_KNOTS = 100  # of motions by splines: their programs are whole, and take 10 ms to compile for each
 DEPENDENT = 1e-10  # of a row's square: the rest of a row that depends on others; march ends long before
@@ -47,7 +46,9 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis).code)
 
 
-def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
+def march(
+    mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
+) -> MarchResult:
     """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
 
     The mechanism's driver has the value for its time; `unit` is what values are measured by.
@@ -56,7 +57,9 @@ def march(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: 
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
-def march_at_once(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector) -> MarchResult:
+def march_at_once(
+    mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
+) -> MarchResult:
     """Follow the positions with known numbers, by NumPy: nothing is traced or compiled for it."""
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
@@ -73,7 +76,15 @@ def _march(found: Sequence, xp: ModuleType) -> MarchResult:
     return MarchResult(q, dq, ddq, side, found[3][0, 0], xp.maximum(found[4][0, 0].astype(int) - APPROACH, 0))
 
 
-def _inputs(mechanism: Mechanism, analysis: Analysis, unit: Scalar, s: Scalar, q: Vector, values: Vector, xp: ModuleType) -> list:
+def _inputs(
+    mechanism: Mechanism,
+    analysis: Analysis,
+    unit: NumberLike,
+    s: NumberLike,
+    q: NumericArray,
+    values: NumericArray,
+    xp: ModuleType,
+) -> list:
     scales = analysis.scales
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
     ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
@@ -88,7 +99,7 @@ def _without_loads(mechanism: Mechanism) -> Mechanism:
     return mechanism.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in loads.items()})
 
 
-def _of_unit_masses(mechanism: Mechanism, length: Scalar, xp: ModuleType) -> Mechanism:
+def _of_unit_masses(mechanism: Mechanism, length: NumberLike, xp: ModuleType) -> Mechanism:
     """Return bodies of 1 kg and the characteristic length for radius of gyration: positions do not depend on masses."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
     one = xp.ones_like(length)

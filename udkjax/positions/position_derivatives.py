@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from udkjax.annotations import TimeSeries
 from udkjax.equations.control_flow import sequential
 from udkjax.native.base.host_function import call_seldom
 from udkjax.pinv.linear_primitive import linear_primitive
@@ -34,8 +35,7 @@ from udkjax.transforms.gradients import stop_gradients
 RESIDUE = 1e-6
 MOST_MEETINGS = 8  # values of a call where branches meet: at others, derivatives by what moves the constraints are not numbers
 
-Rows = Float[Array, "T n"]
-Three = tuple[Rows, Rows, Rows]  # of q, q' and q''
+Three = tuple[TimeSeries, TimeSeries, TimeSeries]  # of q, q' and q''
 
 
 def with_derivatives(curve: Curve, values: Float[Array, "T"], points: Points, regular: Bool[Array, "T"]) -> Three:

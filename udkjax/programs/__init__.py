@@ -1,4 +1,4 @@
-"""JAX programs evaluated by NumPy, and programs that wait for their compilation."""
+"""JAX programs evaluated by NumPy, and programs whose compilation is deferred."""
 
 from udkjax.lazy_names import lazy_names
 

@@ -1,19 +1,19 @@
-"""Programs that are compiled when they have been called often: before that NumPy evaluates them (numpy_program.py).
+"""Programs that NumPy evaluates at first (numpy_program.py), and that are compiled once they have been called often.
 
-XLA takes some two milliseconds to compile an operation, NumPy two microseconds to evaluate it, and who asks for one derivative
-waits for the first alone. So a program is evaluated by NumPy until that has taken as many operations as compiling is worth; from
-then on XLA's program serves. Both agree to rounding.
+XLA takes about two milliseconds to compile an operation, and NumPy two microseconds to evaluate it: a program that runs once is
+faster without compilation. NumPy therefore evaluates a program until this has cost as much as compiling it; from then on the
+compiled program runs. Both agree to rounding.
 
-To JAX such a program is one operation, whose derivatives and batches are such programs again.
+For JAX such a program is one operation, whose derivatives and batches are again deferred programs.
 
-Everything in the package that is to be done once, and what it is for:
+All means of avoiding repeated work in the package, and their uses:
 
     deferred                        a program that users wait for: NumPy evaluates it at first
-    deferred_if_traced              the same, of a function whose concrete numbers decide something, or are checked
+    deferred_if_traced              likewise, for a function that checks or branches on concrete numbers
     traced_once                     a function that larger programs call many times: one trace, compiled within each of them
-    equations.control_flow.solve    an algorithm too long to trace: Python's loops where all is concrete, else one program
-    native call_seldom              a part of a compiled program that is hardly ever reached: NumPy evaluates it there
-    scene cached_by_identity        a result that no number changes: found again for the same objects, without any program
+    equations.control_flow.solve    an algorithm too long to trace: Python loops if everything is concrete, else one program
+    native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
+    scene cached_by_identity        a result that does not depend on numbers: cached by the identity of objects
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -35,15 +35,15 @@ from udkjax.programs.varying_axes import varies
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-WORTH = 700  # evaluations by NumPy, 2 to 3 us an operation, that take as long as compiling it, 2 ms
-MOST = 400_000  # operations that NumPy takes before any program is compiled: about a second
-_SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # of those, by program
+WORTH = 700  # evaluations by NumPy (2 to 3 us per operation) that take as long as compilation (2 ms per operation)
+MOST = 400_000  # operations evaluated by NumPy before any program is compiled: about a second
+_SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # operations evaluated by NumPy so far, by program
 
 
 def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function of trees of arrays and of static values, traced once for each structure as by `equinox.filter_jit`.
+    """Return a deferred version of a function of trees of arrays and static values, traced once per structure (`filter_jit`).
 
-    Where it is not within a program that is compiled as a whole, NumPy evaluates it and its derivatives and batches at first.
+    Outside of compiled programs, NumPy evaluates it, its derivatives and its batches at first.
     """
     by_jit = eqx.filter_jit(function)
     if deferred_p is None:
@@ -53,13 +53,13 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if jax.config.jax_disable_jit:
             return function(*args, **kwargs)
-        if any(varies(x) for x in jax.tree.leaves((args, kwargs))):  # within a program of devices, whose types say so
+        if any(varies(x) for x in jax.tree.leaves((args, kwargs))):  # within `shard_map`, by the types of its values
             return by_jit(*args, **kwargs)
         try:
             program, leaves, out = trace_once(function, args, kwargs)
         except _ClosesOverError:
             return by_jit(*args, **kwargs)
-        # Bound, JAX would trace a program with rules of derivatives again, to leave them out before it is evaluated.
+        # Binding would make JAX retrace a program with custom derivative rules, to remove them before evaluation.
         is_concrete = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
         found = (_evaluate if is_concrete else deferred_p.bind)(*leaves, call_jaxpr=program)
         return out.rebuild(found)
@@ -70,7 +70,7 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 def trace_once(
     function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
 ) -> "tuple[Any, list[Any], Out]":
-    """Return the program of a function, traced once for each structure of its arguments, their arrays, and the result's form."""
+    """Return the program of a function, traced once per structure of its arguments, their arrays, and the form of the result."""
     dynamic, static = eqx.partition((args, kwargs or {}), _is_array)
     leaves, tree = jax.tree.flatten(dynamic)
     fixed, fixed_tree = jax.tree.flatten(static)
@@ -80,9 +80,9 @@ def trace_once(
 
 
 def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return the same of a function whose known numbers decide something, or are checked: they stay known.
+    """Like `deferred`, for a function that checks or branches on concrete numbers: they stay concrete within it.
 
-    So do NumPy's results of these alone. Where nothing is traced, the function itself is called.
+    So do results that depend only on these. If nothing is traced, the function itself is called.
     """
 
     call: Callable[..., Any] = function
@@ -109,10 +109,10 @@ def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Argume
 
 
 def traced_once(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function of a mechanism and of numbers that is traced once for each structure, however often programs take it.
+    """Return a function of a mechanism and of numbers that is traced once per structure, however often programs call it.
 
-    One program takes Psi, its Jacobian and the loads dozens of times: in each stage, in projection, under each derivative. JAX
-    finds the trace of a function under `jit` again, and of its derivatives and batches too.
+    One program calls Psi, its Jacobian and the loads dozens of times: in each stage, in projection, under each derivative. JAX
+    caches the trace of a function under `jit`, and of its derivatives and batches.
     """
     program: Callable[..., Any] = eqx.filter_jit(function)
 
@@ -124,12 +124,12 @@ def traced_once(function: Callable[Arguments, Result]) -> Callable[Arguments, Re
 
 
 def _as_traced(value: Any) -> Any:
-    """Return a mechanism without its origin, and numbers as arrays: neither is part of what is traced."""
+    """Return a mechanism without its origin, and numbers as arrays: neither affects the trace."""
     return value.without_origin if isinstance(value, eqx.Module) else jnp.asarray(value, jnp.result_type(float))
 
 
 class _ConcreteLeaf:
-    """A number, or anything else that is not traced, compared by its content: what is traced for it serves its equals."""
+    """A concrete number or any other object, compared by content, so that equal ones share traces."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -146,7 +146,7 @@ class _ConcreteLeaf:
 
 
 class _Rest:
-    """The part of a result that is known, and no part of a program."""
+    """The part of a result that is not traced, and not part of a program."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -161,17 +161,17 @@ def _is_array(x: Any) -> bool:
 
 
 class _ClosesOverError(Exception):
-    """A function among the arguments knows numbers that are traced: results for it serve no other call."""
+    """A function among the arguments closes over traced numbers: its program cannot be reused."""
 
 
 class Out:
-    """The form of a result: the tree of its arrays, and all else."""
+    """The form of a result: the tree of its arrays, and its static part."""
 
     tree: Any
     static: Any
 
     def rebuild(self, arrays: Sequence[Any]) -> Any:
-        """Return the result of these arrays."""
+        """Return the result with these arrays."""
         return eqx.combine(jax.tree.unflatten(self.tree, arrays), self.static)
 
 
@@ -179,7 +179,7 @@ class Out:
 def _trace(
     function: Callable[..., Any], tree: Any, fixed: tuple[Hashable, ...], fixed_tree: Any, types: tuple[Any, ...], x64: bool
 ) -> tuple[Any, Out]:
-    del x64  # a trace is of it
+    del x64  # only part of the key of the cache
     out = Out()
 
     def flat(*leaves: Array) -> list[Array]:
@@ -221,7 +221,7 @@ def _compiled(program: Any) -> Callable[..., list[Array]]:
     return jax.jit(jax.extend.core.jaxpr_as_fun(program))
 
 
-_make = getattr(jax.extend.core, "create_call_primitive", None)  # of JAX 0.12 on
+_make = getattr(jax.extend.core, "create_call_primitive", None)  # from JAX 0.12 on
 deferred_p: Any = None if _make is None else _make("deferred_program")
 if deferred_p is not None:
     deferred_p.def_impl(_evaluate)

@@ -1,4 +1,4 @@
-"""Indexing operations of JAX's programs by NumPy: slices, gathers and scatters."""
+"""Indexing operations of JAX programs in NumPy: slices, gathers and scatters."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from jax.lax import GatherScatterMode
 
 
 def dynamic_slice(x: np.ndarray, *starts: Any, slice_sizes: Sequence[int]) -> np.ndarray:
-    """Return a slice of a known size, moved into the array where it would leave it."""
+    """Return a slice of a fixed size, shifted to lie within the array."""
     return x[_window(np.shape(x), starts, slice_sizes)]
 
 
@@ -50,7 +50,7 @@ def gather(
 
 
 def scatter(combine: Callable[[np.ndarray, Any, np.ndarray], None]) -> Callable[..., np.ndarray]:
-    """Return XLA's operation Scatter, which changes slices of an array; `combine(array, places, updates)` changes entries."""
+    """Change slices of an array (XLA's operation Scatter); `combine(array, places, updates)` changes entries."""
 
     def apply(
         x: np.ndarray, indices: np.ndarray, updates: np.ndarray, dimension_numbers: Any, mode: GatherScatterMode, **_: Any
@@ -91,9 +91,9 @@ def _places(
     sizes: Sequence[int],
     mode: GatherScatterMode,
 ) -> tuple[int, np.ndarray | None, tuple[np.ndarray, ...]]:
-    """Return the number of batch dimensions, which slices lie inside (None: all), and the index of each entry in each dimension.
+    """Return the number of batch dimensions, the slices that lie inside (None: all), and each entry's index in each dimension.
 
-    Entries have the batch dimensions of `indices` first, then those of the slices.
+    Entries have the batch dimensions of `indices` first, then the dimensions of the slices.
     """
     indices = np.asarray(indices)
     batch_shape, batch = indices.shape[:-1], indices.ndim - 1

@@ -1,7 +1,7 @@
-"""Programs of JAX evaluated by NumPy, operation by operation: without the seconds that XLA takes to compile them.
+"""Evaluate JAX programs by NumPy, operation by operation, without the seconds that XLA takes to compile them.
 
-Loops and branches are those of Python. An operation that NumPy has no rule for is expanded into others where it can be, else JAX
-compiles it by itself.
+Loops and branches run in Python. An operation without a NumPy rule is expanded into others if possible; otherwise JAX compiles it
+alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,31 +15,30 @@ from jax.extend.core import Jaxpr, Literal, Primitive, jaxprs_in_params
 
 from udkjax.programs.numpy_rules import RULES
 
-Arrays = list[Any]
-Step = tuple[Callable[..., Any], list[int], Any]  # a function, the places of its arguments, and that or those of its results
-ENTRIES = 2_000  # of an array that NumPy takes as long for as for an operation by itself
-PLAIN = (np.dtype(float), np.dtype(int), np.dtype(bool))  # types that NumPy keeps in every operation
+Step = tuple[Callable[..., Any], list[int], Any]  # a function, and the indices of its arguments and of its result or results
+ENTRIES = 2_000  # of an array that cost NumPy as much time as the overhead of an operation
+PLAIN = (np.dtype(float), np.dtype(int), np.dtype(bool))  # dtypes that every NumPy operation preserves
 
 _EXPANSIONS: dict[Primitive, Callable[..., Callable[..., Any]]] = {}
 _EVALUATIONS: dict[Primitive, Callable[..., Any]] = {}
 
 
 def expand_as(primitive: Primitive, function: Callable[..., Callable[..., Any]]) -> None:
-    """Let a primitive be the operations of `function(**parameters)`, a function of arrays that JAX can trace."""
+    """Expand a primitive into the operations of `function(**parameters)`, a function of arrays that JAX can trace."""
     _EXPANSIONS[primitive] = function
 
 
 def evaluate_as(primitive: Primitive, function: Callable[..., Any]) -> None:
-    """Let a primitive be a function of arrays of NumPy and of its parameters."""
+    """Evaluate a primitive by a function of NumPy arrays and of its parameters."""
     _EVALUATIONS[primitive] = function
 
 
 class TooLongError(Exception):
-    """A program has taken more operations than it may."""
+    """A program exceeds its limit of operations."""
 
 
 class Meter:
-    """Counts operations, of many entries as several, and ends an evaluation that takes more than `limit`."""
+    """Counts operations (large arrays as several), and ends an evaluation that exceeds `limit`."""
 
     def __init__(self, limit: float):
         self.count, self.limit = 0, limit
@@ -51,11 +50,11 @@ class Meter:
 
 
 class NumpyProgram:
-    """A program of JAX, as steps of NumPy."""
+    """A JAX program as NumPy steps."""
 
     def __init__(self, jaxpr: Jaxpr, constants: Sequence[Any]):
         self._places: dict[Any, int] = {}
-        self._memory: Arrays = []
+        self._memory: list[Any] = []
         self._inputs = [self._place(v) for v in jaxpr.invars]
         for v, x in zip(jaxpr.constvars, constants, strict=True):
             self._memory[self._place(v)] = np.asarray(x)
@@ -77,8 +76,8 @@ class NumpyProgram:
             self._memory.append(None)
         return self._places[v]
 
-    def __call__(self, meter: Meter, inputs: Sequence[Any]) -> Arrays:
-        """Return the results for some inputs, arrays of NumPy."""
+    def __call__(self, meter: Meter, inputs: Sequence[Any]) -> list[Any]:
+        """Return the results for inputs that are NumPy arrays."""
         meter.add(self._cost)
         memory = self._memory.copy()
         for place, x in zip(self._inputs, inputs, strict=True):
@@ -98,13 +97,13 @@ def _type(v: Any) -> Any:
 
 
 def count_operations(jaxpr: Any) -> int:
-    """Return the number of operations of a program, with those of its loops and branches once each."""
+    """Return the number of operations of a program, counting bodies of loops and branches once."""
     inner = (x for e in jaxpr.eqns for x in jaxprs_in_params(e.params))
     return len(jaxpr.eqns) + sum(map(count_operations, inner))
 
 
 def has_rules(jaxpr: Any) -> bool:
-    """Return True if NumPy knows all operations of a program: for others JAX is called."""
+    """Return True if NumPy has rules for all operations of a program, so that JAX is never called."""
 
     def has_rule(equation: Any) -> bool:
         primitive = equation.primitive
@@ -120,7 +119,7 @@ _PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()
 
 
 def numpy_program(jaxpr: Any) -> NumpyProgram:
-    """Return a program of JAX as one of NumPy, with its constants where it is a closed one; the same for the same."""
+    """Return the NumPy program of a jaxpr, with its constants if it is closed; cached."""
     found = _PROGRAMS.get(jaxpr)
     if found is None:
         parts = (jaxpr.jaxpr, jaxpr.consts) if hasattr(jaxpr, "consts") else (jaxpr, ())
@@ -132,7 +131,7 @@ def numpy_program(jaxpr: Any) -> NumpyProgram:
 
 
 def _step_of(equation: Any) -> Callable[..., Any]:
-    """Return a function of a meter and of arrays for an operation of a program."""
+    """Return the function of a meter and arrays for one operation."""
     primitive, parameters = equation.primitive, equation.params
     if primitive in _EVALUATIONS:
         return lambda _, *xs: _EVALUATIONS[primitive](*xs, **parameters)
@@ -152,7 +151,7 @@ def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
     def step(_: Meter, *xs: Any) -> Any:
         try:
             found = rule(*xs, **parameters)
-        except np.linalg.LinAlgError:  # of singular matrices, for which XLA finds infinity
+        except np.linalg.LinAlgError:  # a singular matrix: XLA returns infinity
             found = NotImplemented
         if found is NotImplemented:
             return _by_jax(primitive, parameters, xs)
@@ -171,7 +170,7 @@ def _by_jax(primitive: Primitive, parameters: dict[str, Any], xs: Sequence[Any])
 
 
 class _Expanded:
-    """An operation that is made of others, traced when it is first evaluated; or JAX's own, where it is not."""
+    """An operation expanded into others, traced at its first evaluation; evaluated by JAX if it cannot be expanded."""
 
     def __init__(self, equation: Any):
         self._primitive, self._parameters = equation.primitive, equation.params
@@ -188,7 +187,7 @@ class _Expanded:
         return found if self._primitive.multiple_results else found[0]
 
     def trace(self) -> Any:
-        """Return the program of the others that it is made of, or None."""
+        """Return the program of the operations that it is expanded into, or None."""
         function = self._function()
         return None if function is None else jax.make_jaxpr(function)(*self._inputs)
 
@@ -196,7 +195,7 @@ class _Expanded:
         primitive, parameters = self._primitive, self._parameters
         if primitive in _EXPANSIONS:
             return _EXPANSIONS[primitive](**parameters)
-        if "_prim" in parameters:  # an operation of JAX that is defined by others
+        if "_prim" in parameters:  # a JAX primitive defined by other operations
             return parameters["_prim"].expand
         impl = primitive.impl
         if isinstance(impl, partial) or impl.__module__.startswith(("jax.", "jaxlib")):
@@ -212,7 +211,7 @@ def _call(jaxpr: Any) -> Callable[..., Any]:
 def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int, **_: Any) -> Callable[..., Any]:
     condition, body = numpy_program(cond_jaxpr), numpy_program(body_jaxpr)
 
-    def step(meter: Meter, *xs: Any) -> Arrays:
+    def step(meter: Meter, *xs: Any) -> list[Any]:
         of_condition, of_body = xs[:cond_nconsts], xs[cond_nconsts : cond_nconsts + body_nconsts]
         state = list(xs[cond_nconsts + body_nconsts :])
         while np.any(goes_on := condition(meter, [*of_condition, *state])[0]):
@@ -224,14 +223,14 @@ def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: in
 
 
 def _where(condition: np.ndarray, a: Any, b: Any) -> np.ndarray:
-    """Return a where the condition holds, else b: of a batch of loops, of which some have ended."""
+    """Select a where the condition holds, else b: in a batch of loops, some may have ended."""
     return np.where(condition.reshape(condition.shape + (1,) * (np.ndim(a) - condition.ndim)), a, b)
 
 
 def _cond(branches: Sequence[Any], **_: Any) -> Callable[..., Any]:
     programs = [numpy_program(branch) for branch in branches]
 
-    def step(meter: Meter, index: Any, *xs: Any) -> Arrays:
+    def step(meter: Meter, index: Any, *xs: Any) -> list[Any]:
         return programs[min(max(int(index), 0), len(programs) - 1)](meter, xs)
 
     return step
@@ -245,7 +244,7 @@ def _scan(jaxpr: Any, length: int, reverse: bool, **parameters: Any) -> Callable
         constants, carry = parameters["num_consts"], parameters["num_carry"]
     avals = jaxpr.out_avals[carry:]
 
-    def step(meter: Meter, *xs: Any) -> Arrays:
+    def step(meter: Meter, *xs: Any) -> list[Any]:
         fixed, state, rows = xs[:constants], list(xs[constants : constants + carry]), xs[constants + carry :]
         outputs = [np.zeros((length, *a.shape), a.dtype) for a in avals]
         for k in range(length - 1, -1, -1) if reverse else range(length):

@@ -1,6 +1,6 @@
-"""Operations of JAX's programs by NumPy: for each primitive a function of arrays and of the primitive's parameters.
+"""NumPy rules for JAX primitives: functions of arrays and of the primitive's parameters.
 
-A rule returns `NotImplemented` where it does not serve: the operation is JAX's own, then.
+A rule may return `NotImplemented`: then JAX evaluates the operation.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ def _is_inexact(x: Any) -> bool:
 
 
 def _total_less(x: Any, y: Any) -> Any:
-    """Return x < y in the total order in which NaN is the largest number, and -0 is below 0."""
+    """Return x < y in the total order in which NaN is largest and -0 is less than 0."""
     if not _is_inexact(x):
         return np.less(x, y)
     zero = (x == y) & np.signbit(x) & ~np.signbit(y)
@@ -79,7 +79,7 @@ def _reduce(function: Callable[..., Any]) -> Rule:
 
 def _extremum(function: Callable[..., Any]) -> Rule:
     def rule(x: Any, axes: Sequence[int], **_: Any) -> Any:
-        if not np.size(x):  # of which XLA's is an infinity
+        if not np.size(x):  # XLA returns an infinity
             return NotImplemented
         return function(x, axis=tuple(axes)) if axes else x
 

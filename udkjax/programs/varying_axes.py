@@ -1,4 +1,4 @@
-"""Types of the results of primitives, and inputs of one type, where values vary over the devices of `jax.shard_map`."""
+"""Types of values that vary over the devices of `jax.shard_map`, for results and inputs of primitives."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 
 def result_type(shape: Sequence[int], inputs: Sequence[Any], dtype: Any = float) -> ShapedArray:
-    """Return the type of an array that a primitive makes of inputs of these types: it varies over devices as they do."""
+    """Return the type of a primitive's result, which varies over the same devices as its inputs."""
     dtype = jnp.result_type(dtype)
     varying = max(inputs, key=_axis_count, default=None)
     if varying is None or not _axis_count(varying):
@@ -21,7 +21,7 @@ def result_type(shape: Sequence[int], inputs: Sequence[Any], dtype: Any = float)
 
 
 def vary_together(xs: Sequence[Array]) -> list[Array]:
-    """Return arrays that all vary over the devices over which any of them does: the cotangents of others are sums over these."""
+    """Make arrays vary over all devices over which any of them varies: the transpose sums cotangents over these devices."""
     if not any(map(varies, xs)):
         return list(xs)
     zero = sum(zero_of(x) for x in xs)
@@ -29,12 +29,12 @@ def vary_together(xs: Sequence[Array]) -> list[Array]:
 
 
 def varies(x: Any) -> bool:
-    """Return whether anything is an array that varies over devices."""
+    """Return True for an array that varies over devices."""
     return isinstance(x, Tracer) and _axis_count(jax.typeof(x)) > 0
 
 
 def zero_of(x: Array) -> Array | float:
-    """Return a zero that is batched, and varies over devices, as x does, by the `vmap`s around this one as well; XLA folds it."""
+    """Return a zero that is batched and varies over devices like x, also by outer `vmap`s; XLA removes it."""
     if jnp.size(x) == 0:
         return 0.0
     first = jnp.ravel(x)[0]
@@ -42,6 +42,6 @@ def zero_of(x: Array) -> Array | float:
 
 
 def _axis_count(type_: Any) -> int:
-    """Return the number of the axes of devices over which values of a type vary."""
+    """Return the number of device axes over which values of a type vary."""
     manual = getattr(type_, "manual_axis_type", None)
     return len(manual.varying) if manual is not None else 0

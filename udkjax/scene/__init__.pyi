@@ -18,7 +18,7 @@ from udkjax.scene.checks import SceneError as SceneError
 from udkjax.scene.checks import abbreviate as abbreviate
 from udkjax.scene.checks import quote as quote
 from udkjax.scene.checks import suggestion as suggestion
-from udkjax.scene.checks import traced_numbers_hold as traced_numbers_hold
+from udkjax.scene.checks import traced_numbers_are_valid as traced_numbers_are_valid
 from udkjax.scene.checks import unknown_key as unknown_key
 from udkjax.scene.description import format_pose as format_pose
 from udkjax.scene.description import poses_table as poses_table
@@ -33,12 +33,11 @@ from udkjax.scene.drivers import Motion as Motion
 from udkjax.scene.drivers import Polynomial as Polynomial
 from udkjax.scene.drivers import Sine as Sine
 from udkjax.scene.drivers import Spline as Spline
+from udkjax.scene.element_setup import attached_bodies as attached_bodies
 from udkjax.scene.fields import CALLED as CALLED
 from udkjax.scene.fields import NOT_NEGATIVE as NOT_NEGATIVE
 from udkjax.scene.fields import POSITIVE as POSITIVE
 from udkjax.scene.fields import ROUNDING as ROUNDING
-from udkjax.scene.fields import Number as Number
-from udkjax.scene.fields import Numbers as Numbers
 from udkjax.scene.fields import given_number as given_number
 from udkjax.scene.fields import is_traced as is_traced
 from udkjax.scene.fields import is_within_jit as is_within_jit
@@ -57,11 +56,10 @@ from udkjax.scene.files import save as save
 from udkjax.scene.forces import Force as Force
 from udkjax.scene.forces import ForceElement as ForceElement
 from udkjax.scene.forces import Friction as Friction
-from udkjax.scene.forces import Load as Load
 from udkjax.scene.forces import Spring as Spring
 from udkjax.scene.forces import Torque as Torque
 from udkjax.scene.forces import TorsionSpring as TorsionSpring
-from udkjax.scene.given_elements import attached_bodies as attached_bodies
+from udkjax.scene.forces import Wrench as Wrench
 from udkjax.scene.held import Held as Held
 from udkjax.scene.held import row_size as row_size
 from udkjax.scene.held import rows_of as rows_of

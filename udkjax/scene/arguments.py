@@ -1,8 +1,8 @@
 """The one door: arguments of public functions are checked before anything is computed.
 
-`@checked` reads the annotations and names of a function's parameters. A parameter annotated with classes takes their instances,
-one annotated `Literal` its choices; arrays are recognized by their names (named_arguments.py): shapes are those of the mechanism,
-numbers are real, finite and of the right sign. Of traced values the shapes and dtypes are checked; their values are data.
+`@checked` reads the annotations and names of a function's parameters. Classes in an annotation must match, a `Literal` lists the
+choices, and arrays are recognized by their names (named_arguments.py): shapes must fit the mechanism, numbers must be real,
+finite and of the right sign. For traced values only shapes and dtypes are checked.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,12 +16,20 @@ import numpy as np
 from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.named_arguments import CHECKS
-from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, Check, Given, article, describe, require_history
+from udkjax.scene.requirements import (
+    ArgumentCheck,
+    ArgumentError,
+    ArgumentTypeError,
+    GivenArguments,
+    article,
+    describe,
+    require_history,
+)
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# Examples of how to make an argument of each class, for messages.
+# Example of an argument of each class, for messages.
 EXAMPLES = {
     "Mechanism": 'udk.load("scene.toml")',
     "State": "udk.State(q, v)",
@@ -37,11 +45,11 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     """Return a function that checks its arguments.
 
     Args:
-        function: Its parameters are checked by their annotations and names, as the module says.
+        function: Its parameters are checked by their annotations and names; see the module.
 
     Returns:
-        The same function. Raises `TypeError` where an argument is of a wrong type, `ValueError` where it is of a wrong shape or
-        value; the message names the argument, what was given and what is meant.
+        The function with checks. It raises `TypeError` if an argument has the wrong type, `ValueError` if it has the wrong shape
+        or value; the message states the argument, its value and the requirement.
     """
     bind, checks = _binder(function), _checks_of(function)
 
@@ -58,8 +66,8 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     return call
 
 
-def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str, Any]], tuple[Given, Given]]:
-    """Return a function that names the arguments of a call: those that are given, and all with their defaults."""
+def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str, Any]], tuple[GivenArguments, GivenArguments]]:
+    """Return a function that maps a call to its arguments by name: the given ones, and all including defaults."""
     parameters = signature(function)
     defaults = {name: p.default for name, p in parameters.parameters.items() if p.default is not p.empty}
     kinds = {p.kind for p in parameters.parameters.values()}
@@ -69,11 +77,11 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
         kinds <= {Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY},
     )
 
-    def bind(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Given, Given]:
+    def bind(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[GivenArguments, GivenArguments]:
         given = dict(zip(names, args, strict=False)) | kwargs
         bound = defaults | given
         is_right = len(given) == len(args) + len(kwargs) and required <= given.keys() and len(bound) == len(parameters.parameters)
-        if not (plain and is_right):  # `bind` says what is wrong
+        if not (plain and is_right):  # `bind` raises the error
             given = bind_arguments(function.__name__, parameters, args, kwargs).arguments
             bound = defaults | given
         return given, bound
@@ -82,7 +90,7 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
 
 
 def bind_arguments(name: str, parameters: Signature, args: Sequence[Any], kwargs: Mapping[str, Any]) -> BoundArguments:
-    """Return the arguments of a function by their names. Raises `TypeError`, which names the function."""
+    """Return the arguments of a function by name; raise a `TypeError` that names the function."""
     try:
         return parameters.bind(*args, **kwargs)
     except TypeError as error:
@@ -90,8 +98,8 @@ def bind_arguments(name: str, parameters: Signature, args: Sequence[Any], kwargs
         raise TypeError(f"{name}(): {error}{suggestion(unknown, parameters.parameters)}") from None
 
 
-def argument_problems(function: Callable[..., object], given: Given) -> list[str]:
-    """Return the mistakes in some of the arguments for a function, the mechanism among them."""
+def argument_problems(function: Callable[..., object], given: GivenArguments) -> list[str]:
+    """Return the mistakes in some arguments of a function; `given` must include the mechanism."""
     problems: list[str] = []
     for name, check, if_none in _checks_of(function):
         try:
@@ -103,10 +111,10 @@ def argument_problems(function: Callable[..., object], given: Given) -> list[str
 
 
 class ParameterCheck(NamedTuple):
-    """One check of a parameter; `if_none` says whether it takes None too, lets it pass, or refuses it."""
+    """One check of a parameter; `if_none` tells whether it is applied to None, skipped for None, or refuses None."""
 
     name: str
-    check: Check
+    check: ArgumentCheck
     if_none: Literal["takes", "passes", "refuses"] = "takes"
 
 
@@ -127,7 +135,7 @@ def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
-    """Return the classes that an annotation allows; none where it is not made of classes alone."""
+    """Return the classes that an annotation allows; empty unless it consists of classes only."""
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
     plain = [x for x in parts if isclass(x) and (x in (bool, type(None), str) or _is_ours(x))]
     return tuple(plain) if len(plain) == len(parts) and any(x is not type(None) for x in plain) else ()
@@ -137,11 +145,11 @@ def _is_ours(x: type) -> bool:
     return x.__module__.startswith("udkjax.") and not getattr(x, "_is_protocol", False)
 
 
-def _instance(classes: tuple[type, ...]) -> Check:
+def _instance(classes: tuple[type, ...]) -> ArgumentCheck:
     kinds = (*classes, np.bool_) if bool in classes else classes
     meant = " or ".join(_meant(x) for x in classes).removesuffix(",")
 
-    def check(name: str, value: Any, given: Given):
+    def check(name: str, value: Any, given: GivenArguments):
         if not isinstance(value, kinds):
             raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}{_remedy(name, value, classes)}")
 
@@ -158,24 +166,24 @@ def _meant(cls: type) -> str:
 
 
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
-    """Return the cure of an argument that is one step from right: a class in place of its instance, or its name as a text."""
+    """Return the cure for a class, or its name as a text, in place of an instance; else an empty text."""
     called = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
     found = {x.__name__.lower(): x.__name__ for x in _family(classes)}.get(called.strip("() ").lower())
     return f"; give an instance: {name}=udk.{found}()" if found and found not in ("Mechanism", "State", "Analysis") else ""
 
 
 def _family(classes: Sequence[type]) -> Iterator[type]:
-    """Iterate over classes and all that inherit from them."""
+    """Iterate over classes and all their subclasses."""
     for cls in classes:
         yield cls
         if cls not in (bool, str, type(None)):
             yield from _family(cls.__subclasses__())
 
 
-def _choice(known: tuple[Any, ...]) -> Check:
+def _choice(known: tuple[Any, ...]) -> ArgumentCheck:
     texts = [x for x in known if isinstance(x, str)]
 
-    def check(name: str, value: Any, given: Given):
+    def check(name: str, value: Any, given: GivenArguments):
         if not isinstance(value, str | bool | int | None) or value not in known:
             listed = ", ".join(quote(x) if isinstance(x, str) else str(x) for x in known)
             raise ArgumentError(f"{name} must be one of {listed}, {describe(value)}{suggestion(value, texts)}")
@@ -184,6 +192,6 @@ def _choice(known: tuple[Any, ...]) -> Check:
 
 
 def require_mechanism(value: Any) -> Mechanism:
-    """Return a mechanism; raise TypeError where it is none."""
+    """Return the value; raise a `TypeError` unless it is a mechanism."""
     _instance((Mechanism,))("mechanism", value, given={})
     return value

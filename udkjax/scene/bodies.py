@@ -1,4 +1,4 @@
-"""A rigid body, and the frame through which joints and forces see it."""
+"""A rigid body, and its frame: the arguments of joints and force elements."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,18 +7,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.printing import PrintsLine, one_line
-from udkjax.scene.fields import POSITIVE, Number, array_namespace, given_number
+from udkjax.scene.fields import POSITIVE, array_namespace, given_number
 
 GROUND = "ground"
-COORDINATES = ("x", "y", "angle")  # of a body, in the order in which q and v hold them
-Vector = Float[Array, "2"] | Sequence[Number]  # two components
+COORDINATES = ("x", "y", "angle")  # of a body, in their order in q and v
+PlaneVector = Float[Array, "2"] | Sequence[Number]  # two components
 
 
 class Body(PrintsLine):
     """A rigid body in the plane; its frame has its origin at the centre of mass.
 
-    `position`, `angle`, `velocity` and `angular_velocity` are the initial guess that `assemble` closes.
+    `position`, `angle`, `velocity` and `angular_velocity` are the initial guess from which `assemble` closes the loops.
 
     Args:
         mass: in kg, greater than zero.
@@ -46,8 +47,8 @@ class Point(NamedTuple):
     """A point, a vector or a velocity in ground coordinates.
 
     Attributes:
-        x: in m, or in m/s.
-        y: likewise.
+        x: in m or m/s.
+        y: in m or m/s.
     """
 
     x: Number
@@ -61,10 +62,10 @@ class Point(NamedTuple):
         return self.x * other.x + self.y * other.y
 
     def norm(self, least: Number = 0.0) -> Array:
-        """Return the vector's length; at the zero vector, where it has a kink, the derivative is taken as zero.
+        """Return the length of the vector; the derivative at the zero vector, where it has a kink, is set to zero.
 
         Args:
-            least: A length up to which a vector is taken as zero.
+            least: Length up to which a vector counts as zero.
         """
         square = self.dot(self)
         xp, nonzero = array_namespace(square), square > least * least
@@ -72,19 +73,19 @@ class Point(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Position and velocity of a body, as scalars: the arguments with which joints and force elements are written.
+    """Position and velocity of a body as scalars: the argument of joints and force elements.
 
-    Joints see `vx`, `vy` and `omega` as None: ideal joints hold positions. The ground is `GROUND_FRAME`.
+    In joints `vx`, `vy` and `omega` are None: ideal joints constrain positions. The ground is `GROUND_FRAME`.
 
     Attributes:
-        x: of the centre of mass (m).
-        y: likewise (m).
-        angle: in rad; the relative angle of two bodies is a difference of these.
-        cos: of the angle.
-        sin: of the angle.
-        vx: of the centre of mass (m/s).
-        vy: likewise (m/s).
-        omega: the rate of the angle (rad/s).
+        x: x coordinate of the centre of mass (m).
+        y: y coordinate of the centre of mass (m).
+        angle: anticlockwise from the x axis (rad), not wrapped; the relative angle of two bodies is the difference.
+        cos: cosine of the angle.
+        sin: sine of the angle.
+        vx: x velocity of the centre of mass (m/s).
+        vy: y velocity of the centre of mass (m/s).
+        omega: angular velocity, anticlockwise (rad/s).
     """
 
     x: Number  # m
@@ -100,42 +101,42 @@ class Frame(NamedTuple):
         return one_line(self)
 
     @classmethod
-    def at(cls, position: Vector, angle: Number) -> "Frame":
+    def at(cls, position: PlaneVector, angle: Number) -> "Frame":
         """Return the frame of a body at a position (m) and an angle (rad), as joints see it."""
         xp = array_namespace(angle)
         return cls(position[0], position[1], angle, xp.cos(angle), xp.sin(angle))
 
-    def vector(self, local: Vector) -> Point:
-        """Turn a vector of the body's own frame into ground coordinates."""
+    def vector(self, local: PlaneVector) -> Point:
+        """Transform a vector from the body's frame to ground coordinates."""
         return Point(self.cos * local[0] - self.sin * local[1], self.sin * local[0] + self.cos * local[1])
 
-    def point(self, local: Vector) -> Point:
-        """Return a point of the body's own frame in ground coordinates (m)."""
+    def point(self, local: PlaneVector) -> Point:
+        """Return the ground coordinates (m) of a point given in the body's frame."""
         arm = self.vector(local)
         return Point(self.x + arm.x, self.y + arm.y)
 
-    def velocity(self, local: Vector) -> Point:
-        """Return the velocity of a point of the body's own frame, in ground coordinates (m/s)."""
+    def velocity(self, local: PlaneVector) -> Point:
+        """Return the velocity, in ground coordinates (m/s), of a point given in the body's frame."""
         arm = self.vector(local)
         return Point(self.vx - self.omega * arm.y, self.vy + self.omega * arm.x)
 
-    def local(self, vector: Vector) -> Point:
-        """Turn a vector in ground coordinates into the body's own frame: the inverse of `vector`."""
+    def local(self, vector: PlaneVector) -> Point:
+        """Transform a vector from ground coordinates to the body's frame: the inverse of `vector`."""
         return Point(self.cos * vector[0] + self.sin * vector[1], self.cos * vector[1] - self.sin * vector[0])
 
 
-GROUND_FRAME = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # as joints see the ground
-GROUND_FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # as force elements see it, with its velocities
+GROUND_FRAME = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # for joints
+GROUND_FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # for force elements: with velocities
 
 
 def frame_over_time(names: Sequence[str], q: Float[Array, "T bodies 3"], v: Float[Array, "T bodies 3"], body: str) -> Frame:
-    """Return the frame of a body along a motion, each of its numbers (T,).
+    """Return the frame of a body over time, each of its numbers (T,).
 
     Args:
         names: The bodies, in the order of q and v.
         q: Coordinates (m, m, rad).
         v: Velocities (m/s, m/s, rad/s).
-        body: One of them, or "ground".
+        body: The name of a body, or "ground".
 
     Returns:
         The frame, with its velocities.
@@ -154,7 +155,7 @@ def frame_over_time(names: Sequence[str], q: Float[Array, "T bodies 3"], v: Floa
     return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
 
 
-def between(points: Float[Array, "2 2"] | Sequence[Vector], one: Frame, two: Frame) -> Point:
+def between(points: Float[Array, "2 2"] | Sequence[PlaneVector], one: Frame, two: Frame) -> Point:
     """Return the vector from `points[0]` of body 1 to `points[1]` of body 2.
 
     Args:

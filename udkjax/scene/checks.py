@@ -1,4 +1,4 @@
-"""Checks of a scene, which find all of its mistakes at once, in files and in Python alike."""
+"""Checks of a scene from a file or from Python, which find all mistakes at once."""
 
 import dataclasses
 import difflib
@@ -13,8 +13,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
+from udkjax.annotations import TomlTable
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import FieldMetadata, Table, is_traced
+from udkjax.scene.fields import FieldMetadata, is_traced
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
@@ -24,9 +25,9 @@ KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements,
 
 
 class Mistakes(ValueError):
-    """All mistakes in a thing: `problems` lists them, `source` is the file that they stand in, or empty."""
+    """A list of mistakes: `problems`, and the file that has them, `source`, or empty."""
 
-    subject = ""  # the thing that has the mistakes, as the message calls it
+    subject = ""  # noun for the thing that has the mistakes, in the message
 
     def __init__(self, problems: Sequence[str], source: str = ""):
         self.problems, self.source = list(problems), source
@@ -43,22 +44,22 @@ class SceneError(Mistakes):
 
     Attributes:
         problems: every mistake, each with its place.
-        source: the name of the mechanism or the file.
+        source: the name of the mechanism or of the file.
     """
 
     subject = "scene"
 
 
 class SceneEntry(NamedTuple):
-    """One element to check: its section, its place there, its name, its class (None if unknown) and its table."""
+    """One element to check: its section and index, its name, its class (None if unknown) and its table."""
 
     section: str
     index: int
     name: object
     cls: type | None
-    table: Table
-    problem: str = ""  # the reason why the class is not known
-    element: object = None  # where it is made already
+    table: TomlTable
+    problem: str = ""  # why the class is unknown
+    element: object = None  # the element, if it exists already
 
     @property
     def where(self) -> str:
@@ -95,31 +96,31 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     return found
 
 
-def traced_numbers_hold(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
-    """Tell whether the traced numbers of elements are what their fields require: known ones were checked as they were given."""
+def traced_numbers_are_valid(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
+    """Return True if traced numbers meet the strict requirements of their fields; concrete numbers are checked on input."""
     found = [jnp.array(True)]
     for element in elements:
         for field in dataclasses.fields(element):
             value = getattr(element, field.name)
             if isinstance(value, eqx.Module):
-                found.append(traced_numbers_hold([value]))
+                found.append(traced_numbers_are_valid([value]))
             elif isinstance(value, Tracer):
                 found += [jnp.all(need.holds(value)) for need in field.metadata.get("require", ()) if need.strict]
     return jnp.all(jnp.stack(found))
 
 
 def gravity_mistakes(gravity: object) -> list[str]:
-    """Return the mistakes of the acceleration of gravity."""
+    """Return the mistakes in the acceleration of gravity."""
     return list(_check_number("gravity", ["2"], gravity, {}, {}))
 
 
 def _short(key: Any) -> str:
-    """Return a key of a table as a text that is not long."""
+    """Return a key of a table, abbreviated if long."""
     return abbreviate(key) if isinstance(key, str) and len(key) > LONGEST_QUOTE else f"{key}"
 
 
-def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Iterator[str]:
-    """Iterate over the mistakes of one table, read as an element of class `cls`."""
+def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> Iterator[str]:
+    """Iterate over the mistakes in a table that describes an element of class `cls`."""
     expected, sizes = keys(cls), {}
     for name in table:
         if name not in expected:
@@ -135,7 +136,7 @@ def check_table(where: str, cls: type, table: Table, known: KnownNames) -> Itera
 
 
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
-    """Iterate over the mistakes of one value. `sizes` holds the lengths of a table's named dimensions so far."""
+    """Iterate over the mistakes in one value. `sizes` collects the lengths of the table's named dimensions."""
     if get_origin(annotation) is UnionType:  # a number, or samples of it
         annotation, held = get_args(annotation)
         if isinstance(value, held | dict):
@@ -158,7 +159,7 @@ def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetad
 
 
 def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
-    """Iterate over the mistakes of a motion law or a profile: a module in Python, a table in a file."""
+    """Iterate over the mistakes in a motion law or a profile: a module in Python, a table in a file."""
     if isinstance(value, Held) and annotation is not Held:
         yield f"{path}: a motion that is held jumps at each sample: give a Spline through its values"
     elif isinstance(value, annotation) and isinstance(value, eqx.Module):
@@ -176,7 +177,7 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
 
 
 def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
-    """Iterate over the mistakes of a number that is held between samples, each of which has the shape `dims`."""
+    """Iterate over the mistakes in a `Held` whose samples have the shape `dims`."""
     table = table_of(value) if isinstance(value, Held) else value
     found, expected = list(check_table(path, Held, table, {})), keys(Held)
     for name in ("dt", "t0"):
@@ -190,7 +191,7 @@ def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
         yield f"{path}.values: each sample must be {each}, has the shape {shape}"
 
 
-def find_class(path: str, choices: Mapping[str, type], table: Table) -> tuple[type | None, str]:
+def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tuple[type | None, str]:
     """Return the class that a table's `type` names, or None and the mistake."""
     kind = table.get("type")
     if isinstance(kind, str) and kind in choices:
@@ -201,7 +202,7 @@ def find_class(path: str, choices: Mapping[str, type], table: Table) -> tuple[ty
 
 
 def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
-    """Iterate over the mistakes of a number: its type, its shape and, where it is not traced, its value."""
+    """Iterate over the mistakes in a number: its type, its shape and, if concrete, its value."""
     traced = is_traced(value)
     array = jnp.asarray(value) if traced else _as_array(value)
     fixed = all(dim.isdigit() for dim in dims)
@@ -232,7 +233,7 @@ def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -
 
 
 def _as_array(value: object) -> np.ndarray | None:
-    """Return a number, or nested lists of numbers, as an array; None for anything else, booleans and text too."""
+    """Return a number or nested lists of numbers as an array; None for anything else, including booleans and text."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         array = np.asarray(value)
         return array if array.dtype.kind in "iuf" else None
@@ -246,8 +247,8 @@ def _as_array(value: object) -> np.ndarray | None:
 
 
 def _check_references(path: str, kind: str | None, value: object, known: KnownNames) -> Iterator[str]:
-    """Iterate over the names in a value that name nothing."""
-    if kind not in known:  # in a module that an element holds, whose names need not be those of the scene
+    """Iterate over the mistakes in names of bodies and joints."""
+    if kind not in known:  # in a nested module, whose names need not exist in the scene
         return
     named = known[kind]
     single = isinstance(value, str)
@@ -264,8 +265,8 @@ def _check_references(path: str, kind: str | None, value: object, known: KnownNa
             yield f'{place}: "{GROUND}" does not move; name a body'
 
 
-def _check_bodies(where: str, cls: type, table: Table) -> Iterator[str]:
-    """Iterate over the mistakes of an element's bodies: as many as a type of the format has, none of them twice."""
+def _check_bodies(where: str, cls: type, table: TomlTable) -> Iterator[str]:
+    """Iterate over the mistakes in the bodies of an element: their number must fit the type, and all must differ."""
     bodies = table.get("bodies")
     if not isinstance(bodies, list | tuple):
         return
@@ -279,7 +280,7 @@ def _check_bodies(where: str, cls: type, table: Table) -> Iterator[str]:
 
 
 def suggestion(name: object, choices: Iterable[str]) -> str:
-    """Return '; did you mean "..."?' where one of the choices is close, else nothing."""
+    """Return '; did you mean "..."?' if one of the choices is similar, else an empty text."""
     if not isinstance(name, str):
         return ""
     lowered = {choice.lower(): choice for choice in choices}
@@ -288,19 +289,19 @@ def suggestion(name: object, choices: Iterable[str]) -> str:
 
 
 def unknown_key(key: object, expected: Iterable[str]) -> str:
-    """Return the words for a key that is not among the expected ones: the one that may be meant, or else all of them."""
+    """Return the message for an unknown key, with the most similar expected key, or else all of them."""
     known = tuple(expected)
     return "unknown key" + (suggestion(key, known) or f"; known are {', '.join(known)}")
 
 
 def quote(name: str) -> str:
-    """Return a name in double quotes, what cannot be printed as in TOML."""
+    """Return a name in double quotes, with unprintable characters escaped as in TOML."""
     escaped = name.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
 def abbreviate(value: object) -> str:
-    """Return a value as the text of a message: as in a TOML file, and not longer than `LONGEST_QUOTE`."""
+    """Return a value as text for a message: as in a TOML file, at most `LONGEST_QUOTE` long."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""A mechanism and poses of its bodies as tables of numbers with their units."""
+"""Printed tables of a mechanism and of the poses of its bodies, with units."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,11 +12,11 @@ from udkjax.scene.number_fields import Sections
 from udkjax.scene.schema import numbers_in
 from udkjax.scene.units import field_unit
 
-LEFT_OUT = ("velocity", "angular_velocity")  # where they are zero
+LEFT_OUT = ("velocity", "angular_velocity")  # fields omitted if zero
 
 
 def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str]]) -> PrintedTable:
-    """Return the table of a mechanism, where `frame_names` returns the bodies of an element."""
+    """Return the table of a mechanism; `frame_names` maps an element to its bodies."""
     groups = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
     rows = [
         (
@@ -34,7 +34,7 @@ def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str
 
 
 def drawing_table(name: str, groups: Mapping[str, Mapping[str, eqx.Module]], ground: Sequence[str]) -> PrintedTable:
-    """Return the table of the elements of a drawing by section and name, and of the pins on the ground."""
+    """Return the table of a drawing, from its elements by section and name and its pins on the ground."""
     rows = [
         (section, key, "ground" if section == "pin" and key in ground else _names_in(element), _format_element(element))
         for section, elements in groups.items()
@@ -72,7 +72,7 @@ def _format_element(element: eqx.Module) -> str:
 
 
 def format_pose(pose: np.ndarray, size: float) -> str:
-    """Return x, y (m) and angle (rad) of a body as text; rounding beside `size` (m) or one radian prints as 0."""
+    """Return x, y (m) and angle (rad) of a body as text; rounding errors relative to `size` (m) or one radian print as 0."""
     x, y = (format_number(value, scale=size) for value in pose[:2])
     return f"({x}, {y}) m, {format_number(pose[2], 'rad', 1.0)}"
 
@@ -84,7 +84,7 @@ def size_of(q: ArrayLike) -> float:
 
 
 def poses_table(title: str, names: Sequence[str], q: ArrayLike, v: ArrayLike | None = None) -> PrintedTable:
-    """Return the table of the coordinates, and velocities, (bodies, 3) of bodies; without names they are counted."""
+    """Return the table of coordinates, and velocities, (bodies, 3); bodies without names are numbered."""
     arrays = [np.asarray(x, float) for x in ((q,) if v is None else (q, v))]
     heads = ["body", "x (m)", "y (m)", "angle (rad)", "vx (m/s)", "vy (m/s)", "omega (rad/s)"][: 1 + 3 * len(arrays)]
     scales = [scale for x in arrays for scale in (size_of(x), size_of(x), float(np.nanmax(np.abs(x[..., 2]), initial=0.0)))]

@@ -1,4 +1,4 @@
-"""Drivers prescribe a motion: the constraints that depend on time, and the motion laws that they follow."""
+"""Drivers, the constraints that depend on time, and the motion laws that they prescribe."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -8,26 +8,27 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Point, between
-from udkjax.scene.fields import CALLED, KNOTS, NOT_EMPTY, Number, given_direction, given_number, given_or_guess
+from udkjax.scene.fields import CALLED, KNOTS, NOT_EMPTY, given_direction, given_number, given_or_guess
 from udkjax.scene.joints import Constraint, fill, fills
 from udkjax.scene.splines import natural_spline
 
 
 class Motion(PrintsLine):
-    """A motion law. Subclass it to write one of your own: `__call__` maps the time (s) to a value (rad, m).
+    """A motion law. Subclass it to write your own: `__call__` maps the time (s) to a value (rad, m).
 
-    A law that is smooth in pieces names the times where they meet in `breakpoints`; its value and rate are continuous there.
+    A piecewise smooth law lists the times where its pieces meet in `breakpoints`; value and rate must be continuous there.
     """
 
     @abstractmethod
     def __call__(self, t: Number) -> Number:
-        """Return the prescribed value at time t; it is differentiated twice."""
+        """Return the prescribed value at time t (s); it must be twice differentiable."""
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | Sequence[Number]:
-        """The times (s) where the law is not smooth: steps end there, and no interpolation reaches across. By default none."""
+        """The times (s) where the law is not smooth: steps end there, and no interpolation crosses them. Empty by default."""
         return ()
 
 
@@ -52,7 +53,7 @@ class Sine(Motion):
 
     Args:
         amplitude: in the unit of the coordinate (rad or m).
-        frequency: in rad/s: 2 pi times the cycles in a second.
+        frequency: angular frequency (rad/s).
         phase: in rad.
         offset: in the unit of the coordinate.
     """
@@ -67,10 +68,10 @@ class Sine(Motion):
 
 
 class Spline(Motion):
-    """A natural cubic spline through (times, values), at least two; outside its times it goes on as a straight line.
+    """A natural cubic spline through at least two points (times, values); outside them it continues as a straight line.
 
     Args:
-        times: in s, increasing; two at least.
+        times: in s, increasing; at least two.
         values: at these times, in the unit of the coordinate (rad or m).
     """
 
@@ -82,28 +83,32 @@ class Spline(Motion):
 
     @property
     def breakpoints(self):
-        return self.times if self.times.size > 2 else ()  # through two points it is one straight line
+        return self.times if self.times.size > 2 else ()  # two points: a straight line
 
 
 class Driver(Constraint):
     """Prescribe one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
 
-    `angle`: theta2 - theta1 (rad). `x`, `y`: point 2 from point 1, along the axes of body 1's frame (m): with point 1 at the
-    origin, the default, the coordinates of point 2 in that frame; `axis` turns these axes in it, by an angle (rad) or as a
-    vector. `distance`: between the points (m), which must not meet.
+    With d the vector from point 1 to point 2, the coordinates are
+        `angle`: theta2 - theta1 (rad), anticlockwise positive, not wrapped: body 1 is usually the ground or the base;
+        `x`, `y`: the components of d (m) along axes fixed to body 1: x along `axis`, y to its left. With point 1 at the origin
+            and the default axis they are the coordinates of point 2 in body 1's frame;
+        `distance`: |d| (m), which must not become zero.
+    Exchanging the bodies reverses the sign of the angle. The multiplier of the row is minus the effort, the torque (N m) or force
+    (N) that the driver exerts on body 2 along the coordinate.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
         coordinate: "angle", "x", "y" or "distance".
         motion: the prescribed value as a function of time: `Polynomial`, `Sine`, `Spline`, or a `Motion` of your own.
-        points: for x, y and distance, each in its own body's frame (m); by default the origins.
-        axis: for x and y: the direction of x in body 1's frame, as an angle (rad) or as a vector; by default its own.
+        points: for x, y and distance: point 1 and point 2, each in its own body's frame (m); by default the origins.
+        axis: for x and y: the direction of x in body 1's frame, as an angle (rad) or a vector; by default the frame's x axis.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
     motion: Motion = eqx.field(metadata=CALLED)
     points: Float[Array, "2 2"] = eqx.field(converter=given_or_guess, default=None)
-    axis: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # of x, for `x`, `y`; None: that of body 1
+    axis: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # None: the x axis of body 1
 
     def residual(self, t, *frames):
         one, two = frames
@@ -124,7 +129,7 @@ class Driver(Constraint):
 
     @property
     def effort_unit(self) -> str:
-        """The unit of what it exerts along its coordinate."""
+        """The unit of the effort along the coordinate."""
         return "N m" if self.coordinate == "angle" else "N"
 
     @fills("points")

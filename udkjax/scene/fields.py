@@ -1,15 +1,15 @@
-"""Fields of the classes of a scene: converters, and the requirements that values must satisfy.
+"""Fields of the classes of a scene: converters, and requirements on values.
 
-A class of this folder is its own schema: its fields are the keys of the scene format, the annotation of a number states its
-shape, and the metadata below state what else must hold. Files and Python are checked by the same declarations (`checks.py`).
+Each class of a scene is its own schema: its fields are the keys of the scene format, annotations state the shapes of numbers, and
+the metadata below all other requirements. Files and Python are checked by the same declarations (`checks.py`).
 """
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import wraps
 from types import ModuleType
-from typing import Any, Literal, NamedTuple, TypeAlias, TypedDict, TypeVar
+from typing import Any, Literal, NamedTuple, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,48 +17,46 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.annotations import Number as Number
-from udkjax.annotations import Numbers as Numbers
+from udkjax.annotations import Numbers
 
-# Of the largest of its kind: bound on a number that is zero in theory, as it is computed: some hundred units of rounding.
+# Bound on a computed number that is zero in theory, relative to the largest of its kind: some hundred rounding units.
 ROUNDING = 256 * float(np.finfo(float).eps)
 
 Module = TypeVar("Module")
-Table: TypeAlias = Mapping[str, object]  # {key: value} of one element, as in a scene file
 
 
 def array_namespace(*numbers: ArrayLike | Sequence[ArrayLike]) -> ModuleType:
-    """Return NumPy, or JAX's if one of the numbers is an array of JAX."""
+    """Return jax.numpy if one of the numbers is a JAX array, else NumPy."""
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(numbers)) else np
 
 
 def is_traced(tree: Any) -> bool:
-    """Return whether any number in a tree is traced."""
+    """Return True if any number in a tree is traced."""
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
 def is_within_jit() -> bool:
-    """Return whether a program is being traced, whose constants known numbers become."""
+    """Return True while a program is traced, in which concrete numbers become constants."""
     return isinstance(jax.device_put(0.0), Tracer)
 
 
 def library_for(tree: Any) -> ModuleType:
-    """Return NumPy where nothing in a tree is traced: there each operation of JAX would be a program to compile; else JAX's."""
+    """Return jax.numpy if a number in a tree is traced, else NumPy: JAX would compile a program for each operation."""
     return jnp if is_traced(tree) else np
 
 
 def stored(x: Any) -> Any:
-    """Return an array of NumPy as one of JAX, which takes no program; any other as it is."""
+    """Convert a NumPy array to a JAX array, without compiling anything; return anything else unchanged."""
     return jax.device_put(x) if isinstance(x, np.ndarray | np.generic) else x
 
 
 _put_together = jax.jit(lambda *arrays: arrays)
-_WORTH_A_PROGRAM = 60  # calls: putting arrays one by one takes 0.3 ms longer than by a program, which takes 15 ms to compile
+_WORTH_A_PROGRAM = 60  # calls: putting arrays one by one takes 0.3 ms longer than a program, which takes 15 ms to compile
 _calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # by shapes
 
 
 def put_arrays(arrays: Any) -> Any:
-    """Return a tree of arrays of NumPy, and numbers, as those of JAX."""
+    """Convert a tree of NumPy arrays and numbers to JAX arrays."""
     leaves, tree = jax.tree.flatten(arrays)
     _calls[shapes := tuple(map(np.shape, leaves))] += 1
     if _calls[shapes] <= _WORTH_A_PROGRAM:
@@ -67,7 +65,7 @@ def put_arrays(arrays: Any) -> Any:
 
 
 def make_module(cls: type[Module], **fields: Any) -> Module:
-    """Return an object of a class of data with all its fields, without what its constructor checks and converts."""
+    """Make an instance from all of its fields, without the checks and conversions of its constructor."""
     made = object.__new__(cls)
     for name, value in fields.items():
         object.__setattr__(made, name, value)
@@ -75,30 +73,30 @@ def make_module(cls: type[Module], **fields: Any) -> Module:
 
 
 def number(value: Numbers) -> Float[Array, "..."]:
-    """Make an array leaf of a number: a Python float as a field would be static, and each new value would compile anew."""
+    """Convert a number to an array leaf: a Python float as a field would be static, and each new value would recompile."""
     dtype = jnp.result_type(float)
     if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
         value = np.asarray(value, dtype)
         found = jax.device_put(value)  # jnp.asarray would compile a program for each shape
         if not isinstance(found, Tracer):
             return found
-        with jax.ensure_compile_time_eval():  # known numbers stay known while something else is traced
+        with jax.ensure_compile_time_eval():  # concrete numbers stay concrete while something else is traced
             return jax.device_put(value)
     return jnp.asarray(value, dtype=dtype)
 
 
 def optional_number(value: Numbers | None) -> Float[Array, "..."] | None:
-    """Like `number`; None stays None: an absent number, for which nothing is computed."""
+    """Like `number`, but None, an absent number, stays None."""
     return None if value is None else number(value)
 
 
 def number_or_guess(value: Numbers | None) -> Float[Array, "..."]:
-    """Like `number`; None stands for the value in the initial guess, which the mechanism fills in (`Constraint.complete`)."""
+    """Like `number`, but None stands for the value in the initial guess, which the mechanism fills in (`Constraint.complete`)."""
     return None if value is None else number(value)  # pyright: ignore[reportReturnType]
 
 
 def direction(value: Numbers | None) -> Float[Array, ""]:
-    """Like `number`: a direction in the plane as an angle (rad), which may be given as a vector (x, y); None stays None."""
+    """Convert a direction in the plane, an angle (rad) or a vector (x, y), to an angle; None stays None."""
     if value is None:
         return None  # pyright: ignore[reportReturnType]
     found = number(value)
@@ -110,9 +108,9 @@ def direction(value: Numbers | None) -> Float[Array, ""]:
 
 
 def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a converter for fields of a scene's elements: values that cannot be converted stay as they are.
+    """Return a converter for fields of elements that leaves values as they are if they cannot be converted.
 
-    The mechanism that the element is put into refuses it, and names its place.
+    The mechanism then refuses the element, with the path of the value.
     """
 
     @wraps(convert)
@@ -126,7 +124,7 @@ def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def number_called(name: str, optional: bool = False) -> Callable[[Any], Any]:
-    """Return `number` as a converter of a field or an argument that errors call by its name; `optional`: None stays None."""
+    """Return `number` as a converter whose errors name the field or argument; if `optional`, None stays None."""
 
     def converted(value: Any) -> Any:
         if optional and value is None:
@@ -141,7 +139,7 @@ def number_called(name: str, optional: bool = False) -> Callable[[Any], Any]:
 
 
 def vector_as_angle(value: Any) -> Any:
-    """Return the angle (rad) of a vector of two numbers in a table; anything else as it is, for others to refuse."""
+    """Return the angle (rad) of a vector of two numbers in a table; return anything else unchanged, to be refused later."""
     parts = list(value) if isinstance(value, np.ndarray | jax.Array) and value.shape == (2,) else value
     numbers = int | float | np.number | jax.Array
     if not isinstance(parts, list | tuple) or len(parts) != 2 or not all(isinstance(x, numbers) for x in parts):
@@ -154,7 +152,7 @@ def vector_as_angle(value: Any) -> Any:
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
-    """Make a hashable tuple of names; raise TypeError where something is no name."""
+    """Convert a name or a list of names to a tuple; raise a `TypeError` if an entry is not a text."""
     found = (value,) if isinstance(value, str) else tuple(value)
     if not all(isinstance(name, str) for name in found):
         raise TypeError("must be a name, or a list of names")
@@ -167,9 +165,9 @@ given_direction, given_names = or_as_given(direction), or_as_given(names)
 
 @jax.tree_util.register_static
 class StaticValue:
-    """The value of a field of a user's class that is neither an array nor a number, such as a function or a name: a static leaf.
+    """A static leaf: a value in a user's class that is neither an array nor a number, such as a function or a name.
 
-    Calls, comparisons and attributes are those of the `value` that it wraps.
+    Calls, comparisons and attributes are passed on to the wrapped `value`.
     """
 
     def __init__(self, value: object):
@@ -181,7 +179,7 @@ class StaticValue:
         return self.value(*arguments, **named)
 
     def __getattr__(self, name: str) -> object:
-        if name == "value":  # not yet set, while it is copied
+        if name == "value":  # not yet set during a copy
             raise AttributeError(name)
         return getattr(self.value, name)
 
@@ -197,10 +195,10 @@ class StaticValue:
 
 
 class Requirement(NamedTuple):
-    """A condition on each entry of a number: `holds` maps the array, of NumPy or of JAX, to a boolean array of the same shape.
+    """A condition on each entry of a number: `holds` maps a NumPy or JAX array to a boolean array of the same shape.
 
-    Where it is `strict`, numbers that break it mean nothing, and a run whose traced numbers do ends by `Result.invalid_argument`.
-    Where it is not, as of a damping below zero, they still have a meaning, and differences around zero need them.
+    If it is `strict`, numbers that violate it are meaningless, and a run whose traced numbers do ends with
+    `Result.invalid_argument`. If not, as for a negative damping, they are meaningful: finite differences around zero need them.
     """
 
     text: str
@@ -213,8 +211,8 @@ class FieldMetadata(TypedDict, total=False):
 
     require: tuple[Requirement, ...]
     at_least: int  # entries
-    called: bool  # the field holds a function of time, of which the element takes nothing but its values
-    names: Literal["body", "revolute", "pin", "link", "slide"]  # the field holds names: of bodies, of revolute joints, ...
+    called: bool  # the field holds a function of time, used only by calling it
+    names: Literal["body", "revolute", "pin", "link", "slide"]  # kind of the names that the field holds
 
 
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
@@ -231,7 +229,7 @@ CALLED: FieldMetadata = {"called": True}
 NOT_EMPTY: FieldMetadata = {"at_least": 1}
 BODY: FieldMetadata = {"names": "body"}  # the field names one or several bodies
 REVOLUTE: FieldMetadata = {"names": "revolute"}  # the field names a revolute joint
-PIN: FieldMetadata = {"names": "pin"}  # of a drawing: one or several
-LINK: FieldMetadata = {"names": "link"}  # of a drawing, or the ground, or a body: one or several
-SLIDE: FieldMetadata = {"names": "slide"}  # of a drawing
+PIN: FieldMetadata = {"names": "pin"}  # one or several pins of a drawing
+LINK: FieldMetadata = {"names": "link"}  # one or several links of a drawing, bodies or the ground
+SLIDE: FieldMetadata = {"names": "slide"}  # a slide of a drawing
 OUTLINE: FieldMetadata = {"at_least": 3}

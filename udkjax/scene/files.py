@@ -1,4 +1,4 @@
-"""Scene files: mechanisms and drawings as TOML, versions 1 and 2 of the format, and MJCF models, read and written."""
+"""Read and write scene files: mechanisms (TOML format 1), drawings (format 2) and MJCF models."""
 
 import os
 from pathlib import Path
@@ -11,17 +11,17 @@ from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml, parse_toml
 
-DRAWN_VERSION = 2  # of the format: drawings, of pins and links
+DRAWN_VERSION = 2  # of the format of drawings, with pins and links
 
 
 def load(path: str | os.PathLike[str]) -> Mechanism:
-    """Read a mechanism from a TOML file of format 1, or of format 2: a drawing; or from an MJCF model, as `read_mjcf`.
+    """Read a mechanism from a TOML file of format 1, a drawing of format 2, or an MJCF model (as `read_mjcf`).
 
     Args:
-        path: The file; a text that begins as XML is MJCF.
+        path: The file; if it begins like XML, it is read as MJCF.
 
     Returns:
-        The mechanism; that of a drawing has it as `drawing`.
+        The mechanism; if it was drawn, `drawing` is its drawing.
 
     Raises:
         SceneError: The scene is wrong; the error lists every mistake in it.
@@ -50,11 +50,11 @@ def loads(text: str) -> Mechanism:
 
 @checked
 def save(mechanism: Mechanism | Drawing, path: str | os.PathLike[str]) -> None:
-    """Write a mechanism to a file, whole or not at all: to TOML as in `dumps`, or to an MJCF model as in `mjcf_text`.
+    """Write a mechanism atomically to a TOML file (as `dumps`) or an MJCF model (as `mjcf_text`).
 
     Args:
         mechanism: The scene.
-        path: The file; an older one is replaced. An MJCF model ends in ".xml".
+        path: The file, replaced if it exists; the suffix ".xml" selects MJCF.
 
     Raises:
         SceneError: The format cannot hold the mechanism, as in `dumps` and `mjcf_text`.
@@ -62,7 +62,7 @@ def save(mechanism: Mechanism | Drawing, path: str | os.PathLike[str]) -> None:
     """
     path = Path(path)
     if path.suffix.lower() == ".xml":
-        from udkjax.scene.mjcf.mjcf_writer import mjcf_text  # and with it XML, which other scenes do without
+        from udkjax.scene.mjcf.mjcf_writer import mjcf_text  # deferred, as only MJCF needs XML
 
         text = mjcf_text(mechanism)
     else:
@@ -77,10 +77,10 @@ def save(mechanism: Mechanism | Drawing, path: str | os.PathLike[str]) -> None:
 
 @checked
 def dumps(mechanism: Mechanism | Drawing) -> str:
-    """Return the mechanism as the text of a TOML file; reading it gives the same numbers back, bit by bit.
+    """Return the mechanism as the text of a TOML file; reading it back gives bitwise identical numbers.
 
-    A drawing, or a mechanism made from one, is written in format 2, in the units that it was drawn in; unless it has numbers that
-    do not follow from the drawing any more (`with_parameters({"body.crank.mass": ...})`): these need format 1.
+    A drawing, or a mechanism made from one, is written in format 2, in the units of the drawing. If numbers of the mechanism no
+    longer follow from the drawing (`with_parameters({"body.crank.mass": ...})`), it is written in format 1.
 
     Args:
         mechanism: The scene.
@@ -100,7 +100,7 @@ def dumps(mechanism: Mechanism | Drawing) -> str:
 
 def _read(text: str, source: str) -> Mechanism:
     if is_xml(text):
-        from udkjax.scene.mjcf.mjcf_reader import mechanism_of_text  # likewise
+        from udkjax.scene.mjcf.mjcf_reader import mechanism_of_text  # deferred
 
         return mechanism_of_text(text, source, stacklevel=4)
     scene = parse_toml(text, source, SceneError)

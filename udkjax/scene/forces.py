@@ -1,4 +1,9 @@
-"""Force elements: springs, dampers, constant loads and friction, each by its potential energy, its loads, or the sum of both."""
+"""Force elements: springs, dampers, applied loads and friction, each defined by a potential energy, by loads, or by both.
+
+Conventions that hold throughout: forces are in ground axes (N), torques are positive anticlockwise and about the centre of mass
+of the body that they act on (N m). Each element lists the loads on its bodies in their order; those on body 1 are the reactions
+to those on body 2.
+"""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal
@@ -8,31 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Frame, Point, between
-from udkjax.scene.fields import (
-    BODY,
-    NOT_NEGATIVE,
-    POSITIVE,
-    REVOLUTE,
-    Number,
-    given_names,
-    given_number,
-    given_or_none,
-)
+from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, REVOLUTE, given_names, given_number, given_or_none
 from udkjax.scene.held import Held, given_sampled, value_at
 
-Load = tuple[Number, Number, Number]  # force x, force y (N), torque about the centre of mass (N m), in ground axes
+Wrench = tuple[Number, Number, Number]  # force x, force y (N, ground axes), torque about the centre of mass (N m)
 
-# Of a spring's length: nearer, its ends are taken to be in one place. Derivatives of the direction of its force lose as many
-# digits as the ends are near: between pins that joints hold together, where rounding alone is between them, all of them.
+# Fraction of a spring's length. Nearer than this, its ends count as coincident: the closer they are, the more digits the
+# derivatives of the force's direction lose; all of them between pins that a joint holds together, up to rounding.
 NEAREST = float(np.sqrt(np.finfo(float).eps))
 
 
 class ForceElement(PrintsLine):
-    """A force element. Subclass it and write `potential` or `loads`; the other one stays None, and costs nothing.
+    """A force element. Subclass it and write `potential`, `loads` or both; one that is not written costs nothing.
 
-    One that is smooth in pieces of time names the times where they meet in `breakpoints`; its loads may jump there.
+    If its loads are piecewise smooth in time, `breakpoints` lists the times where the pieces meet; loads may jump there.
 
     Args:
         bodies: the names of the bodies whose frames `potential` and `loads` get.
@@ -42,40 +39,41 @@ class ForceElement(PrintsLine):
     n_bodies: ClassVar[int] = 2  # number of `bodies` of a type of the scene format
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
-        """Return the potential energy V (J), or None; the load is -dV/dq."""
+        """Return the potential energy V (J), or None; its generalized force is -dV/dq."""
         return None
 
-    def loads(self, t: Number, *frames: Frame) -> Sequence[Load] | None:
+    def loads(self, t: Number, *frames: Frame) -> Sequence[Wrench] | None:
         """Return (force x, force y, torque about the centre of mass) for each attached body, in ground axes (N, N m), or None."""
         return None
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | Sequence[Number]:
-        """The times (s) where the loads are not smooth: steps end there, and no interpolation reaches across. By default none."""
+        """The times (s) where the loads are not smooth: steps end there, and no interpolation crosses them. Empty by default."""
         return ()
 
     def piece(self, t: Number, *frames: Frame) -> Number | None:
-        """Return the number of the smooth piece in which the loads are, or None where they are smooth everywhere (the default).
+        """Return the index of the current smooth piece of the loads, or None if they are smooth everywhere (the default).
 
-        Where pieces meet, loads are continuous. No interpolation reaches from one piece to another.
+        Loads are continuous where pieces meet. No interpolation crosses from one piece to another.
         """
         return None
 
 
 class Spring(ForceElement):
-    """V = 1/2 stiffness (|d| - length)^2 between two points, d from point 1 to point 2, and a damper beside it.
+    """A spring between two points, V = 1/2 stiffness (|d| - length)^2, d from point 1 to point 2, with a damper in parallel.
 
-    The damper's force on point 2 is -damping d|d|/dt along the line. Units: N/m, N s/m, m.
+    Longer than `length`, it pulls the points together. The damper's force on point 2 along d/|d| is -damping d|d|/dt, and on
+    point 1 the opposite. The order of the bodies does not matter.
 
-    Where its ends meet, a spring with a length pulls nowhere, since d has no direction; between pins that a joint holds together
-    it changes nothing. Where its ends pass through one another its force jumps: the motion is right, its derivatives lack what
-    they change by at that moment.
+    Where its ends coincide, d has no direction and the force of a spring with a length is zero, so that it has no effect between
+    pins that a joint holds together. Where its ends pass through each other the force jumps: the motion is right, but its
+    derivatives lack the contribution of the jump.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
         points: the ends, each in its own body's frame (m).
         stiffness: in N/m, not negative.
-        length: without load (m), not negative.
+        length: free length (m), not negative.
         damping: in N s/m, not negative; None: no damper.
     """
 
@@ -87,7 +85,7 @@ class Spring(ForceElement):
     def potential(self, t, *frames):
         d = between(self.points, *frames)
         distance = d.norm(NEAREST * self.length)
-        # Where the ends meet, |d| has a kink, but the energy of a spring without a length has none: its |d|^2 is d.d.
+        # |d| has a kink where the ends meet, but the energy of a spring without a length is smooth: |d|^2 is d.d.
         square = jnp.where(self.length > 0, (distance - self.length) ** 2, d.dot(d) - (2 * distance - self.length) * self.length)
         return 0.5 * self.stiffness * square
 
@@ -103,15 +101,16 @@ class Spring(ForceElement):
 
 
 class TorsionSpring(ForceElement):
-    """V = 1/2 stiffness (theta2 - theta1 - angle)^2, and a damper: the torque -damping (omega2 - omega1) on body 2.
+    """A torsion spring, V = 1/2 stiffness (theta2 - theta1 - angle)^2, with a damper in parallel.
 
-    Units: N m/rad, N m s/rad, rad.
+    The torque on body 2 is -stiffness (theta2 - theta1 - angle) - damping (omega2 - omega1), anticlockwise, and on body 1 the
+    opposite. The relative angle is not wrapped: after a turn it has grown by 2 pi.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
         stiffness: in N m/rad, not negative.
         damping: in N m s/rad, not negative; None: no damper.
-        angle: theta2 - theta1 without load (rad); a `Held` is the target of a servo.
+        angle: theta2 - theta1 without load (rad); a `Held` makes it the setpoint of a servo.
     """
 
     stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)
@@ -130,13 +129,13 @@ class TorsionSpring(ForceElement):
 
 
 class Force(ForceElement):
-    """A force `vector` (N) at a `point` of a body, in the axes of the ground, or of the body: it then turns with it.
+    """A force on a body at a `point` that moves with it; `vector` is fixed to the ground, or turns with the body.
 
     Args:
         body: the name of the body.
-        vector: the force (N): constant, or a `Held` of values (N, 2).
-        point: point of attack, in the body's frame (m).
-        frame: the axes of the vector: "ground", or "body", with which it turns.
+        vector: the force (N) on the body: constant, or a `Held` of values (N, 2).
+        point: point of application, in the body's frame (m).
+        frame: the axes of the vector's components: "ground" or "body".
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
@@ -146,7 +145,7 @@ class Force(ForceElement):
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")
 
     def __post_init__(self):
-        self.bodies = (self.body,) if isinstance(self.body, str) else ()  # anything else is refused by its own name
+        self.bodies = (self.body,) if isinstance(self.body, str) else ()  # the check of `body` refuses anything else
 
     def loads(self, t, *frames):
         (body,) = frames
@@ -156,11 +155,11 @@ class Force(ForceElement):
 
 
 class Torque(ForceElement):
-    """A torque `value` (N m) on body 2, and its reaction on body 1.
+    """A torque `value` on body 2, anticlockwise positive, and -value on body 1.
 
     Args:
-        bodies: the names of two bodies: it acts on the second, its reaction on the first.
-        value: in N m, anticlockwise: constant, or a `Held`.
+        bodies: the names of the two bodies, the reacting one first; "ground" is the fixed frame.
+        value: in N m: constant, or a `Held`.
     """
 
     value: Float[Array, ""] | Held = eqx.field(converter=given_sampled)
@@ -170,15 +169,14 @@ class Torque(ForceElement):
 
 
 class Friction(ForceElement):
-    """Friction in a revolute joint: the torque -torque tanh(omega / velocity) on body 2, omega = omega2 - omega1.
+    """Friction in a revolute joint: the torque -torque tanh((omega2 - omega1) / velocity) on body 2, and its opposite on body 1.
 
-    Dry friction of `torque` (N m), smoothed over `velocity` (rad/s). Its bodies are those of its `joint`, which the mechanism
-    looks up (`Mechanism.frames_of`).
+    Bodies 1 and 2 are those of the `joint`, which the mechanism looks up (`Mechanism.frames_of`).
 
     Args:
         joint: the name of a revolute joint.
-        torque: of dry friction (N m), not negative.
-        velocity: over which it is smoothed (rad/s), greater than zero.
+        torque: torque of dry friction (N m), not negative.
+        velocity: relative angular velocity over which it is smoothed (rad/s), greater than zero.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
@@ -191,12 +189,12 @@ class Friction(ForceElement):
         return _couple(-self.torque * jnp.tanh((two.omega - one.omega) / self.velocity))
 
 
-def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Load:
-    """Return a force at a point of a body as a load about its centre of mass."""
+def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Wrench:
+    """Return the load about the centre of mass of a force at a point of a body."""
     arm = frame.vector(point)
     return force.x, force.y, arm.x * force.y - arm.y * force.x
 
 
-def _couple(torque: Number) -> list[Load]:
-    """Return the loads of a torque on body 2 and its reaction on body 1."""
+def _couple(torque: Number) -> list[Wrench]:
+    """Return the loads of a torque on body 2 and its reaction on body 1, in the order of the bodies."""
     return [(0.0, 0.0, -torque), (0.0, 0.0, torque)]

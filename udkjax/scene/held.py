@@ -1,7 +1,7 @@
-"""Numbers that are held between samples: what a digital controller puts out, or a table of measured forces.
+"""Numbers that are held between samples: the output of a digital controller, or a table of measured forces.
 
-Numbers with samples, splines among them, are constant or a cubic from one breakpoint to the next: programs are made of one such
-interval, and a run changes the numbers of the interval where it begins anew behind a breakpoint.
+Sampled numbers, including splines, are constant or cubic between breakpoints: programs contain one such interval, and a run
+replaces the numbers of the interval when it restarts after a breakpoint.
 """
 
 import dataclasses
@@ -15,21 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.printing import PrintsLine
 from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import NOT_EMPTY, POSITIVE, Number, given_number, make_module
+from udkjax.scene.fields import NOT_EMPTY, POSITIVE, given_number, make_module
 from udkjax.scene.splines import spline_pieces
 
 
 class Held(PrintsLine):
-    """A number, or a vector, that is held between samples (zero-order hold): values[k] from t0 + k dt to t0 + (k + 1) dt.
+    """A number or vector that is held between samples (zero-order hold): values[k] from t0 + k dt to t0 + (k + 1) dt.
 
-    Before t0 it is the first value, behind the last sample the last one. Steps of an integrator end at the samples. The values
-    may be traced and differentiated; a run takes the same code and the same time per step, however many there are. A force
-    element may have one in any of its fields; `torque.value`, `force.vector` and `torsion_spring.angle` of this package take one.
+    It is the first value before t0 and the last value after the last sample. Steps of the integrator end at the samples. The
+    values may be traced and differentiated; code and time per step do not depend on their number. Any field of a force element
+    may hold one; in this package, `torque.value`, `force.vector` and `torsion_spring.angle` accept it.
 
     Args:
-        values: the samples (N,), or (N, 2) of a vector, in the unit of the number that they stand for.
+        values: the samples (N,), or (N, 2) for a vector, in the unit of the number that they replace.
         dt: the time between two samples (s), greater than zero.
         t0: the time of the first sample (s).
     """
@@ -43,18 +44,18 @@ class Held(PrintsLine):
             value = getattr(self, name)
             try:
                 object.__setattr__(self, name, float(value))
-            except (TypeError, ValueError):  # traced, or no number: the mechanism says so
+            except (TypeError, ValueError):  # traced or not a number: the mechanism reports it
                 continue
 
     def __call__(self, t: Number) -> Array:
         """Return the value at time t (s)."""
-        if len(self.values) == 1:  # also where it stands for all samples: no operation
+        if len(self.values) == 1:  # also a single interval in place of all samples: no operation
             return self.values[0]
         return self.values[jnp.searchsorted(jnp.asarray(self.breakpoints), t, side="right")]
 
     @property
     def breakpoints(self) -> Float[np.ndarray, "N-1"]:
-        """The times (s) of the samples but the first."""
+        """The times (s) of all samples after the first."""
         return self.t0 + self.dt * np.arange(1, len(self.values))
 
 
@@ -64,15 +65,15 @@ def given_sampled(value: Any) -> Any:
 
 
 def value_at(x: Float[Array, "..."] | Held, t: Number) -> Any:
-    """Return a number at time t (s): that of a `Held`, or what does not depend on time as it is."""
+    """Return the value of a `Held` at time t (s); return any other number unchanged."""
     return x(t) if isinstance(x, Held) else x
 
 
-# --- what has samples, a number or a motion, as a table: a row of numbers for each interval between its breakpoints
+# --- sampled numbers and motions as a table: one row of numbers per interval between breakpoints
 
 
 class SplinePiece(Motion):
-    """A spline between two of its knots: c0 + c1 s + c2 s^2 + c3 s^3, with s = t - start.
+    """A spline between two knots: c0 + c1 s + c2 s^2 + c3 s^3, with s = t - start.
 
     Args:
         row: start (s), c0, c1, c2 and c3.
@@ -90,7 +91,7 @@ Sampled = Held | Spline
 
 
 def sampled_fields(elements: Sequence[eqx.Module]) -> list[tuple[int, str]]:
-    """Return the places of samples in elements, index and field: a field holds a `Held`, or a spline that is only called."""
+    """Return index and field of the sampled numbers of elements: fields with a `Held`, or with a spline that is only called."""
     return [
         (k, name)
         for k, e in enumerate(elements)
@@ -117,12 +118,12 @@ def rows_of(x: Sampled, xp: ModuleType) -> Any:
 
 
 def with_row(x: Sampled, row: Any) -> Any:
-    """Return the samples of one interval, of a row of numbers; or of a mark, or None, in place of a row."""
+    """Return the samples of one interval from a row of numbers; a mark, or None, may stand in place of the row."""
     if isinstance(x, Spline):
         return make_module(SplinePiece, row=row)
     return make_module(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)
 
 
 def row_at(x: Sampled, t: Any, xp: ModuleType) -> Any:
-    """Return the row that holds at time t (s)."""
+    """Return the row of the interval at time t (s)."""
     return rows_of(x, xp)[xp.searchsorted(xp.asarray(x.breakpoints, float), t, side="right")]

@@ -1,6 +1,6 @@
-"""Results computed of objects that stay as they are, found again by their identities.
+"""A cache of results computed from immutable objects, by their identities.
 
-Mechanisms, states and methods are trees of arrays: to compare their values takes as long as much of what is computed of them.
+Mechanisms, states and methods are trees of arrays: comparing their values takes as long as many of the computations.
 """
 
 import weakref
@@ -15,20 +15,20 @@ import numpy as np
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-CACHE_SIZE = 64  # results of a function that are stored; the one that was asked for longest ago makes room
+CACHE_SIZE = 64  # results stored per function; the least recently used one is dropped
 
 
-_BY_VALUE = (bool, int, float, str, np.generic, type(None))  # types: to ask an Equinox module for its own takes a microsecond
+_BY_VALUE = (bool, int, float, str, np.generic, type(None))  # isinstance of an Equinox module takes a microsecond
 
 
 def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function that finds its results again for the same arguments: numbers and texts by value, others by identity.
+    """Cache the results of a function by its arguments: numbers and texts by value, others by identity.
 
-    A result is stored for as long as its arguments exist, but no longer than `CACHE_SIZE` others have been asked for since.
-    None of the arguments may be traced, and none may change.
+    A result is stored while its arguments exist, and among the `CACHE_SIZE` most recently used ones. Arguments must be concrete
+    and must not change.
     """
     found: OrderedDict[tuple[Hashable, ...], tuple[list[Any], Result]] = OrderedDict()
-    lock = RLock()  # the end of an object may come at any time, also within the lock
+    lock = RLock()  # an object may be deleted at any time, also within the lock
 
     def forget(key: tuple[Hashable, ...]) -> None:
         with lock:
@@ -56,7 +56,7 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:
-    """Return a weak reference, which tells when an object ends, and with it the right to its identity; or the object itself."""
+    """Return a weak reference that calls `forget` when the object is deleted; the object itself if it allows none."""
     try:
         return weakref.ref(x, forget)
     except TypeError:

@@ -1,9 +1,10 @@
-"""One class per joint. A joint writes only its position residual; everything else is derived from it.
+"""One class per joint. A joint defines only its position residual; everything else is derived from it.
 
-Conventions that hold throughout: `bodies` names the bodies that the joint connects, in the order in which `residual` gets
-their frames; `points` are the attachments, each in its body's own frame (m); `axis` is the direction of a line in body 1's
-frame, an angle (rad) or a vector (x, y); angles are in rad, anticlockwise; rows come in the order in which `residual` returns
-them. A number that is None when a joint is made ("as in the initial guess") is filled in by the mechanism.
+Conventions that hold throughout: body 1 and body 2 are the first and second of `bodies`, and `residual` takes their frames in
+this order; `points` are point 1 on body 1 and point 2 on body 2, each in its body's own frame (m); `axis` is the direction of a
+line in body 1's frame, as an angle (rad) or a vector (x, y), and its normal points to the left of it; angles are in rad,
+anticlockwise positive, and not wrapped; rows are in the order in which `residual` returns them. The joint's force on a body is
+-Psi_q^T lambda. A number left out ("as in the initial guess") is None until the mechanism fills it in.
 """
 
 from abc import abstractmethod
@@ -14,6 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number, Numbers
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import (
@@ -22,8 +24,6 @@ from udkjax.scene.fields import (
     PROFILE_ANGLES,
     PROFILE_RADII,
     ROUNDING,
-    Number,
-    Numbers,
     array_namespace,
     given_direction,
     given_names,
@@ -35,10 +35,10 @@ from udkjax.scene.splines import count_knots, periodic_spline, wrap
 
 
 class Constraint(PrintsLine):
-    """Anything that holds Psi(t, q) = 0: a joint or a driver. A subclass writes `residual`, nothing more.
+    """A constraint Psi(t, q) = 0: a joint or a driver. A subclass need only define `residual`.
 
     Args:
-        bodies: the names of the bodies whose frames `residual` gets.
+        bodies: the names of the bodies whose frames `residual` takes.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
@@ -46,27 +46,27 @@ class Constraint(PrintsLine):
 
     @abstractmethod
     def residual(self, t: Number, *frames: Frame) -> Sequence[Number]:
-        """Return Psi, one scalar a row, from the time (s) and the frames of the attached bodies."""
+        """Return Psi, one scalar per row, at a time (s), for the frames of the attached bodies."""
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """The bodies whose frames `residual` gets, in that order."""
+        """The bodies whose frames `residual` takes, in order."""
         return self.bodies
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | Sequence[Number]:
-        """The times (s) where Psi is not smooth, though it and its rate are continuous. By default none."""
+        """The times (s) where Psi is not smooth; Psi and its rate must be continuous there. Empty by default."""
         return ()
 
     def piece(self, t: Number, *frames: Frame) -> Number | None:
-        """Return the number of the smooth piece in which Psi is, or None where it is smooth everywhere (the default).
+        """Return the index of the current smooth piece of Psi, or None if it is smooth everywhere (the default).
 
-        Where pieces meet, Psi has continuous second derivatives. No interpolation reaches from one piece to another.
+        Second derivatives of Psi are continuous where pieces meet. No interpolation crosses from one piece to another.
         """
         return None
 
     def complete(self, *frames: Frame) -> Self:
-        """Return the constraint with the numbers that it leaves to the initial guess, from its bodies' frames there."""
+        """Return the constraint with its missing numbers computed from the frames of its bodies in the initial guess."""
         return self
 
 
@@ -75,7 +75,7 @@ Completion = TypeVar("Completion", bound=Callable)
 
 
 def fills(name: str) -> Callable[[Completion], Completion]:
-    """Mark a `complete` that does nothing but set the number `name` where it is absent: elsewhere nobody has to call it."""
+    """Mark a `complete` that only sets the number `name` if it is absent, so that it need not be called otherwise."""
 
     def mark(complete: Completion) -> Completion:
         complete.fills = name  # pyright: ignore[reportFunctionMemberAccess]
@@ -85,15 +85,17 @@ def fills(name: str) -> Callable[[Completion], Completion]:
 
 
 class Joint(Constraint):
-    """A constraint that does not depend on time. Subclass it to write a joint of your own.
+    """A constraint that does not depend on time. Subclass it to write your own joint.
 
     Args:
-        bodies: the names of the bodies whose frames `residual` gets; "ground" is the fixed frame.
+        bodies: the names of the bodies whose frames `residual` takes; "ground" is the fixed frame.
     """
 
 
 class Revolute(Joint):
-    """Two points coincide. 2 rows: the x and y components of point 2 minus point 1 (m).
+    """Two points coincide. 2 rows: the x and y components, in ground axes, of point 2 minus point 1 (m).
+
+    The multipliers are the x and y components of the force of body 2 on body 1 (N), in ground axes.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
@@ -108,15 +110,15 @@ class Revolute(Joint):
 
 
 class Prismatic(Joint):
-    """Body 2 slides along a line of body 1 without turning on it.
+    """Body 2 slides along a line of body 1 without relative rotation.
 
-    2 rows: the distance of point 2 from the line through point 1 along `axis` (m, positive on its left), and
-    theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+    2 rows: the distance of point 2 from the line through point 1 along `axis` (m), positive to the left of the axis, and
+    theta2 - theta1 - `angle` (rad). The line and its normal turn with body 1: exchanging the bodies gives another joint.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: a point of the line in body 1, and the point of body 2 that slides on it (m).
-        axis: the direction of the line in body 1's frame, as an angle (rad) or as a vector.
+        points: a point of the line on body 1, and the point of body 2 that slides on it, each in its own body's frame (m).
+        axis: the direction of the line in body 1's frame, as an angle (rad) or a vector.
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
@@ -134,12 +136,15 @@ class Prismatic(Joint):
 
 
 class Slot(Joint):
-    """A pin of body 2 slides along a line of body 1, free to turn. 1 row: its distance from the line, as in `Prismatic`.
+    """A pin of body 2 slides along a line of body 1, free to turn.
+
+    1 row: the distance of point 2 from the line through point 1 along `axis` (m), positive to the left of the axis. The line
+    turns with body 1. The multiplier is the force of the pin on body 1 (N) along this normal.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: a point of the line in body 1, and the pin in body 2 (m).
-        axis: the direction of the line in body 1's frame, as an angle (rad) or as a vector.
+        points: a point of the line on body 1, and the pin on body 2, each in its own body's frame (m).
+        axis: the direction of the line in body 1's frame, as an angle (rad) or a vector.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=given_number)
@@ -150,11 +155,11 @@ class Slot(Joint):
 
 
 class Weld(Joint):
-    """No relative motion. 3 rows: those of `Revolute`, and theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+    """No relative motion. 3 rows: the two of `Revolute` (m), then theta2 - theta1 - `angle` (rad).
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: the point where they meet, in each body's own frame (m).
+        points: the common point, in each body's own frame (m).
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
@@ -174,12 +179,13 @@ class Weld(Joint):
 class Distance(Joint):
     """A massless rod of `length` L joins two points. 1 row: (d.d - L^2) / (2 L) (m), d the vector from point 1 to point 2.
 
-    Its gradient at d.d = L^2 is the unit vector along the rod, so its multiplier is the rod's force (N), positive in compression.
+    At d.d = L^2 the gradient with respect to point 2 is the unit vector d / L, so that the multiplier is the force in the rod
+    (N), positive in tension. The order of the bodies does not matter.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: the two points that it connects, each in its own body's frame (m).
-        length: of the rod (m), greater than zero; by default as in the initial guess.
+        points: the ends of the rod, each in its own body's frame (m).
+        length: length of the rod (m), greater than zero; by default as in the initial guess.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=given_number)
@@ -193,12 +199,12 @@ class Distance(Joint):
     def complete(self, *frames):
         length = between(self.points, *frames).norm()
         reach = sum(abs(x) for frame, point in zip(frames, self.points, strict=True) for x in (frame.x, frame.y, *point))
-        # The rounding between points that coincide has no direction: a length of zero, which the mechanism refuses.
+        # Coincident points, up to rounding, give no direction: set the length to zero, which the mechanism refuses.
         return fill(self, "length", array_namespace(length).where(length > ROUNDING * reach, length, 0.0))
 
 
 class Angle(Joint):
-    """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad; default: as in the initial guess).
+    """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad). Relative translation is free.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
@@ -217,16 +223,17 @@ class Angle(Joint):
 
 
 class Gear(Joint):
-    """Two wheels mesh, their centres held by the `carrier` c (a body or the ground).
+    """Two gear wheels mesh, their centres held by the `carrier` c (a body or the ground).
 
-    1 row (m): r1 (theta1 - theta_c) + r2 (theta2 - theta_c) - constant, with r2 negated where wheel 1 is an `internal` gear
-    (or wheel 2 is: the sign does not tell). The constant is the initial guess's.
+    1 row (m): r1 (theta1 - theta_c) + r2 (theta2 - theta_c) - constant for external gears, which turn in opposite directions
+    relative to the carrier; with -r2 for an `internal` gear, with which both turn in the same direction. The sign is the same
+    whichever wheel is the internal one. The constant is the value in the initial guess.
 
     Args:
         bodies: the names of the two wheels.
-        radii: of wheel 1 and of wheel 2 (m), greater than zero.
-        internal: whether one of them is an internal gear.
-        carrier: the body that holds both centres.
+        radii: pitch radii of wheel 1 and wheel 2 (m), both greater than zero.
+        internal: whether one of the wheels is an internal gear.
+        carrier: the body that holds both centres; other joints must hold them.
     """
 
     radii: Float[Array, "2"] = eqx.field(converter=given_number, metadata=POSITIVE)
@@ -251,15 +258,16 @@ class Gear(Joint):
 
 
 class Rack(Joint):
-    """Body 2, a pinion of `radius` r centred at its centre of mass, rolls on a rack along `axis` of body 1, on the rack's left.
+    """Body 2, a pinion of `radius` r centred at its centre of mass, rolls on a rack of body 1 along `axis`, to its left.
 
-    1 row (m): s + r (theta2 - theta1) - constant, s the displacement of body 2's origin from body 1's along the axis. The
-    constant is the initial guess's. Only the rolling is held: another joint, a `Slot`, keeps the pinion at its height.
+    1 row (m): s + r (theta2 - theta1) - constant, s the displacement along `axis` of body 2's origin from body 1's: moving along
+    the axis, the pinion turns clockwise. The constant is the value in the initial guess. Only rolling is constrained; another
+    joint, such as a `Slot`, must keep the pinion at its distance from the rack.
 
     Args:
         bodies: the names of the rack and of the pinion.
-        radius: of the pinion (m), greater than zero.
-        axis: the direction of the rack in body 1's frame, as an angle (rad) or as a vector.
+        radius: pitch radius of the pinion (m), greater than zero.
+        axis: the direction of the rack in body 1's frame, as an angle (rad) or a vector; the pinion is on its left.
     """
 
     radius: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)
@@ -278,11 +286,11 @@ class Rack(Joint):
 
 
 class Profile(PrintsLine):
-    """A cam's outline: a closed curve, radius over polar angle, by a periodic cubic spline. The first point is not repeated.
+    """The closed outline of a cam: its radius over the polar angle, a periodic cubic spline.
 
     Args:
-        angle: polar angles (rad), increasing, within less than one turn; three at least.
-        radius: at each of them (m), greater than zero.
+        angle: polar angles (rad), anticlockwise, increasing within less than one turn; at least three. The first is not repeated.
+        radius: radius at each angle (m), greater than zero.
     """
 
     angle: Float[Array, "n"] = eqx.field(converter=given_number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn
@@ -293,23 +301,24 @@ class Profile(PrintsLine):
         return periodic_spline(angle, self.angle, self.radius, 2 * jnp.pi)
 
     def piece(self, angle: Number) -> Array:
-        """Return the number of the cubic at a polar angle (rad)."""
+        """Return the index of the cubic at a polar angle (rad)."""
         return count_knots(wrap(angle, self.angle[0], 2 * jnp.pi), self.angle)
 
 
 def as_profile(value: Any) -> Any:
-    """Return a profile, which may be given as a table; anything else as it is, for the mechanism to refuse."""
+    """Convert a table to a profile; return anything else unchanged, to be refused by the mechanism."""
     return Profile(**value) if isinstance(value, Mapping) and value.keys() == {"angle", "radius"} else value
 
 
 class Cam(Joint):
-    """A follower, point 2, stays on body 1's closed `profile` around point 1.
+    """A point of a follower, body 2, stays on the closed `profile` of a cam, body 1.
 
-    1 row (m): |d| - radius(phi), with d the vector from point 1 to point 2 in body 1's frame, and phi its polar angle.
+    1 row (m): |d| - radius(phi), positive outside the profile, with d the vector from point 1 to point 2 in body 1's frame, and
+    phi its polar angle. The constraint acts in both directions: the follower cannot lift off.
 
     Args:
         bodies: the names of the cam and of the follower.
-        points: the centre of the profile in body 1, and the point of body 2 that stays on it (m).
+        points: the centre of the profile on body 1, and the point of body 2 that stays on it, each in its own body's frame (m).
         profile: a `Profile`, or a table of its angles and radii.
     """
 
@@ -330,7 +339,7 @@ class Cam(Joint):
 
 
 def _lateral_distance(axis: Number, points: Float[Array, "2 2"], one: Frame, two: Frame) -> Number:
-    """Return the distance of point 2 to the left of the line through point 1 along `axis` of body 1 (m)."""
+    """Return the distance (m) of point 2 from the line through point 1 along `axis` of body 1, positive to the left."""
     normal = one.vector((-jnp.sin(axis), jnp.cos(axis)))
     return normal.dot(between(points, one, two))
 
@@ -340,5 +349,5 @@ def _replace(constraint: AnyConstraint, name: str, value: Numbers) -> AnyConstra
 
 
 def fill(constraint: AnyConstraint, name: str, value: Numbers) -> AnyConstraint:
-    """Return the constraint with its number `name` set to `value` where it is absent (None)."""
+    """Return the constraint with its number `name` set to `value` if it is absent (None)."""
     return constraint if getattr(constraint, name) is not None else _replace(constraint, name, value)

@@ -1,4 +1,4 @@
-"""A mechanism: the pytree of everything that exists in a scene, checked, with named access to every number."""
+"""A mechanism: the checked pytree of everything that exists in a scene, with named access to every number."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import Body
-from udkjax.scene.changes_by_hand import changed_by_hand, count_marks, mark_changes, marks_by_name
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
+from udkjax.scene.direct_changes import count_marks, directly_changed, mark_changes, marks_by_name
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, is_traced, make_module, number
+from udkjax.scene.element_setup import attached_bodies, check_elements, complete, completion_mistakes, name_elements
+from udkjax.scene.fields import is_traced, make_module, number
 from udkjax.scene.forces import ForceElement, Friction
-from udkjax.scene.given_elements import attached_bodies, check_elements, complete, completion_mistakes, name_elements
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.joints import Constraint, Joint
@@ -39,7 +39,7 @@ Module = TypeVar("Module", bound=eqx.Module)
 
 
 class Origin:
-    """The concrete mechanism that one with traced numbers was made from. It is hashable, and equal where its numbers are."""
+    """The concrete mechanism from which one with traced numbers was made. It is hashable, and compares by value."""
 
     def __init__(self, mechanism: "Mechanism"):
         self.mechanism = mechanism
@@ -55,7 +55,7 @@ class Origin:
 
 
 class AbstractDrawing(PrintsTable):
-    """Source that a mechanism was made from, whose own numbers decide on those of the bodies: pins, widths, densities."""
+    """The source of a mechanism, whose numbers (pins, widths, densities) determine those of the bodies."""
 
     @property
     @abstractmethod
@@ -64,39 +64,39 @@ class AbstractDrawing(PrintsTable):
 
     @abstractmethod
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "AbstractDrawing":
-        """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""
+        """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
 
     @abstractmethod
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
-        """Return a body, or the ground, and the point in its frame (m) where a pin is; None where there is no such pin."""
+        """Return a body (or the ground) at a pin and the pin's position in the body's frame (m); None for an unknown pin."""
 
     @abstractmethod
     def shapes(self) -> dict[str, Array]:
-        """Return the points (n, 2) through which bodies are drawn, by name, in their own frames (m)."""
+        """Return the points (n, 2) through which each body is drawn, in its own frame (m), by name."""
 
     @property
     @abstractmethod
     def polygons(self) -> list[str]:
-        """The bodies whose shape is the polygon of these points, as corners in their order."""
+        """The bodies that are polygons with these points, in order, as corners."""
 
     @abstractmethod
     def free_pins(self) -> dict[str, tuple[str, Array]]:
-        """Return the pins that belong to one body alone: the body of each, and its place in the body's frame (m)."""
+        """Return the pins that belong to a single body: the body, and the position in its frame (m)."""
 
     @abstractmethod
     def mechanism(self) -> "Mechanism":
-        """Return the mechanism that is drawn."""
+        """Return the mechanism of the drawing."""
 
 
 class Mechanism(PrintsTable):
-    """Bodies, joints, drivers and force elements, each under its name, and gravity.
+    """Bodies, joints, drivers and force elements by name, and gravity.
 
-    Data alone: `udkjax.analyse` finds what follows from it, such as redundant rows. A pytree whose leaves
-    are all of its numbers; names, topology and types are static. Names, orders and rows are the user's: `constraints` are the
-    joints in their order, then the drivers. `forces` may be a list: an element without a name is called TYPE1, TYPE2, ... by its
-    place among those of its type. Numbers that a joint leaves to the initial guess are filled in here.
+    It is data only; `udkjax.analyse` finds its properties, such as redundant rows. All numbers are leaves of the pytree; names,
+    topology and types are static. The user's order is kept: `constraints` are the joints in their order, then the drivers.
+    `forces` may be a list: unnamed elements are numbered by type, TYPE1, TYPE2, ... Numbers that a joint leaves to the initial
+    guess are filled in here.
 
-    Raises `SceneError`, which lists every mistake. Numbers that are traced are not looked at; their shapes are.
+    Raises a `SceneError` that lists all mistakes. For traced numbers only shapes are checked.
 
     Args:
         bodies: a `Body` by name.
@@ -105,9 +105,9 @@ class Mechanism(PrintsTable):
         forces: a force element by name, or a list of them.
         gravity: in m/s^2.
         name: of the mechanism, for titles and files.
-        origin: for internal use: the known mechanism that traced numbers stand for.
-        drawing: the `Drawing` that it is made from, if any.
-        changed: for internal use: one for each entry of a number that does not follow from the drawing any more, zero for others.
+        origin: for internal use: the concrete mechanism behind traced numbers.
+        drawing: the `Drawing` from which it is made, if any.
+        changed: for internal use: one for each entry of a number that no longer follows from the drawing, zero for others.
     """
 
     name: str = eqx.field(static=True)
@@ -116,15 +116,15 @@ class Mechanism(PrintsTable):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
-    origin: Origin | None = eqx.field(static=True)  # of traced numbers: the concrete ones that they stand for
+    origin: Origin | None = eqx.field(static=True)  # the concrete mechanism behind traced numbers
     # JAX sorts the keys of a dict: tuples keep the user's order.
     _bodies: tuple[Body, ...]
     _joints: tuple[Joint, ...]
     _drivers: tuple[Driver, ...]
     _forces: tuple[ForceElement, ...]
-    drawing: AbstractDrawing | None = None  # the drawing that it was made from
-    # Of a drawn one: one for each entry of a number of the elements that was changed by hand, zero where it follows from the
-    # drawing. A number itself, so that what was changed and what was not are of one structure: one program serves both.
+    drawing: AbstractDrawing | None = None
+    # In a drawn mechanism: one for each entry of a number that was changed directly, zero if it follows from the drawing. These
+    # marks are numbers, so that mechanisms with and without changes have the same structure and share programs.
     changed: Float[Array, "K"] | None = None
 
     def __init__(
@@ -187,7 +187,7 @@ class Mechanism(PrintsTable):
         return _by_name(self.joint_names + self.driver_names, self._joints + self._drivers)
 
     def frames_of(self, element: Constraint | ForceElement) -> tuple[str, ...]:
-        """Return the names of the bodies whose frames an element gets, in that order."""
+        """Return the names of the bodies whose frames an element takes, in order."""
         return attached_bodies(element, self.joints if isinstance(element, Friction) else {})
 
     @property
@@ -202,25 +202,25 @@ class Mechanism(PrintsTable):
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | None:
-        """The times (s) where the motion is not smooth, as the elements name them, in any order; None where none does."""
+        """The times (s) where the motion is not smooth, collected from the elements, unsorted; None if there are none."""
         named = [number(e.breakpoints).reshape(-1) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
         held = [x.breakpoints for x in self.samples.values() if isinstance(x, Held)]
         if any(map(len, held)):
             named.append(number(np.unique(np.concatenate(held))))
         if not named:
             return None
-        known = not is_traced(named)  # and stays so while something else is traced
-        return number(np.concatenate(named)) if known else jnp.concatenate(named)
+        concrete = not is_traced(named)  # and must stay concrete while something else is traced
+        return number(np.concatenate(named)) if concrete else jnp.concatenate(named)
 
     @property
     def samples(self) -> dict[tuple[str, int, str], Any]:
-        """The numbers that have samples, each a `Held` or a `Spline`, by the place of its element and its field."""
+        """The sampled numbers, each a `Held` or a `Spline`, by section, index and field."""
         sections = {"_drivers": self._drivers, "_forces": self._forces}
         places = [(section, *place) for section, elements in sections.items() for place in sampled_fields(elements)]
         return {place: getattr(sections[place[0]][place[1]], place[2]) for place in places}
 
     def with_samples(self, samples: Mapping[tuple[str, int, str], Any]) -> "Mechanism":
-        """Return the mechanism with something else in the places of `samples`; nothing is checked."""
+        """Return the mechanism with other values in place of `samples`, without checks."""
         if not samples:
             return self
         changed = {section: list(getattr(self, section)) for section in ("_drivers", "_forces")}
@@ -230,11 +230,11 @@ class Mechanism(PrintsTable):
 
     @property
     def without_samples(self) -> "Mechanism":
-        """The mechanism that programs are made of: with one interval, of numbers zero, in place of all that has samples."""
+        """The mechanism from which programs are made: with a single interval of zeros in place of all samples."""
         return self.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in self.samples.items()})
 
-    def at(self, t: Scalar) -> "Mechanism":
-        """Return the mechanism with one interval, that at time t (s), in place of all that has samples."""
+    def at(self, t: NumberLike) -> "Mechanism":
+        """Return the mechanism with only the interval at time t (s) in place of all samples."""
         samples = self.samples
         traced = is_traced((t, samples))
         xp, eager = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
@@ -243,7 +243,7 @@ class Mechanism(PrintsTable):
 
     @property
     def without_origin(self) -> "Mechanism":
-        """The same mechanism without its `origin` and its `drawing`: a program compiled for it serves all of them."""
+        """The mechanism without `origin` and `drawing`: one compiled program serves all mechanisms that agree without them."""
         if self.origin is None and self.drawing is None:
             return self
         return _copy(self, {"origin": None, "drawing": None, "changed": None})
@@ -255,7 +255,7 @@ class Mechanism(PrintsTable):
 
     @property
     def numbers(self) -> list[Array]:
-        """All numbers of the equations, in the order in which programs take them: leaves without those of the drawing."""
+        """All numbers of the equations, in the order in which programs take them: the leaves without those of the drawing."""
         return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
     @property
@@ -266,69 +266,68 @@ class Mechanism(PrintsTable):
     def _table(self) -> PrintedTable:
         return mechanism_table(self, self.frames_of)
 
-    _shapes = _table  # traced numbers are named as such, element by element
+    _shapes = _table  # it marks traced numbers as such
 
     def parameters(self) -> dict[str, Array]:
-        """Return every number of the scene under its name, such as `body.link1.mass`; absent ones (a damping) are left out."""
+        """Return every number of the scene by name, such as `body.link1.mass`, without absent ones (an optional damping)."""
         return {name: p.value for name, p in parameters_of(self).items() if p.value is not None}
 
     def with_parameters(self, values: Mapping[str, Numbers | Held]) -> "Mechanism":
         """Return the mechanism with some of its numbers replaced; pure, and values may be traced.
 
-        `values` maps names as in `parameters`, or those of one entry (`joint.A.points[1][0]`), to values of exactly the same
-        shape: a batch of values belongs inside `vmap`. A number that may have samples may be given as a `Held`. A mechanism with
-        traced values remembers the known numbers that it was made from (`origin`), so that their analysis serves it. A number
-        that was absent is then there. Numbers that a joint once took from the initial guess stay as they are; the constants of
-        gears and racks follow the guess.
+        `values` maps names as in `parameters`, or names of entries (`joint.A.points[1][0]`), to values of exactly the same shape:
+        use `vmap` for a batch of values. Absent numbers may be set. A number that may be sampled may be given as a `Held`. A
+        mechanism with traced values remembers the concrete one that it was made from (`origin`), whose analysis it uses. Numbers
+        that a joint has taken from the initial guess do not change, except the constants of gears and racks.
 
-        Numbers of a drawing (`pin.A`, `link.crank.width`) change all that follows from them. A number that follows from the
-        drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
+        Numbers of a drawing (`pin.A`, `link.crank.width`) change everything that follows from them. A number that follows from
+        the drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
         """
         require_values(values, self.name)
         traced = is_traced(dict(values))
         origin = Origin(self) if traced and self.is_concrete else self.origin
         base, own, changed = self, values, None
         if self.drawing is not None:
-            base, own, by_hand = self._redraw(self.drawing, values)
+            base, own, direct = self._redraw(self.drawing, values)
         new, gravity = replace_numbers(groups_of(base), base.gravity, own, parameters_of(base), self.name)
         if self.drawing is not None:
-            changed = mark_changes(self, new, by_hand)
+            changed = mark_changes(self, new, direct)
         elements = new["body"], new["joint"], new["driver"], new["force"]
         return Mechanism(*elements, gravity, self.name, origin, base.drawing, changed)
 
     @property
     def departs_from_drawing(self) -> bool:
-        """True if a number does not follow from the drawing any more, or may not, as numbers are traced."""
+        """True if a number no longer follows from the drawing, or if the marks are traced."""
         return self.changed is not None and (is_traced(self.changed) or bool(np.any(np.asarray(self.changed))))
 
     @property
     def changed_names(self) -> list[str]:
-        """Names of known numbers of which an entry does not follow from the drawing any more."""
+        """Names of the concrete numbers with an entry that no longer follows from the drawing."""
         return [name for name, mark in marks_by_name(self).items() if np.any(np.asarray(mark))]
 
     def _redraw(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], list[str]]:
-        """Return the mechanism of the drawing with its share of the values, the other values, and the names of those by hand."""
+        """Return the mechanism redrawn with the drawing's values, all direct changes, and the names of the new ones."""
         drawn, known = parameters_in(drawing.groups), parameters_of(self)
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
         own = {name: value for name, value in values.items() if name not in of_drawing}
         if not of_drawing:
             return self, own, list(own)
-        replace_numbers(groups_of(self), self.gravity, own, known, self.name)  # all mistakes in names before anything else
+        replace_numbers(groups_of(self), self.gravity, own, known, self.name)  # raises all mistakes in names first
         drawn["gravity"] = known["gravity"]
         groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
         redrawn = drawing.with_groups(groups, gravity).mechanism()
-        return redrawn, changed_by_hand(self, redrawn) | own, list(own)
+        return redrawn, directly_changed(self, redrawn) | own, list(own)
 
 
 def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
-    known = not is_traced((vectors, numbers))  # by NumPy: jnp takes its time for each array
-    if known:
+    concrete = not is_traced((vectors, numbers))  # by NumPy, as jnp is slow for many small arrays
+    if concrete:
         return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
     return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])
 
 
 def _copy(module: Module, changes: dict[str, object]) -> Module:
-    """Return a module with other values in some fields, without checking anything."""
+    """Return a module with other values in some fields, without checks."""
     return make_module(type(module), **vars(module) | changes)
 
 

@@ -1,4 +1,4 @@
-"""Mechanisms as the tables of a TOML file, format 1, and back; reading gives the same numbers, bit by bit."""
+"""Convert mechanisms to the tables of a TOML file, format 1, and back, with bitwise identical numbers."""
 
 import re
 import tomllib
@@ -8,18 +8,19 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from udkjax.annotations import TomlTable
 from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, abbreviate, find_class, problems_of, unknown_key
-from udkjax.scene.fields import Table, is_traced, vector_as_angle
-from udkjax.scene.given_elements import name_elements
+from udkjax.scene.element_setup import name_elements
+from udkjax.scene.fields import is_traced, vector_as_angle
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import groups_of
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 
-FORMAT_VERSION = 1  # of scenes of bodies and joints
+FORMAT_VERSION = 1  # of the format of scenes with bodies and joints
 
 
 def mechanism_text(mechanism: Mechanism) -> str:
-    """Return a mechanism as the text of a TOML file; raise `SceneError` where the format cannot hold it."""
+    """Return a mechanism as the text of a TOML file; raise a `SceneError` if the format cannot express it."""
     check_known(mechanism, mechanism.name)
     entries = [
         SceneEntry(section, index, name, type(element), table_of(element))
@@ -38,13 +39,13 @@ def mechanism_text(mechanism: Mechanism) -> str:
 
 
 def check_known(tree: eqx.Module, name: str) -> None:
-    """Raise `SceneError` where numbers are traced: a file cannot hold them."""
+    """Raise a `SceneError` if numbers are traced."""
     if is_traced(tree):
         raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], name)
 
 
 def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
-    """Return the mechanism of the tables of a file; raise `SceneError`, with the name of the file."""
+    """Return the mechanism described by the tables of a file; raise a `SceneError` that names the file."""
     entries, problems = [], list(head_mistakes(scene, ("format", "name", "gravity", *SECTIONS)))
     for section in SECTIONS:
         entries.extend(read_section(section, scene.get(section, []), problems, CLASSES_WITHOUT_TYPE.get(section)))
@@ -59,8 +60,8 @@ def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
     return Mechanism(made["body"], made["joint"], made["driver"], made["force"], gravity, scene.get("name", ""))
 
 
-def head_mistakes(scene: Table, expected: Collection[str]) -> Iterator[str]:
-    """Iterate over the mistakes at the top of a file, whose keys are `expected`."""
+def head_mistakes(scene: TomlTable, expected: Collection[str]) -> Iterator[str]:
+    """Iterate over the mistakes in the top-level keys of a file."""
     if not isinstance(scene.get("name", ""), str):
         yield f"name: must be a string, is {abbreviate(scene['name'])}"
     for key in scene:
@@ -72,9 +73,9 @@ def head_mistakes(scene: Table, expected: Collection[str]) -> Iterator[str]:
 def read_section(
     section: str, tables: object, problems: list[str], cls: type | None = None, counted: bool = False
 ) -> Iterator[SceneEntry]:
-    """Iterate over the entries of one section; adds to the problems if it is no list of tables.
+    """Iterate over the entries of one section; add to the problems if it is not a list of tables.
 
-    Their class is `cls`, or that which their types name. Those without a name are counted, as SECTION1, if they are `counted`.
+    Their class is `cls`, or follows from their `type`. If `counted`, unnamed ones are numbered, as SECTION1.
     """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
@@ -92,8 +93,8 @@ def read_section(
         yield entry
 
 
-def check_classes(where: str, cls: type, table: Table) -> Iterator[str]:
-    """Iterate over the classes in an element that a file cannot name."""
+def check_classes(where: str, cls: type, table: TomlTable) -> Iterator[str]:
+    """Iterate over the classes in an element for which the format has no type."""
     if not is_in_format(cls):
         yield f"{where}: a scene file has no type for the class {cls.__name__}; keep this scene in Python"
     for name, value in table.items():
@@ -102,18 +103,18 @@ def check_classes(where: str, cls: type, table: Table) -> Iterator[str]:
 
 
 def type_key(cls: type) -> dict[str, str]:
-    """Return the key by which a file names the class of an element, where it needs one."""
+    """Return the `type` key for the class of an element, if the format requires one."""
     return {} if cls in CLASSES_WITHOUT_TYPE.values() else {"type": type_name(cls)}
 
 
-# tomli-w writes each number of a list on a line of its own: 174 lines for the paper's linkage, where these are 75.
-def key_lines(table: Table) -> list[str]:
-    """Return a table as lines of TOML, one a key."""
+# tomli-w writes one number per line: 174 lines for the paper's linkage, instead of 75.
+def key_lines(table: TomlTable) -> list[str]:
+    """Return a table as lines of TOML, one per key."""
     return [f"{key if re.fullmatch('[A-Za-z0-9_-]+', key) else _string(key)} = {toml(value)}" for key, value in table.items()]
 
 
 def toml(value: object) -> str:
-    """Return a value as TOML; a float's shortest text that reads back as the same float."""
+    """Return a value as TOML, with the shortest text of a float that reads back as the same float."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -136,27 +137,27 @@ def _string(text: str) -> str:
 
 
 def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
-    """Return the tables of a text.
+    """Parse a TOML text.
 
     Args:
-        text: TOML; a byte order mark before it is passed over.
-        source: The file that it stands in, or empty.
+        text: The text; a leading byte order mark is skipped.
+        source: The file that contains it, or empty.
         error: The class of the error.
 
     Returns:
         The tables.
 
     Raises:
-        Mistakes: `error`; the text is not TOML, nests too deeply, or holds a number of thousands of digits.
+        Mistakes: `error`; the text is not TOML, nests too deeply, or contains a number with thousands of digits.
     """
     try:
         return tomllib.loads(text.removeprefix("\ufeff"))
     except RecursionError:
         raise error(["not valid here: lists or tables nest too deeply to be read; three levels are enough"], source) from None
-    except ValueError as problem:  # not TOML, or a whole number of more digits than Python reads
+    except ValueError as problem:  # not TOML, or an integer with more digits than Python reads
         raise error([f"not valid TOML: {problem}"], source) from None
 
 
 def is_xml(text: str) -> bool:
-    """Return whether a text is XML rather than TOML, or the name of a file."""
+    """Return True if a text begins like XML."""
     return text.removeprefix("\ufeff").lstrip().startswith("<")

@@ -1,6 +1,6 @@
-"""Requirements on arguments by their names, the same in every public function, whatever the annotations say.
+"""Requirements on arguments by their names, the same in every public function, whatever the annotations.
 
-None of them gets None: where a parameter may be None, nothing is required of it then; elsewhere None is refused (arguments.py).
+They are never applied to None: it passes where a parameter may be None, and is refused elsewhere (arguments.py).
 """
 
 import dataclasses
@@ -16,10 +16,10 @@ import numpy as np
 
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import (
+    ArgumentCheck,
     ArgumentError,
     ArgumentTypeError,
-    Check,
-    Given,
+    GivenArguments,
     array,
     describe,
     require_coordinates,
@@ -32,8 +32,8 @@ from udkjax.scene.requirements import (
 )
 
 
-def _check_state(name: str, value: Any, given: Given) -> None:
-    value = getattr(value, "state", value)  # a closure has one
+def _check_state(name: str, value: Any, given: GivenArguments) -> None:
+    value = getattr(value, "state", value)  # the state of a `Closure`
     for part in ("q", "v"):
         require_coordinates(f"{name}.{part}", getattr(value, part), given, flat=False)
     shapes = np.shape(value.q), np.shape(value.v)
@@ -41,7 +41,7 @@ def _check_state(name: str, value: Any, given: Given) -> None:
         raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
 
 
-def _check_thresholds(name: str, value: Any, given: Given) -> None:
+def _check_thresholds(name: str, value: Any, given: GivenArguments) -> None:
     """Check the thresholds of a pseudoinverse, or the gains of a stabilization."""
     for field in dataclasses.fields(value) if isinstance(value, eqx.Module) else ():
         x = getattr(value, field.name)
@@ -49,7 +49,7 @@ def _check_thresholds(name: str, value: Any, given: Given) -> None:
             require_number(f"{name}.{field.name}", x, "not negative")
 
 
-def _check_analysis(name: str, value: Any, given: Given) -> None:
+def _check_analysis(name: str, value: Any, given: GivenArguments) -> None:
     mechanism = given.get("mechanism")
     if not isinstance(mechanism, Mechanism):
         return
@@ -58,9 +58,9 @@ def _check_analysis(name: str, value: Any, given: Given) -> None:
         raise ArgumentError(f"{name} is that of another mechanism: give udk.analyse(mechanism), or leave it out")
 
 
-def _of_diffrax(kind: str, example: str) -> Check:
-    def check(name: str, value: Any, given: Given):
-        diffrax = sys.modules.get("diffrax")  # imported already by whoever has an instance of its classes
+def _of_diffrax(kind: str, example: str) -> ArgumentCheck:
+    def check(name: str, value: Any, given: GivenArguments):
+        diffrax = sys.modules.get("diffrax")  # imported if an instance of its classes exists
         if not (diffrax and isinstance(value, getattr(diffrax, kind))):
             meant = f"an instance of diffrax's, such as {name}={example}, or None"
             raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")
@@ -68,10 +68,10 @@ def _of_diffrax(kind: str, example: str) -> Check:
     return check
 
 
-def _of_kind(meant: str, suits: Callable[[Any], bool]) -> Check:
-    """Return the check of an argument that must suit; `meant` says in words what does."""
+def _of_kind(meant: str, suits: Callable[[Any], bool]) -> ArgumentCheck:
+    """Return a check that an argument satisfies `suits`; `meant` describes valid arguments in messages."""
 
-    def check(name: str, value: Any, given: Given):
+    def check(name: str, value: Any, given: GivenArguments):
         if not suits(value):
             raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
 
@@ -93,25 +93,25 @@ _require_mapping = _of_kind(
 
 
 def _is_coordinate(x: Any) -> bool:
-    """Return whether something is the name of a driver or a coordinate, or a `Coordinate`."""
+    """Return True for the name of a driver or a coordinate, or a `Coordinate`."""
     return bool(x) if isinstance(x, str) else hasattr(x, "bodies")
 
 
 def _is_parameter(x: Any) -> bool:
-    """Return whether something is the name of a parameter, a `Parameter`, or names that are tied."""
+    """Return True for the name of a parameter, a `Parameter`, or names of tied parameters."""
     return isinstance(x, str | list | tuple) or callable(x) or dataclasses.is_dataclass(x)
 
 
-def _require_point(name: str, value: Any, given: Given) -> None:
+def _require_point(name: str, value: Any, given: GivenArguments) -> None:
     if "of" in given and np.shape(value) != (2,):
-        return  # `path` knows the points of pins, and says what a shape should be
+        return  # `path` resolves pins and checks the shape
     if array(name, value).shape != (2,):
         raise ArgumentError(f"{name} must be two numbers, x and y in m, {describe(value)}")
     require_finite(name, value)
 
 
-def _require_drivers(name: str, value: Any, given: Given) -> None:
-    """Check names of drivers with their values, or, where they have none here, names alone."""
+def _require_drivers(name: str, value: Any, given: GivenArguments) -> None:
+    """Check a mapping of drivers to values, or a list of names of drivers where they have no values."""
     if isinstance(value, Mapping):
         for driver, values in value.items():
             require_finite(f"{name}[{driver!r}]", values)
@@ -125,7 +125,7 @@ def _require_drivers(name: str, value: Any, given: Given) -> None:
         raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
 
 
-CHECKS: dict[str, Check] = {
+CHECKS: dict[str, ArgumentCheck] = {
     "out": _of_kind("be a path, or None", lambda x: isinstance(x, str | os.PathLike)),
     "memory": require_count,
     "drivers": _require_drivers,

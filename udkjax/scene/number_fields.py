@@ -1,4 +1,4 @@
-"""Every number of a mechanism under one name: the path in a scene file, with the element's name in place of its index."""
+"""Names of all numbers of a mechanism: the path in a scene file, with the element's name in place of its index."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -7,13 +7,14 @@ from typing import Any, NamedTuple, Protocol
 import equinox as eqx
 from jaxtyping import Array
 
+from udkjax.annotations import Numbers
 from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
-from udkjax.scene.fields import Numbers, number
+from udkjax.scene.fields import number
 from udkjax.scene.held import Held, given_sampled
 from udkjax.scene.schema import numbers_in
 
 _SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
-Groups = dict[str, dict[str, Any]]  # elements by section and name
+ElementGroups = dict[str, dict[str, Any]]  # elements by section and name
 
 
 class Drawn(Protocol):
@@ -42,24 +43,24 @@ class Sections(Protocol):
 
 
 class NumberField(NamedTuple):
-    """The place of a number in a mechanism, its value and its shape."""
+    """The location of a number in a mechanism, its value and its shape."""
 
     section: str
     owner: str
-    path: tuple[str, ...]  # of fields; none: gravity
+    path: tuple[str, ...]  # fields; empty for gravity
     value: Array | None  # None: absent
     shape: tuple[int, ...] | None  # None: absent, any shape
 
 
 def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
-    """Return every number of a mechanism by name, absent ones too; first those of the drawing that it was made from."""
+    """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
     found = {} if mechanism.drawing is None else parameters_in(mechanism.drawing.groups)
     gravity = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
     return gravity | found | parameters_in(groups_of(mechanism))
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
-    """Return every number of some elements by name; that of a pin's position is the pin's: `pin.A`."""
+    """Return every number of some elements by name; the position of a pin has the name of the pin, `pin.A`."""
     found = {}
     for section, elements in groups.items():
         for owner, element in elements.items():
@@ -69,7 +70,7 @@ def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, N
     return found
 
 
-def groups_of(mechanism: Sections) -> Groups:
+def groups_of(mechanism: Sections) -> ElementGroups:
     """Return the elements of a mechanism by section and name."""
     return {section: dict(getattr(mechanism, plural)) for section, plural in _SECTIONS.items()}
 
@@ -83,7 +84,7 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
 
 
 def require_values(values: object, name: str) -> None:
-    """Raise `SceneError`, of the scene called `name`, where values do not go by names of parameters."""
+    """Raise a `SceneError` unless `values` maps names to numbers; `name` is the scene's."""
     if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
         raise SceneError([f"values must map names of parameters to numbers, is {abbreviate(values)}"], name)
 
@@ -94,14 +95,14 @@ def replace_numbers(
     values: Mapping[str, Any],
     known: Mapping[str, NumberField],
     name: str,
-) -> tuple[Groups, Array]:
-    """Return elements by section and name, and gravity, with the values in.
+) -> tuple[ElementGroups, Array]:
+    """Return elements by section and name, and gravity, with some values replaced.
 
     Args:
         groups: The elements.
         gravity: The acceleration of gravity (m/s^2).
-        values: Numbers by their names, or those of entries.
-        known: The numbers that there are, as `parameters_of` finds them.
+        values: Numbers by their names, or by the names of their entries.
+        known: All numbers of the mechanism, from `parameters_of`.
         name: Name of the scene, for the message of an error.
 
     Returns:
@@ -112,10 +113,10 @@ def replace_numbers(
     """
     groups, problems, scene = {section: dict(elements) for section, elements in groups.items()}, [], name
     sampled = {held_name: _field_of_held(known[f"{held_name}.values"]) for held_name in held_names(known)}
-    # Whole arrays before their entries, whatever the order of the keys: jit sorts them.
+    # Whole arrays before single entries, whatever the order of the keys, which jit sorts.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
         name, index = split_index(given, known)
-        if name in sampled or isinstance(values[given], Held):  # a number with samples in place of one without, or the reverse
+        if name in sampled or isinstance(values[given], Held):  # replaces a plain number by a sampled one, or the reverse
             field = sampled.get(name) or known.get(name)
             if field is not None and field.path:
                 element = groups[field.section][field.owner]
@@ -139,7 +140,7 @@ def replace_numbers(
 
 
 def held_names(known: Collection[str]) -> list[str]:
-    """Return the names of the numbers of forces that have samples."""
+    """Return the names of the sampled numbers of forces."""
     return [name.removesuffix(".values") for name in known if name.endswith(".values") and name.startswith("force.")]
 
 
@@ -148,20 +149,20 @@ def _field_of_held(values: NumberField) -> NumberField:
 
 
 def value_of(known: Mapping[str, NumberField], name: str, groups: Mapping[str, Mapping[str, Any]]) -> Any:
-    """Return the value of a number, with its samples if it has any, or of one of its entries, by its name."""
+    """Return the value of a number, a `Held` if it is sampled, or of one of its entries, by name."""
     if name in held_names(known):
         section, owner, path, *_ = _field_of_held(known[f"{name}.values"])
         return _at(groups[section][owner], path)
     owner, index = split_index(name, known)
     value = known[owner].value
-    assert value is not None  # only what is there has been set
+    assert value is not None  # only existing numbers have been set
     return value[index] if index else value
 
 
 def _fit(
     given: str, value: Numbers, name: str, index: tuple[int, ...], shape: tuple[int, ...] | None, old: Array | None
 ) -> tuple[Array | None, str]:
-    """Return the parameter's new value, or None and why the value does not fit."""
+    """Return the new value of a parameter, or None and why the value does not fit."""
     try:
         new = None if isinstance(value, bool) else number(value)
     except (TypeError, ValueError, OverflowError):

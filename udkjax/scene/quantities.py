@@ -1,4 +1,4 @@
-"""Quantities of a mechanism that are no single number of it: functions of a mechanism and a value, which texts can name."""
+"""Quantities of a mechanism that are not single parameters: functions of a mechanism and a value, which texts can name."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,22 +7,22 @@ import jax.numpy as jnp
 from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
-Setter = TypeAliasType("Setter", Callable[[Mechanism, Scalar], Mechanism])  # (mechanism, value) -> mechanism
+Setter = TypeAliasType("Setter", Callable[[Mechanism, NumberLike], Mechanism])  # (mechanism, value) -> mechanism
 
 
 @dataclass(frozen=True)
 class Length:
-    """Gives bodies another length (m), all the same: see `with_length`."""
+    """Sets the length (m) of bodies, all to the same value: see `with_length`."""
 
     bodies: tuple[str, ...]
     as_rod: bool = False
 
-    def __call__(self, mechanism: Mechanism, value: Scalar) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: NumberLike) -> Mechanism:
         return with_length(mechanism, self.bodies, value, self.as_rod)
 
     def __str__(self) -> str:
@@ -31,11 +31,11 @@ class Length:
 
 @dataclass(frozen=True)
 class InitialAngle:
-    """Gives bodies another initial angle (rad): see `with_angle`."""
+    """Sets the initial angle (rad) of bodies: see `with_angle`."""
 
     bodies: tuple[str, ...]
 
-    def __call__(self, mechanism: Mechanism, value: Scalar) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: NumberLike) -> Mechanism:
         return with_angle(mechanism, self.bodies, value)
 
 
@@ -45,12 +45,12 @@ class Scaled:
 
     factors: Mapping[str, float]
 
-    def __call__(self, mechanism: Mechanism, value: Scalar) -> Mechanism:
+    def __call__(self, mechanism: Mechanism, value: NumberLike) -> Mechanism:
         return mechanism.with_parameters({name: factor * jnp.asarray(value) for name, factor in self.factors.items()})
 
 
 def parameter_value(mechanism: Mechanism, name: str) -> Array:
-    """Return the value of a parameter that is there, or one entry of it (`joint.A.points[1][0]`)."""
+    """Return the value of an existing parameter, or one entry of it (`joint.A.points[1][0]`)."""
     known = parameters_of(mechanism)
     owner, index = split_index(name, known)
     return jnp.asarray(known[owner].value)[index]

@@ -1,4 +1,4 @@
-"""Requirements on arguments: real, finite, of a shape and a sign; the errors say which was not, with what was given."""
+"""Requirements on arguments (real, finite, shape, sign), with errors that state the argument and its value."""
 
 from collections.abc import Callable, Mapping, Sequence
 from inspect import isclass
@@ -15,22 +15,22 @@ from udkjax.scene.checks import abbreviate, quote
 from udkjax.scene.fields import is_traced
 from udkjax.scene.mechanism import Mechanism
 
-Given = Mapping[str, Any]  # all arguments of a call by name, defaults among them
-Check = Callable[..., None]  # of the name of an argument, its value, and `given`, all arguments of the call
+GivenArguments = Mapping[str, Any]  # all arguments of a call by name, including defaults
+ArgumentCheck = Callable[..., None]  # (name, value, given): an argument, and all arguments of the call
 Sign = Literal["any", "positive", "not negative"]
-NOTHING: Given = MappingProxyType({})
+NOTHING: GivenArguments = MappingProxyType({})
 
 
 class ArgumentError(ValueError):
-    """An argument of a public function cannot be used; the message names it, what was given and what is meant."""
+    """An argument of a public function has an invalid value; the message states its name, its value and the requirement."""
 
 
 class ArgumentTypeError(ArgumentError, TypeError):
-    """It is of a wrong type."""
+    """An argument of a public function has the wrong type."""
 
 
 def describe(value: Any) -> str:
-    """Describe a value for the end of a message: 'not the class SVD', 'not "SVD", a text'."""
+    """Describe an invalid value for the end of a message: 'not the class SVD', 'not the text "SVD"'."""
     if isclass(value):
         return f"not the class {value.__name__}"
     if isinstance(value, str):
@@ -43,12 +43,12 @@ def describe(value: Any) -> str:
 
 
 def article(noun: str) -> str:
-    """Return "a" or "an", as a noun takes it."""
+    """Return "a" or "an", as required by a noun."""
     return "an" if noun[0].lower() in "aeiou" else "a"
 
 
 def array(name: str, value: Any) -> "np.ndarray | Tracer":
-    """Return real numbers as an array; a traced one as it is. Raises TypeError where they are none, and names the argument."""
+    """Return real numbers as an array, a traced one unchanged; raise a `TypeError` that names the argument for anything else."""
     if isinstance(value, Tracer):
         found: Any = value
     elif not isinstance(value, np.ndarray | float) and is_traced(value):
@@ -62,14 +62,14 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
             raise ArgumentTypeError(f"{name} must be an array of numbers, {describe(value)}") from None
     if found.dtype.kind in "fiu":
         return found
-    if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):  # of few digits
+    if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):  # bfloat16 and the like
         kind = "complex numbers" if jnp.issubdtype(found.dtype, jnp.complexfloating) else None
         raise ArgumentTypeError(f"{name} must be real numbers, {f'not {kind}' if kind else describe(value)}")
     return found
 
 
-def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: Given = NOTHING) -> None:
-    """Require one real number, finite unless said otherwise, of a sign; of a traced one, the shape and the dtype alone."""
+def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: GivenArguments = NOTHING) -> None:
+    """Require one real number of a sign, finite unless `infinite`; of a traced one, only shape and dtype are checked."""
     found = array(name, value)
     if found.shape != ():
         cure = "a batch is for jax.vmap, or for udk.sweep"
@@ -83,8 +83,8 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
         raise ArgumentError(f"{name} must be {meant}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
 
 
-def require_count(name: str, value: Any, least: int = 1, given: Given = NOTHING) -> None:
-    """Require a whole number that is not below `least`; of a traced one, the shape and the dtype alone."""
+def require_count(name: str, value: Any, least: int = 1, given: GivenArguments = NOTHING) -> None:
+    """Require an integer, at least `least`; of a traced one, only shape and dtype are checked."""
     found = None if isinstance(value, bool | np.bool_) else array(name, value)
     if found is None or found.shape != () or not jnp.issubdtype(found.dtype, jnp.integer):
         raise ArgumentTypeError(f"{name} must be a whole number, {describe(value)}")
@@ -92,8 +92,8 @@ def require_count(name: str, value: Any, least: int = 1, given: Given = NOTHING)
         raise ArgumentError(f"{name} must be at least {least}, not {int(found)}")
 
 
-def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: Given = NOTHING) -> None:
-    """Require finite numbers where they are known; `place` says in words which entry it is."""
+def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: GivenArguments = NOTHING) -> None:
+    """Require finite numbers if they are concrete; `place` describes an entry in words."""
     found = array(name, value)
     if isinstance(found, Tracer) or (finite := np.isfinite(found)).all():
         return
@@ -102,10 +102,10 @@ def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *in
     raise ArgumentError(f"{name}{where} is {found[index]:g}{place(*index)}: it must be finite")
 
 
-def require_coordinates(name: str, value: Any, given: Given, flat: bool = True) -> None:
-    """Require x, y and angle of each body of the mechanism, or their rates, (bodies, 3); or (n,), if `flat`."""
+def require_coordinates(name: str, value: Any, given: GivenArguments, flat: bool = True) -> None:
+    """Require x, y and angle of each body of the mechanism, or their rates: (bodies, 3), or (n,) if `flat`."""
     mechanism, found = given["mechanism"], array(name, value)
-    if not isinstance(mechanism, Mechanism):  # a system of the user's own has coordinates as many as he gives
+    if not isinstance(mechanism, Mechanism):  # the number of coordinates of a user-written system is not known
         if found.ndim != 1:
             raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {found.shape}")
         require_finite(name, value)
@@ -124,15 +124,15 @@ def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
     return f" ({COORDINATES[coordinate]} of {quote(names[body])})"
 
 
-def require_single(name: str, value: Any, given: Given) -> None:
-    """Require that a mechanism is no batch of them."""
+def require_single(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a single mechanism, not a batch."""
     if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
         raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
 
 
-def require_times(name: str, value: Any, given: Given = NOTHING) -> None:
-    """Require a vector of finite times; of a traced one, the shape alone."""
+def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+    """Require a vector of finite times; of a traced one, only the shape is checked."""
     found = array(name, value)
     if found.ndim != 1 or not len(found):
         raise ArgumentError(f"{name} must be a vector of times in s; its shape is {found.shape}")
@@ -140,7 +140,7 @@ def require_times(name: str, value: Any, given: Given = NOTHING) -> None:
 
 
 def require_output_times(name: str, value: Any) -> None:
-    """Require at least two finite times, each after the one before; of traced ones, the shape alone."""
+    """Require at least two finite, increasing times; of traced ones, only the shape is checked."""
     found = array(name, value)
     if found.ndim != 1 or len(found) < 2:
         what = "a vector of at least two output times, from the start on"
@@ -152,8 +152,8 @@ def require_output_times(name: str, value: Any) -> None:
         raise ArgumentError(f"{name} must increase from each output time to the next: {after}")
 
 
-def require_history(name: str, value: Any, given: Given) -> None:
-    """Require a solution, or whatever has times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
+def require_history(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
     mechanism = given["mechanism"]
     missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
     if missing or isclass(value):

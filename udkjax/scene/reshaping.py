@@ -1,8 +1,8 @@
-"""Mechanisms with other lengths and starts, whose initial guess stays as closed as it was.
+"""Change lengths and initial angles of a mechanism without opening the pins of its initial guess.
 
-A length is not one number of a scene: a link that gets longer moves its attachments, and with them the bodies that hang on it. So
-does an initial angle. A change is passed on along the pins, body after body from the ground on, each turned as its
-guess has it: along a tree of pins, which holds each body once, no pin opens. The rest is for `assemble` to close.
+A length is not a single number of a scene: a longer link moves its attachments, and with them the bodies attached to it; so does
+another initial angle. The change is propagated from the ground along a spanning tree of the pins, with the angles of the initial
+guess: no pin of the tree opens. `assemble` closes the others.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,33 +10,32 @@ from collections.abc import Iterator, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import Number, NumberLike, Numbers
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
-from udkjax.scene.fields import Number, Numbers, number
+from udkjax.scene.fields import number
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.spanning_tree import spanning_tree
 
 
 @checked
-def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Scalar, as_rod: bool = False) -> Mechanism:
-    """Return the mechanism with another length of some bodies: the largest distance between two points where a body is attached.
+def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: NumberLike, as_rod: bool = False) -> Mechanism:
+    """Return the mechanism with another length of some bodies: the largest distance between two attachment points of a body.
 
-    All attachments of these bodies, to joints, drivers and forces, are scaled about their centres of mass, so that these stay
-    in their places between them. Angles stay, and positions and velocities of the initial guess follow along the pins. The
-    function is pure and differentiable.
+    All attachment points of these bodies, to joints, drivers and forces, are scaled about the centre of mass. Angles do not
+    change; positions and velocities of the initial guess follow along the pins. The function is pure and differentiable.
 
     Args:
         mechanism: The scene.
         bodies: The name of a body, or several.
         length: The length (m); it may be traced.
-        as_rod: Change mass and inertia to those of a rod of the same mass per metre, in proportion to the length and to its third
-            power; by default they stay.
+        as_rod: Scale mass and inertia as of a rod with constant mass per metre, by the length and by its third power; by default
+            they do not change.
 
     Returns:
-        The mechanism; the one that was given does not change.
+        The changed mechanism.
 
     Raises:
         SceneError: A name is not that of a body, or a body is attached at fewer than two points.
@@ -54,7 +53,7 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Scala
 
 
 def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
-    """Return the largest distance (m) between two points where a body is attached. Raises `SceneError`."""
+    """Return the largest distance (m) between two attachment points of a body. Raises `SceneError`."""
     _check_names(mechanism, body)
     points = [point for _, point in attachments(mechanism, body)]
     if len(points) < 2:
@@ -66,21 +65,21 @@ def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
 
 @checked
 def with_angle(
-    mechanism: Mechanism, bodies: Sequence[str] | str, angle: Scalar, angular_velocity: Scalar | None = None
+    mechanism: Mechanism, bodies: Sequence[str] | str, angle: NumberLike, angular_velocity: NumberLike | None = None
 ) -> Mechanism:
     """Return the mechanism with another initial angle, and angular velocity, of some bodies.
 
-    Positions and velocities of the initial guess follow along the pins: a parallelogram stays closed where all links are given.
+    Positions and velocities of the initial guess follow along the pins: a parallelogram stays closed if all its links are named.
     The function is pure and differentiable.
 
     Args:
         mechanism: The scene.
         bodies: The name of a body, or several.
         angle: The angle (rad); it may be traced.
-        angular_velocity: The angular velocity (rad/s); None: as it is.
+        angular_velocity: The angular velocity (rad/s); by default unchanged.
 
     Returns:
-        The mechanism; the one that was given does not change.
+        The changed mechanism.
 
     Raises:
         SceneError: A name is not that of a body.
@@ -102,7 +101,7 @@ def _check_names(mechanism: Mechanism, bodies: Sequence[str] | str) -> tuple[str
 
 
 def attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Array, "2"]]]:
-    """Iterate over the points (m) of a body, or of the ground, under their names as parameters, in its own frame."""
+    """Iterate over the attachment points (m) of a body or the ground, in its frame, with their names as parameters."""
     groups = {"joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
     for section, elements in groups.items():
         for name, element in elements.items():
@@ -114,18 +113,18 @@ def attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Ar
 
 
 def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
-    """Move bodies by as much as the pins that hold them have moved: a guess in which nothing has changed stays as it is."""
+    """Move bodies by the displacement of the pins that hold them: if nothing has changed, the guess does not change."""
     old = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in before.bodies.items()}
     new = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in after.bodies.items()}
     values: dict[str, Numbers] = {}
     pins = {name: 0 for name, joint in before.joints.items() if isinstance(joint, Revolute | Weld)}
     for body, holder, joint in spanning_tree(before, pins):
         if not joint:
-            continue  # a root stays
+            continue  # a root does not move
         was, now = before.joints[joint], after.joints[joint]
         one, two = (0, 1) if was.bodies[1] == body else (1, 0)
         frame = new[body]
-        # Of the holder and of the body itself, how the pin has moved; then the body makes up for the difference.
+        # Displacements of the pin on the holder and on the body; the body moves by their difference.
         shift = _subtract(_pin_state(new[holder], now.points[one]), _pin_state(old[holder], was.points[one]))
         own = _subtract(_pin_state(frame, now.points[two]), _pin_state(old[body], was.points[two]))
         x, y, vx, vy = (a - b for a, b in zip(shift, own, strict=True))

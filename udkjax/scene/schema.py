@@ -1,7 +1,7 @@
-"""The classes of a scene read as its schema: types by their names in a file, and each element as a table of its keys.
+"""The schema of the scene format, derived from the classes: types by name, and each element as a table of its keys.
 
-A table is what a TOML file holds: {key: value}, with nested tables for motion laws and profiles. It is the one form in which
-scenes are read, checked and written.
+A table is {key: value}, as in a TOML file, with nested tables for motion laws and profiles. Scenes are read, checked and written
+in this form.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ def type_name(cls: type) -> str:
 
 
 def _by_type(module: types.ModuleType, base: type) -> dict[str, type]:
-    """Return the public classes that a module derives from `base`, by their names in a file, in the order of the module."""
+    """Return the public subclasses of `base` in a module, by their names in a file, in the order of the module."""
     return {
         type_name(cls): cls
         for name, cls in vars(module).items()
@@ -46,20 +46,20 @@ CLASSES_WITHOUT_TYPE: dict[str, type] = {"body": Body, "driver": drivers.Driver,
 
 
 def is_in_format(cls: type) -> bool:
-    """Tell whether the scene format knows the class."""
+    """Return True if the scene format has a type for the class."""
     return cls in CLASSES_WITHOUT_TYPE.values() or any(cls in known.values() for known in CLASSES_BY_TYPE.values())
 
 
 class Key(NamedTuple):
     """One key of an element: a field of its class."""
 
-    annotation: Any  # without None: a type, or a union of types
+    annotation: Any  # a type or a union of types, without None
     required: bool
     metadata: FieldMetadata
 
 
 def keys(cls: type) -> dict[str, Key]:
-    """Return the keys of a class: the fields that its constructor takes, in their order."""
+    """Return the keys of a class: the fields that its constructor takes, in order."""
     found = {}
     for field in dataclasses.fields(cls):
         if field.init:
@@ -73,7 +73,7 @@ def keys(cls: type) -> dict[str, Key]:
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
-    """Return an element as a table; absent values are left out, None where it may stand, and nested modules stay modules."""
+    """Return an element as a table without absent values (None where it is the default); nested modules stay modules."""
     table = {name: getattr(element, name) for name in keys(type(element))}
     defaults = {f.name: f.default for f in dataclasses.fields(element)}
     may_be_absent = [name for name in table if defaults[name] is None or defaults[name] is dataclasses.MISSING]
@@ -81,7 +81,7 @@ def table_of(element: eqx.Module) -> dict[str, object]:
 
 
 def build(annotation: Any, value: object) -> Any:
-    """Make an element, and the modules within it, of a table that has been checked."""
+    """Make an element, including nested modules, from a checked table."""
     if not isinstance(value, dict):
         return value
     if get_origin(annotation) is types.UnionType:  # a number, or samples of it
@@ -94,7 +94,7 @@ def build(annotation: Any, value: object) -> Any:
 def numbers_in(element: eqx.Module) -> Iterator[tuple[tuple[str, ...], jax.Array | None, tuple[int, ...] | None]]:
     """Iterate over paths, values and shapes of an element's numbers.
 
-    A value is None where a number is absent but could be there; its shape is the annotation's, or None if that leaves it open.
+    The value of an absent number is None, and its shape is the annotation's, or None if the annotation does not determine it.
     """
     for name, key in keys(type(element)).items():
         value = getattr(element, name)

@@ -1,4 +1,4 @@
-"""Spanning trees of a mechanism: joints by which every body is reached from the ground, each once."""
+"""Spanning trees of a mechanism: joints by which each body is reached from the ground exactly once."""
 
 from collections.abc import Iterator, Mapping
 from heapq import heappop, heappush
@@ -10,7 +10,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class TreeEdge(NamedTuple):
-    """A body, and the holder that it hangs on by a joint; without a joint it is a root of its own, beside the ground."""
+    """A body, its holder (parent) and the joint between them; without a joint the body is a root, like the ground."""
 
     body: str
     holder: str
@@ -18,14 +18,14 @@ class TreeEdge(NamedTuple):
 
 
 def spanning_tree(mechanism: Mechanism, weights: Mapping[str, int]) -> Iterator[TreeEdge]:
-    """Iterate over the bodies from the ground on, holders before what hangs on them (Prim's algorithm).
+    """Iterate over the bodies from the ground on, holders first (Prim's algorithm).
 
     Args:
         mechanism: The scene.
-        weights: The joints that may be taken, by name: the least first, and of one weight those nearest to the ground.
+        weights: The weights of the joints that may be used, by name; ties go to the joint nearest to the ground.
 
     Returns:
-        A tree of least weight.
+        A spanning tree of minimum weight.
     """
     neighbours: dict[str, list[tuple[int, str, str]]] = {name: [] for name in (GROUND, *mechanism.body_names)}
     for joint, weight in weights.items():

@@ -1,4 +1,4 @@
-"""Interpolating cubic splines, natural and periodic, written for values that may be traced.
+"""Interpolating cubic splines, natural and periodic, for values that may be traced.
 
 With knots x_k, values y_k and curvatures m_k = S''(x_k), a cubic spline is, on the interval [x_i, x_i+1] of length h_i, with
 s = x - x_i,
@@ -8,37 +8,34 @@ s = x - x_i,
 and S' is continuous where h_i-1 m_i-1 + 2 (h_i-1 + h_i) m_i + h_i m_i+1 = 6 (y_i+1 - y_i) / h_i - 6 (y_i - y_i-1) / h_i-1.
 Source: de Boor, A Practical Guide to Splines, chapter 4.
 
-All of it is arithmetic on numbers, choices between them, and loops of known length, so that it can be part of machine code.
+They use only arithmetic, selections and loops of fixed length, so that they can become machine code.
 """
 
 from types import ModuleType
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.scene.fields import Number
-
-AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # of the one library or of the other
+from udkjax.annotations import AnyArray, Number
 
 
 def natural_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"]) -> Array:
-    """Evaluate the natural cubic spline (no curvature at the ends) at a scalar x; beyond the ends it is a straight line."""
+    """Evaluate the natural cubic spline (zero curvature at the ends) at a scalar x; beyond the ends it is a straight line."""
     return _evaluate(x, spline_pieces(knots, values, jnp))
 
 
 def spline_pieces(knots: AnyArray, values: AnyArray, xp: ModuleType) -> AnyArray:
-    """Return the natural cubic spline in pieces, the straight lines before and behind it among them, by NumPy or JAX.
+    """Return the pieces of the natural cubic spline, including the straight lines before and after it, by NumPy or JAX.
 
     Args:
         knots: increasing (n,).
-        values: there (n,).
+        values: values at the knots (n,).
         xp: NumPy or jax.numpy.
 
     Returns:
-        (n + 1, 5): where each piece starts, and the coefficients of the powers of x less that. Of two knots one: a straight line.
+        (n + 1, 5): the start of each piece, and the coefficients of the powers of x - start. Two knots give a single piece.
     """
     steps, slopes = xp.diff(knots), xp.diff(values) / xp.diff(knots)
     if len(knots) == 2:
@@ -54,12 +51,12 @@ def spline_pieces(knots: AnyArray, values: AnyArray, xp: ModuleType) -> AnyArray
 
 
 def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], period: Number) -> Array:
-    """Evaluate the periodic cubic spline of three knots or more at a scalar x; after the last one the first comes again."""
+    """Evaluate the periodic cubic spline through at least three knots at a scalar x; the first knot follows the last."""
     n = knots.size
     closed, around = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
     steps, slopes = jnp.diff(closed), jnp.diff(around) / jnp.diff(closed)
     right = 6 * (slopes - jnp.roll(slopes, 1))
-    # The last row and column apart: the rest is tridiagonal (Schur complement).
+    # Without its last row and column, the system is tridiagonal (Schur complement).
     diagonal = 2 * (jnp.roll(steps, 1) + steps)
     corner = jnp.concatenate([steps[-1:], jnp.zeros(n - 3, knots.dtype), steps[-2:-1]])
     one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
@@ -69,7 +66,7 @@ def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, "
 
 
 def wrap(x: Number, start: Number, period: Number) -> Array:
-    """Return x less as many periods as bring it between start and start + period."""
+    """Return x shifted by a multiple of the period into [start, start + period)."""
     return x - period * jnp.floor((x - start) / period)
 
 
@@ -79,14 +76,14 @@ def count_knots(x: Number, knots: Float[Array, " n"]) -> Array:
 
 
 def _cubics(knots: AnyArray, values: AnyArray, curvatures: AnyArray, xp: ModuleType) -> AnyArray:
-    """Return the cubics between neighbouring knots as rows (n - 1, 5), as `spline_pieces` does."""
+    """Return the cubics between neighbouring knots as rows (n - 1, 5) of `spline_pieces`."""
     steps, m = xp.diff(knots), curvatures
     slopes = xp.diff(values) / steps - steps * (2 * m[:-1] + m[1:]) / 6
     return xp.stack([knots[:-1], values[:-1], slopes, m[:-1] / 2, xp.diff(m) / (6 * steps)], 1)
 
 
 def _evaluate(x: Number, pieces: Float[Array, "pieces 5"]) -> Array:
-    """Return the value at x of the piece that it is in."""
+    """Return the value at x of the piece that contains it."""
     starts = pieces[1:, 0]
     inside = jnp.append(True, x >= starts) & jnp.append(x < starts, True)
     start, *c = jnp.sum(jnp.where(inside[:, None], pieces, 0.0), 0)
@@ -95,7 +92,7 @@ def _evaluate(x: Number, pieces: Float[Array, "pieces 5"]) -> Array:
 
 
 def _tridiagonal_by_numpy(diagonal: np.ndarray, beside: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve as `_tridiagonal`, for one column, by numbers of Python: nothing is compiled for each length."""
+    """Solve as `_tridiagonal`, for one column, with Python floats: nothing is compiled for each length."""
     pivots, found, links = diagonal.tolist(), right[:, 0].tolist(), beside.tolist()
     for k, link in enumerate(links):
         factor = link / pivots[k]
@@ -108,7 +105,7 @@ def _tridiagonal_by_numpy(diagonal: np.ndarray, beside: np.ndarray, right: np.nd
 
 
 def _tridiagonal(diagonal: Float[Array, " n"], beside: Float[Array, " n-1"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Solve a symmetric system that is dominated by its diagonal (n,), with `beside` (n - 1,) next to it, for columns (n, k)."""
+    """Solve a symmetric, diagonally dominant tridiagonal system with off-diagonal `beside` for columns (n, k)."""
 
     def eliminate(before, row):
         pivot, found = before

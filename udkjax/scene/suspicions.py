@@ -1,4 +1,4 @@
-"""Likely mistakes in a scene that can be computed all the same: points in another unit, degrees for radians, loose bodies."""
+"""Likely mistakes in a valid scene: points in the wrong unit, degrees for radians, loose bodies."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -11,20 +11,20 @@ from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.reshaping import attachments
 
-# Of the largest of all bodies: a point farther away from its own body is likely in another unit (mm, of which a metre has 1,000).
-# A body reaches as far as its other points, or twice its radius of gyration.
+# Relative to the size of the largest body. A point farther from its own body is probably in the wrong unit (mm). The size of a
+# body is the distance to its other points, or twice its radius of gyration.
 FAR_OUT = 50.0
 ANGLES = ("angle", "axis", "phase")  # fields in radians
 
 
 def suspicions(mechanism: Mechanism) -> list[str]:
-    """Return the likely mistakes of a scene of known numbers, each with the name of its element and a cure."""
+    """Return the likely mistakes in a scene of concrete numbers, each with the name of its element and a cure."""
     return [*_far_points(mechanism), *_degrees(mechanism), *_loose_bodies(mechanism)]
 
 
 def body_sizes(mechanism: Mechanism) -> dict[str, float]:
     """Return the size of each body (m): the distance of its farthest point from its centre, or twice its radius of gyration."""
-    mechanism = jax.tree.map(np.asarray, mechanism)  # by NumPy: JAX would trace known numbers while something else is traced
+    mechanism = jax.tree.map(np.asarray, mechanism)  # JAX would trace concrete numbers while something else is traced
     return {
         name: max(2 * _gyration(body), *(_length(p) for _, p in attachments(mechanism, name)), 0.0)
         for name, body in mechanism.bodies.items()
@@ -40,7 +40,7 @@ def _length(point: Any) -> float:
 
 
 def _far_points(mechanism: Mechanism) -> Iterator[str]:
-    """Iterate over points that are far outside of all bodies."""
+    """Iterate over points far outside of all bodies."""
     reaches = {number: _length(p) for name in mechanism.body_names for number, p in attachments(mechanism, name)}
     gyration = max(2 * _gyration(body) for body in mechanism.bodies.values())
     owner = {number: name for name in mechanism.body_names for number, _ in attachments(mechanism, name)}
@@ -60,7 +60,7 @@ def _beside(size: float) -> str:
 
 
 def _degrees(mechanism: Mechanism) -> Iterator[str]:
-    """Iterate over angles that are more than a turn and a whole number, or half of one, as degrees are and radians are not."""
+    """Iterate over angles of more than a turn that are integers or half-integers, like degrees and unlike radians."""
     for name, value in mechanism.parameters().items():
         if name.rpartition(".")[2] in ANGLES and np.ndim(value) == 0:
             angle = float(value)
@@ -69,7 +69,7 @@ def _degrees(mechanism: Mechanism) -> Iterator[str]:
 
 
 def _loose_bodies(mechanism: Mechanism) -> Iterator[str]:
-    """Iterate over bodies that no joint and no driver holds, beside others that are held."""
+    """Iterate over bodies without joint or driver, if other bodies have one."""
     held = {name for element in mechanism.constraints.values() for name in mechanism.frames_of(element)}
     for name in mechanism.body_names if held else ():
         if name not in held:

@@ -1,7 +1,7 @@
-"""One table of units: of parameters and of the settings of a run, of data, and of numbers with units in drawings.
+"""Units of parameters, settings of a run, data, and numbers in drawings.
 
-pint knows more units, but importing it and reading its definitions takes 0.2 s of every command, and to it a radian is a pure
-number: a frequency in 1/s would pass for an angular velocity. Here an angle is a dimension of its own.
+pint knows more units, but importing it takes 0.2 s in every command, and it treats a radian as dimensionless: a frequency in 1/s
+would pass for an angular velocity. Here angle is a dimension of its own.
 """
 
 import math
@@ -12,11 +12,11 @@ from udkjax.scene.checks import quote
 from udkjax.scene.held import Held
 from udkjax.scene.number_fields import Sections, owner_of, parameters_of, split_index
 
-# The settings of a run that are numbers: one program serves all their values.
+# Numeric settings of a run; one program serves all values.
 NUMBERS = {
     "rtol": "1",
     "atol": "1",
-    "rank_tol": "1",  # relative; where the method is absolute, in the units of D
+    "rank_tol": "1",  # relative; in the units of D if the method is absolute
     "branch_tol": "1",
     "alpha": "1/s",
     "beta": "1/s",
@@ -67,7 +67,7 @@ FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the 
 
 
 def units_of(mechanism: Sections, name: str) -> str:
-    """Return the unit of a parameter or of a setting; an empty text where it is not known."""
+    """Return the unit of a parameter or of a setting; an empty text if unknown."""
     if name in NUMBERS:
         return NUMBERS[name]
     known = parameters_of(mechanism)
@@ -85,7 +85,7 @@ def units_of(mechanism: Sections, name: str) -> str:
 
 
 def field_unit(type_name: str, field: str, driven: str = "") -> str:
-    """Return the unit of a field of a class of the scene; of a motion law's, by the coordinate that it drives."""
+    """Return the unit of a field of a scene class; for a motion law it depends on the driven coordinate."""
     if field in FOLLOWS:
         return "rad" if driven == "angle" else "m"
     return _OF_TYPE.get((type_name, field), _FIELDS.get(field, ""))
@@ -153,10 +153,10 @@ _USUAL = (
 
 
 def read_quantity(text: str, wanted: str) -> float:
-    """Return a text such as "60 rpm" as a number in `wanted`, which are SI units.
+    """Convert a text such as "60 rpm" to a number in the SI units `wanted`.
 
     Raises:
-        ValueError: it is no number with a unit, or its unit is unknown or of another dimension.
+        ValueError: it is not a number with a unit, or its unit is unknown or has another dimension.
     """
     match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
     if match is None:
@@ -173,15 +173,14 @@ def _usual_units(wanted: str) -> str:
 
 
 def conversion_factor(units: str, wanted: str) -> float:
-    """Return the factor that converts numbers in `units` into `wanted`, which are SI units.
+    """Return the factor that converts numbers in `units` to the SI units `wanted`.
 
     Args:
-        units: products written with a space, powers as m/s2 or m/s^2. "g" is a gram, and where
-            an acceleration is wanted 9.80665 m/s2.
+        units: products written with a space, powers as m/s2 or m/s^2. "g" is a gram; for an acceleration, 9.80665 m/s2.
         wanted: the units of a channel.
 
     Raises:
-        ValueError: `units` are unknown, or of another dimension.
+        ValueError: `units` are unknown, or have another dimension.
     """
     if units.split() == wanted.split():
         return 1.0
@@ -193,7 +192,7 @@ def conversion_factor(units: str, wanted: str) -> float:
 
 
 def _read(text: str) -> _Unit:
-    """Read a product of powers of units; a slash divides by the one that follows."""
+    """Read a product of powers of units; a slash divides by the unit that follows it."""
     plain = text
     for spelling, usual in _SPELLINGS.items():
         plain = plain.replace(spelling, usual)
@@ -204,6 +203,6 @@ def _read(text: str) -> _Unit:
             meant = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == f"{name}".lower()]
             meant += ["; cycles a second are rev/s"] if f"{name}".endswith("Hz") else []
             cure = meant[0] if meant else f": they are made of {', '.join(_UNITS)}"
-            raise ValueError(f"{quote(text)} is no unit known here{cure}")
+            raise ValueError(f"{quote(text)} is not a known unit{cure}")
         found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))
     return found

@@ -1,4 +1,4 @@
-"""Reports of studies: counts, lists, numbers and rows of constraints in words, and everything as plain data for JSON."""
+"""Text for reports (counts, lists, numbers, rows of constraints), and plain data for JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,18 +9,18 @@ import numpy as np
 
 from udkjax.scene.mechanism import Mechanism
 
-MOST_LISTED = 8  # names in one sentence
-MOST_DIGITS = 12  # of a number in a table
+MOST_LISTED = 8  # most names in one sentence
+MOST_DIGITS = 12  # most digits of a number in a table
 _ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
 
 
 def plural(count: int, noun: str) -> str:
-    """Return a count with its noun."""
+    """Return a count with its noun, in the plural if needed."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Return names as they stand in a sentence: "a, b and c"."""
+    """Join names for a sentence: "a, b and c"."""
     if len(names) > MOST_LISTED:
         return f"{', '.join(names[:MOST_LISTED])} and {len(names) - MOST_LISTED} more"
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -32,7 +32,7 @@ def ratio(values: Sequence[float] | np.ndarray) -> str:
 
 
 def format_value(value: float, error: float) -> str:
-    """Return a value with as many digits as its standard error allows, and one more."""
+    """Return a value with the digits that its standard error allows, and one more."""
     if not (math.isfinite(error) and error > 0 and value):
         return f"{value:.6g}"
     digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
@@ -46,14 +46,14 @@ def row_label(mechanism: Mechanism, constraint: str, row: int) -> str:
 
 
 def plain(value: object) -> Any:
-    """Return a value as JSON knows it: what is not finite as None, named fields as a mapping, a mechanism by its name."""
+    """Convert a value to JSON types: None for NaN and infinity, a mapping for named fields, the name for a mechanism."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, Enum | Mechanism):
         return value.name
-    if (fields := getattr(value, "_asdict", None)) is not None:  # of a NamedTuple
+    if (fields := getattr(value, "_asdict", None)) is not None:  # a NamedTuple
         return plain(fields())
-    if (tolist := getattr(value, "tolist", None)) is not None:  # of an array or a number of NumPy or JAX
+    if (tolist := getattr(value, "tolist", None)) is not None:  # an array or number of NumPy or JAX
         return plain(tolist())
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item) for item in value]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.equations.load_scale import LoadScale, load_scale
@@ -105,7 +105,7 @@ def _format_rate(omega2: float) -> str:
 
 @checked
 def equilibrium(
-    mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, stable: bool = False, analysis: Analysis | None = None
+    mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0, stable: bool = False, analysis: Analysis | None = None
 ) -> Equilibrium:
     """Return a position of rest, N^T F = 0 on Psi = 0, near a given one: N spans the directions that constraints leave free.
 
@@ -135,7 +135,7 @@ def equilibrium(
 
 @checked
 def equilibria(
-    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: Scalar = 0.0, state: State | None = None
+    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: NumberLike = 0.0, state: State | None = None
 ) -> list[Equilibrium]:
     """Return the different equilibria found from `starts` positions: the given one and random ones of the same mechanism.
 

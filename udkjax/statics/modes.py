@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.control_flow import ControlFlow, solve
 from udkjax.equations.structure import ArrayLibrary
@@ -68,7 +68,7 @@ class Modes(PrintsTable):
 
 
 @checked
-def modes(mechanism: Mechanism, state: State | None = None, t: Scalar = 0.0, analysis: Analysis | None = None) -> Modes:
+def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0, analysis: Analysis | None = None) -> Modes:
     """Return the modes about a position of rest: (s^2 N^T M N + s N^T C N + N^T K N) eta = 0, shape = N eta.
 
     C = -F_v and K = -F_q + (lambda^T Psi)_qq: preload, gravity and the constraints' curvature are in it. K is symmetric where

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations import efforts
 from udkjax.positions.drive import with_halted_drivers
 from udkjax.printing import align_columns, format_number
@@ -21,7 +21,7 @@ class RestingForces(NamedTuple):
     unique: dict[str, dict[str, bool]]  # whether equilibrium alone determines the force
 
 
-def resting_forces(mechanism: Mechanism, q: ArrayLike, t: Scalar) -> RestingForces:
+def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> RestingForces:
     """Return the forces in a position of rest (bodies, 3), where drivers stand still as they are at time t (s)."""
     still, q = with_halted_drivers(mechanism, t), np.asarray(q)
     rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))

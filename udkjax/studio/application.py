@@ -14,7 +14,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -23,12 +22,12 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from udkjax.annotations import JsonObject
 from udkjax.studio.folder import Folder
 from udkjax.studio.gate import INTERFACE, Gate
 from udkjax.studio.limits import COMPILE_SECONDS, DIAGNOSE_SECONDS, EXPORT_SECONDS, RefusedError, require_size
 from udkjax.studio.worker import Worker
 
-Json = dict[str, Any]
 KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 PLACES = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}
 EXPORTS = (".html", ".svg", ".png", ".gif", ".dxf", ".csv", ".py")
@@ -47,12 +46,12 @@ class Studio:
     def __init__(self, folder: Folder, reader: Worker, compiler: Worker, examiner: Worker):
         self.folder, self.reader, self.compiler, self.examiner = folder, reader, compiler, examiner
 
-    def list(self, request: Json) -> Json:
+    def list(self, request: JsonObject) -> JsonObject:
         """Return the scene files of the folder, and the templates."""
         templates = self.reader.call("list_templates", {}, COMPILE_SECONDS)
         return {"files": self.folder.list(), "folder": self.folder.root.name, **templates}
 
-    def open(self, request: Json) -> Json:
+    def open(self, request: JsonObject) -> JsonObject:
         """Return the text of a file or of a template, and its tables."""
         if "template" in request:
             opened = self.reader.call("open_template", {"name": request["template"]}, COMPILE_SECONDS)
@@ -61,7 +60,7 @@ class Studio:
         opened = self.reader.call("open_text", {"text": text}, COMPILE_SECONDS)
         return {**opened, "path": request["path"], "revision": revision}
 
-    def save(self, request: Json) -> Json:
+    def save(self, request: JsonObject) -> JsonObject:
         """Write a drawing, or what is exported of it, unless something else is on disk than the page believes."""
         text, path, revision = require_size(request.get("text")), request.get("path"), request.get("revision")
         if not (revision is None or isinstance(revision, str)):
@@ -73,7 +72,7 @@ class Studio:
         data = bytes.fromhex(made["data"])
         return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
 
-    def compile(self, request: Json) -> Json:
+    def compile(self, request: JsonObject) -> JsonObject:
         """Return a drawing's text and tables, its mistakes, and what the page needs to move it."""
         given = {key: request[key] for key in ("text", "document", "engine") if request.get(key) is not None}
         require_size(given.get("text"))
@@ -82,7 +81,7 @@ class Studio:
         worker = self.compiler if "engine" in given else self.reader
         return worker.call("compile_drawing", given, COMPILE_SECONDS)
 
-    def diagnose(self, request: Json) -> Json:
+    def diagnose(self, request: JsonObject) -> JsonObject:
         """Return freedoms, redundant constraints with their fixes, and what else is found about a drawing."""
         given = {"text": require_size(request.get("text")), "about": str(request.get("about", "structure"))}
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
@@ -101,7 +100,7 @@ def application(studio: Studio, port: int, token: str) -> ASGIApp:
     return Gate(Starlette(routes=[*routes, Route("/{path:path}", _page_file)]), port, token)
 
 
-def _answering(action: Callable[[Json], Json]) -> Callable[[Request], Awaitable[Response]]:
+def _answering(action: Callable[[JsonObject], JsonObject]) -> Callable[[Request], Awaitable[Response]]:
     async def answer(request: Request) -> Response:
         try:
             given = json.loads(await request.body())

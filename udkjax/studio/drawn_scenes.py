@@ -36,7 +36,6 @@ from udkjax.scene.drawing.drawn_forces import shift_motion
 
 GROUND = GROUND
 SAME_PLACE = 1e-9  # of the extent: joints that are closer share a pin
-Place = np.ndarray
 
 
 def drawing_text_of(mechanism: Mechanism) -> str:
@@ -55,7 +54,7 @@ class _Draft:
         q, v = np.asarray(state.q), np.asarray(state.v)
         self.frames = dict(zip(mechanism.bodies, q, strict=True)) | {GROUND: np.zeros(3)}
         self.rates = dict(zip(mechanism.bodies, v, strict=True)) | {GROUND: np.zeros(3)}
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, np.ndarray] = {}
         self.members: dict[str, list[str]] = {}  # of each pin
         self.elements: dict[str, dict[str, Any]] = {}
         held = [p for e in mechanism.constraints.values() for p in np.ravel(np.asarray(getattr(e, "points", 0.0), float))]
@@ -98,14 +97,14 @@ class _Draft:
             **{f"{section}s": group for section, group in self.elements.items()},
         )
 
-    def place(self, body: str, point: Any) -> Place:
+    def place(self, body: str, point: Any) -> np.ndarray:
         """Return the place of a point of a body (m)."""
         x, y, angle = self.frames[body]
         px, py = np.asarray(point, float)
         c, s = np.cos(angle), np.sin(angle)
         return np.array([x + c * px - s * py, y + s * px + c * py])
 
-    def pin(self, name: str, bodies: Sequence[str], place: Place) -> str:
+    def pin(self, name: str, bodies: Sequence[str], place: np.ndarray) -> str:
         """Return the pin of bodies at a place, made or found."""
         for pin, other in self.places.items():
             if np.abs(place - other).max() <= self.near and set(bodies) & set(self.members[pin]):
@@ -229,7 +228,7 @@ class _Draft:
         x, y, _ = self.frames[name]
         return {"pins": self.pins_of(name), "mass": body.mass, "inertia": body.inertia, "centre": [float(x), float(y)]}
 
-    def velocity(self, pin: str) -> Place:
+    def velocity(self, pin: str) -> np.ndarray:
         """Return the velocity of a pin (m/s)."""
         body = next(body for body in self.members[pin] if body != GROUND)
         vx, vy, rate = self.rates[body]

@@ -1,10 +1,10 @@
 """Findings about a drawing, which the page says: freedoms, redundancy and its cure, unique reactions, how far a motor turns."""
 
 import math
-from typing import Any
 
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.integrate import SimulationError
 from udkjax.positions.assembly import AssemblyError
 from udkjax.positions.continuation import Reached
@@ -18,12 +18,11 @@ from udkjax.studio.shown_runs import force_curves, holding_curves
 from udkjax.study.diagnosis import Diagnosis, diagnose
 from udkjax.study.diagnosis.fixes import Fix
 
-Json = dict[str, Any]
 MOST_FIXES = 8  # fixes listed for one redundancy
 IN_LINE = 1e-4  # rad: of a toggle that is found to rounding, whose angle errs by the root of that
 
 
-def examine(mechanism: Mechanism, about: str) -> Json:
+def examine(mechanism: Mechanism, about: str) -> JsonObject:
     """Return the findings about a subject.
 
     Args:
@@ -40,7 +39,7 @@ def examine(mechanism: Mechanism, about: str) -> Json:
         return {"problems": [str(error)]}
 
 
-def structure(mechanism: Mechanism) -> Json:
+def structure(mechanism: Mechanism) -> JsonObject:
     """Return freedoms, sets of redundant constraints with what mends them, and which reactions are unique."""
     found = diagnose(mechanism, walk=False)
     loose = {
@@ -72,7 +71,7 @@ def structure(mechanism: Mechanism) -> Json:
     }
 
 
-def drawn_change(fix: Fix) -> Json | None:
+def drawn_change(fix: Fix) -> JsonObject | None:
     """Return a fix as a change of the drawing: a constraint that is gone, or the slot that takes a pin's place; else None."""
     joint = fix.mechanism.joints.get(fix.constraint)
     if joint is None:
@@ -107,7 +106,7 @@ def _names(names: list[str]) -> str:
     return ", ".join(names)
 
 
-def rest(mechanism: Mechanism) -> Json:
+def rest(mechanism: Mechanism) -> JsonObject:
     """Return the position of rest next to the drawn one, downhill if need be, and its frequencies (Hz)."""
     found = equilibrium(mechanism, stable=True)
     rates = [float(x) for x in np.asarray(found.omega2)]
@@ -118,7 +117,7 @@ def rest(mechanism: Mechanism) -> Json:
     }
 
 
-def motor_travel(mechanism: Mechanism) -> Json:
+def motor_travel(mechanism: Mechanism) -> JsonObject:
     """Return the travel of each motor from the drawn position, where the others hold, and the pins in line at its limits."""
     found = []
     for name, driver in mechanism.drivers.items():

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.equations import analyse, efforts
 from udkjax.integrate import Solution, simulate
 from udkjax.positions.assembly import close
@@ -14,7 +15,6 @@ from udkjax.scene import Driver, Mechanism, SceneError
 from udkjax.show.player.measure_curves import measures_of
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 
-Json = dict[str, Any]
 TURNS = 2  # of the slowest motor that a run shows
 SWINGS = 12  # characteristic times that a run without a motor shows
 STILL = 1.0  # s: of a run in which no load and no motor moves anything
@@ -40,7 +40,7 @@ def shown_run(mechanism: Mechanism) -> Solution:
     return simulate(mechanism, ts, rtol=TOLERANCE, atol=TOLERANCE, throw=False)
 
 
-def recorded_motion(mechanism: Mechanism) -> Json:
+def recorded_motion(mechanism: Mechanism) -> JsonObject:
     """Return the run as plain numbers: `q` and `v` of all bodies at `times`, and why it ended, where it did so too early."""
     run = shown_run(mechanism)
     q, v = np.asarray(run.q), np.asarray(run.v)
@@ -50,7 +50,7 @@ def recorded_motion(mechanism: Mechanism) -> Json:
     return {name: values.tolist() for name, values in kept.items()} | {"cause": run.cause if count < len(q) else ""}
 
 
-def force_curves(mechanism: Mechanism) -> Json:
+def force_curves(mechanism: Mechanism) -> JsonObject:
     """Return curves of the run that need forces: efforts and powers of motors, forces at pins; and energies and violation."""
     run = shown_run(mechanism)
     ts, found = np.asarray(run.ts), _efforts(mechanism, run)
@@ -61,7 +61,7 @@ def force_curves(mechanism: Mechanism) -> Json:
     return {"times": ts.tolist(), "curves": [*found, *powers, *_pin_forces(mechanism, run), *measures], "cause": run.cause}
 
 
-def holding_curves(mechanism: Mechanism) -> Json:
+def holding_curves(mechanism: Mechanism) -> JsonObject:
     """Return curves of what holds a mechanism still in each position of its run: efforts of motors and forces at pins.
 
     Raises:
@@ -81,12 +81,12 @@ def mobility_of(mechanism: Mechanism) -> int:
     return 3 * len(mechanism.bodies) - int(close(mechanism, 0.0).rank)
 
 
-def _efforts(mechanism: Mechanism, run: StateHistory) -> list[Json]:
+def _efforts(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
     drivers = mechanism.drivers
     return [_curve(f"{name}: effort", drivers[name].effort_unit, effort) for name, effort in efforts(mechanism, run).items()]
 
 
-def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[Json]:
+def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
     """Return curves of the forces at pins; of redundant constraints they are the share of least norm, and marked."""
     known = unique_pin_forces(mechanism, run)
     return [
@@ -103,7 +103,7 @@ def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:
     return np.asarray(jax.vmap(jax.grad(lambda t: driver.motion(t)))(ts))
 
 
-def _curve(name: str, unit: str, values: Any, unique: bool = True) -> Json:
+def _curve(name: str, unit: str, values: Any, unique: bool = True) -> JsonObject:
     """Return a curve; a value that is not a number is null."""
     numbers = [x if math.isfinite(x) else None for x in np.asarray(values, float).tolist()]
     return {"name": name, "unit": unit, "values": numbers, "unique": unique}

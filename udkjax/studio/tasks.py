@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.equations import analyse
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.base.program import UnsupportedError
@@ -18,22 +19,20 @@ from udkjax.studio.shown_runs import duration_of, recorded_motion
 from udkjax.studio.templates import TEMPLATES, template_text
 from udkjax.studio.text_edits import merge_document, read_document
 
-Json = dict[str, Any]
 
-
-def list_templates() -> Json:
+def list_templates() -> JsonObject:
     """Return the names and titles of the drawings that one may start from."""
     return {"templates": [{"name": name, "title": title} for name, (title, _) in TEMPLATES.items()]}
 
 
-def open_template(name: str) -> Json:
+def open_template(name: str) -> JsonObject:
     """Return the text and tables of a template."""
     if not isinstance(name, str) or name not in TEMPLATES:
         raise RefusedError(404, f"there is no template {name!r}")
     return open_text(template_text(name))
 
 
-def open_text(text: str) -> Json:
+def open_text(text: str) -> JsonObject:
     """Return the text of a scene file as a drawing, with its tables; one of bodies and joints is drawn anew."""
     problems: list[str] = []
     drawn = text
@@ -47,7 +46,7 @@ def open_text(text: str) -> Json:
     return {"text": drawn, "document": document, "problems": problems, "drawn": drawn != text}
 
 
-def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, engine: str = "") -> Json:
+def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, engine: str = "") -> JsonObject:
     """Return the text and tables of a drawing, its mistakes, and what the page needs to move it.
 
     Args:
@@ -77,7 +76,7 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
     return {"text": text, "document": found, "problems": [], "scene": scene_of(mechanism), **moving}
 
 
-def engine_of(mechanism: Mechanism, document: Json) -> Json:
+def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
     """Return the engine of a drawing for the page, and that of a hand, which nothing drives; or `why` there is none."""
     pins = list(document.get("pins", {}))
     names = [f"pin.{pin}" for pin in pins]
@@ -91,7 +90,7 @@ def engine_of(mechanism: Mechanism, document: Json) -> Json:
     return {"engine": engine, "hand": hand, "pins": pins, "why": engine["why"]}
 
 
-def _undriven(document: Json) -> Json:
+def _undriven(document: JsonObject) -> JsonObject:
     """Return a drawing that nothing drives: the pins of cylinders stay in use, by dampers that do nothing."""
     motors = document.get("motor", [])
     idle = [{"between": motor["between"], "damping": 0} for motor in motors if "between" in motor]
@@ -99,14 +98,14 @@ def _undriven(document: Json) -> Json:
     return {**document, "motor": torques, "driver": [], "damper": [*document.get("damper", []), *idle]}
 
 
-def _read(text: str) -> Json | None:
+def _read(text: str) -> JsonObject | None:
     try:
         return read_document(text)
     except SceneError:
         return None
 
 
-def scene_of(mechanism: Mechanism) -> Json:
+def scene_of(mechanism: Mechanism) -> JsonObject:
     """Return the data by which the page shows a mechanism's positions and energies."""
     analysis = analyse(mechanism)
     bodies = mechanism.bodies.values()
@@ -122,7 +121,7 @@ def scene_of(mechanism: Mechanism) -> Json:
     }
 
 
-def diagnose_drawing(text: str, about: str = "structure") -> Json:
+def diagnose_drawing(text: str, about: str = "structure") -> JsonObject:
     """Return the findings about a drawing; `about` is one of the subjects of findings.py."""
     try:
         require_few(read_document(text))
@@ -131,7 +130,7 @@ def diagnose_drawing(text: str, about: str = "structure") -> Json:
         return {"problems": list(error.problems)}
 
 
-def export(text: str, suffix: str) -> Json:
+def export(text: str, suffix: str) -> JsonObject:
     """Return a drawing in another form, as hexadecimal bytes."""
     try:
         require_few(read_document(text))

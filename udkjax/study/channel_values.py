@@ -11,16 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.annotations import Numbers
 from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
-from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, Quantity, StateHistory, locate, point_of_pin
-from udkjax.positions.channels import Point as Place
+from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, LocalPoint, Quantity, StateHistory, locate, point_of_pin
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame, Point, between
-from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -163,7 +162,7 @@ class _Motion:
         """Return ax, ay and alpha of a body, each (T,)."""
         return self._entries(self.q if body == GROUND else self.dynamics.a if self.a is None else self.a, body)
 
-    def point(self, body: str, local: Float[Array, "2"] | Place, derivative: int) -> Point:
+    def point(self, body: str, local: Float[Array, "2"] | LocalPoint, derivative: int) -> Point:
         """Return the position, velocity or acceleration of a point of a body, x and y each (T,)."""
         frame = self.frames[body]
         if derivative == 0:
@@ -199,7 +198,7 @@ def _measure_body(channel: Channel, motion: _Motion) -> Array:
     return _component(motion, name, point, quantity)
 
 
-def _component(motion: _Motion, body: str, point: Float[Array, "2"] | Place, quantity: str) -> Array:
+def _component(motion: _Motion, body: str, point: Float[Array, "2"] | LocalPoint, quantity: str) -> Array:
     """Return x or y of the position, velocity (vx, vy) or acceleration (ax, ay) of a point."""
     found = motion.point(body, point, DERIVATIVE[quantity[:-1]])
     return jnp.broadcast_to(getattr(found, quantity[-1]), motion.ts.shape)

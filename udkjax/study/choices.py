@@ -13,14 +13,14 @@ from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Household
 from udkjax.scene.checks import abbreviate, quote, suggestion
 
 Choice: TypeAlias = "Pseudoinverse | Formulation | Projection | Baumgarte | Solver | None"
-Table = dict[str, Callable[..., Choice]]
+Constructors = dict[str, Callable[..., Choice]]
 
 
 def _none() -> None:
     return None
 
 
-METHODS: Table = {
+METHODS: Constructors = {
     "auto": Auto,
     "elimination": Elimination,
     "svd": SVD,
@@ -29,15 +29,15 @@ METHODS: Table = {
     "householder": Householder,
     "gram-schmidt": GramSchmidt,
 }
-FORMULATIONS: Table = {
+FORMULATIONS: Constructors = {
     "udwadia-kalaba": _none,
     "augmented": Augmented,
     "null-space-qr": NullSpaceQR,
     "null-space-svd": NullSpaceSVD,
     "partitioning": CoordinatePartitioning,
 }
-STABILIZATIONS: Table = {"projection": Projection, "baumgarte": Baumgarte, "none": _none}
-SOLVERS: Table = {
+STABILIZATIONS: Constructors = {"projection": Projection, "baumgarte": Baumgarte, "none": _none}
+SOLVERS: Constructors = {
     name.lower(): partial(solver_named, name)
     for name in ("Dopri8", "Dopri5", "Tsit5", "Bosh3", "Heun", "Kvaerno5", "Verner65", "Adams", "BDF")
 }

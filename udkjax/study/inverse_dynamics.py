@@ -22,7 +22,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import NumberLike
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.load_scale import load_sizes
@@ -148,7 +148,7 @@ def inverse_dynamics(
     ts: Float[ArrayLike, "T"] | Sequence[float],
     motion: AcceleratedTrajectory | None = None,
     drivers: Sequence[str | Coordinate] | None = None,
-    weights: Mapping[str, Scalar] | None = None,
+    weights: Mapping[str, NumberLike] | None = None,
 ) -> InverseDynamics:
     """Return the efforts of drivers at the times ts (s) on a prescribed motion: M a - F = J^T mu + C^T f.
 

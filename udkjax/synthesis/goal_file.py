@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from udkjax.annotations import TomlTable
 from udkjax.scene.checks import SceneError, quote, unknown_key
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import load
@@ -16,7 +17,6 @@ from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
 
-Table = Mapping[str, Any]
 TOP = (
     "mechanism",
     "units",
@@ -160,7 +160,7 @@ def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problem
         return None
 
 
-def _missing(where: str, make: Callable[..., Any], given: Table) -> list[str]:
+def _missing(where: str, make: Callable[..., Any], given: TomlTable) -> list[str]:
     """Return the mistakes of keys that a goal needs and that are not given."""
     needed = [key for key, value in inspect.signature(make).parameters.items() if value.default is value.empty]
     return [f"{where}.{key}: missing" for key in needed if key not in given]

@@ -7,23 +7,21 @@ A goal measures a position by a few numbers (`measure`, in JAX), and says by how
 from abc import abstractmethod
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Numbers, NumericArray
 from udkjax.positions.channels import locate
 from udkjax.positions.drive import Coordinate, value_of
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.checks import SceneError, quote, suggestion
-from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import require_finite
-
-AnyArray = Any  # of NumPy or JAX
 
 
 def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
@@ -97,7 +95,7 @@ class Goal(PrintsTable):
         """Return the measures of a position."""
 
     @abstractmethod
-    def residual(self, measured: AnyArray, target: AnyArray, extras: AnyArray, xp: ModuleType) -> AnyArray:
+    def residual(self, measured: NumericArray, target: NumericArray, extras: NumericArray, xp: ModuleType) -> list[NumericArray]:
         """Return by how much measures (..., G) differ from a target, as a list of G arrays."""
 
     def origin(self, mechanism: Mechanism) -> Array:

@@ -1,6 +1,5 @@
 """The door of `transforms`: the names that floors above import, each from the module that it is in."""
 
-from udkjax.transforms.gradients import TreeDef as TreeDef
 from udkjax.transforms.gradients import stop_gradients as stop_gradients
 from udkjax.transforms.linear_map import DifferentiableFunction as DifferentiableFunction
 from udkjax.transforms.linear_map import Linear as Linear

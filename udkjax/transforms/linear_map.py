@@ -1,15 +1,15 @@
-"""The first derivatives of a function as a linear map with its transpose, to JAX a primitive; and their derivatives.
+"""The Jacobian J(x) of a function as a linear map with its transpose, which is a JAX primitive, and its derivatives.
 
-A derivative of the map is one of two functions again, of x and a direction v, or of x and a cotangent w,
+To differentiate the map, its two applications are themselves functions, of x and a tangent v, or of x and a cotangent w:
 
     g(x, v) = J(x) v,        h(x, w) = J(x)^T w.
 
-Both change by the second derivative D^2 f along two directions, and by g and h themselves, which are linear in v and w:
+Their derivatives need the second derivative D^2 f along two directions, and g and h themselves, which are linear in v and w:
 
-    dg = D^2 f [v, dx] + J dv,        dh_i = w^T D^2 f [dx, e_i] + (J^T dw)_i        for each unit vector e_i,
+    dg = D^2 f [v, dx] + J dv,        dh_i = w^T D^2 f [dx, e_i] + (J^T dw)_i        for each unit vector e_i.
 
-and since w^T J(x) v is one number, the cotangents of x are w^T D^2 f [v, e_i], those of v and w h and g. So second derivatives
-along pairs of directions are all that takes; those of higher orders are found so by forward mode of JAX.
+In reverse mode, since w^T J(x) v is a scalar, the cotangents of x are w^T D^2 f [v, e_i], and those of v and w are h and g.
+Second derivatives along pairs of directions are thus sufficient; JAX's forward mode gives higher orders.
 """
 
 import math
@@ -34,135 +34,142 @@ from udkjax.transforms.traced_numbers import Mask, replaced, select
 
 
 class DifferentiableFunction(eqx.Module):
-    """A function of a list of arrays that returns a list of arrays. Forward mode of it is JAX's."""
+    """A function from a list of arrays to a list of arrays, which JAX differentiates in forward mode.
+
+    `active` marks the inputs that have derivatives; tangents and cotangents of inputs are listed for these only.
+    """
 
     @abstractmethod
-    def __call__(self, xs: list[Array]) -> list[Array]:
+    def __call__(self, inputs: list[Array]) -> list[Array]:
         """Return f(x)."""
 
     @property
     def orders(self) -> int:
-        """The order up to which its derivatives are machine code."""
+        """The highest order of derivatives that is machine code."""
         return 0
 
     @abstractmethod
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
         """Return the shapes of f(x)."""
 
-    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
-        """Return J v. `run` is what evaluating f at x has left for its first derivatives, if anything."""
+    def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
+        """Return J v. `run` is stored by the evaluation of f at x for its first derivatives, or None."""
         del run
-        return change_along(self, xs, active, vs)[1]
+        return change_along(self, inputs, active, tangents)[1]
 
-    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
-        """Return J^T w, of those of x that are active, in the same way."""
+    def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
+        """Return J^T w. `run` is as in `forward`."""
         del run
-        return self.pull(xs, active, ws)
+        return self.pull(inputs, active, cotangents)
 
-    def pull(self, xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-        """Return J^T w, of those of x that are active, as a function whose forward mode is JAX's."""
-        return _by_rows(lambda es: change_along(self, xs, active, es)[1], xs, active, ws)
+    def pull(self, inputs: list[Array], active: Mask, cotangents: list[Array]) -> list[Array]:
+        """Return J^T w in a form that JAX can differentiate in forward mode."""
+        return _by_rows(lambda units: change_along(self, inputs, active, units)[1], inputs, active, cotangents)
 
-    def twice(self, xs: list[Array], active: Mask, vs: list[Array], others: Mask, us: list[Array]) -> list[Array]:
-        """Return D^2 f [v, u], along v of those of x that are active, and u of others."""
-        return change_along(lambda xs: change_along(self, xs, active, vs)[1], xs, others, us)[1]
+    def twice(
+        self, inputs: list[Array], active: Mask, tangents: list[Array], others: Mask, other_tangents: list[Array]
+    ) -> list[Array]:
+        """Return D^2 f [v, u], with v along the `active` inputs and u along the `others`."""
+        return change_along(lambda inputs: change_along(self, inputs, active, tangents)[1], inputs, others, other_tangents)[1]
 
 
 class Along(DifferentiableFunction):
-    """g(x, v) = J(x) v, with v of those of x that are active."""
+    """g(x, v) = J(x) v."""
 
     of: DifferentiableFunction
     active: Mask = eqx.field(static=True)
 
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        xs, vs = self.parts(xs)
-        return change_along(self.of, xs, self.active, vs)[1]
+    def __call__(self, inputs: list[Array]) -> list[Array]:
+        inputs, tangents = self.parts(inputs)
+        return change_along(self.of, inputs, self.active, tangents)[1]
 
     @property
     def orders(self) -> int:
         return self.of.orders - 1
 
-    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
+    def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
         del run
-        (xs, directions), (of_x, of_v) = self.parts(xs), self.parts(active)
-        dxs, dvs = vs[: sum(of_x)], vs[sum(of_x) :]
-        found = [jnp.zeros(shape) for shape in self.shapes([*xs, *directions])]
+        (inputs, directions), (of_x, of_v) = self.parts(inputs), self.parts(active)
+        dxs, dvs = tangents[: sum(of_x)], tangents[sum(of_x) :]
+        found = [jnp.zeros(shape) for shape in self.shapes([*inputs, *directions])]
         if dxs:
-            found = self.of.twice(xs, self.active, directions, of_x, dxs)
+            found = self.of.twice(inputs, self.active, directions, of_x, dxs)
         if dvs:
-            found = [a + b for a, b in zip(found, self.of.forward(xs, self._those(of_v), dvs, None), strict=True)]
+            found = [a + b for a, b in zip(found, self.of.forward(inputs, self._those(of_v), dvs, None), strict=True)]
         return found
 
-    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
+    def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
         del run
-        (xs, directions), (of_x, of_v) = self.parts(xs), self.parts(active)
-        found = _by_rows(lambda es: self.of.twice(xs, self.active, directions, of_x, es), xs, of_x, ws)
-        return [*found, *(self.of.backward(xs, self._those(of_v), ws, None) if any(of_v) else [])]
+        (inputs, directions), (of_x, of_v) = self.parts(inputs), self.parts(active)
+        found = _by_rows(lambda units: self.of.twice(inputs, self.active, directions, of_x, units), inputs, of_x, cotangents)
+        return [*found, *(self.of.backward(inputs, self._those(of_v), cotangents, None) if any(of_v) else [])]
 
-    def parts(self, xs: Sequence[Any]) -> tuple[Any, Any]:
-        return xs[: len(self.active)], xs[len(self.active) :]
+    def parts(self, inputs: Sequence[Any]) -> tuple[Any, Any]:
+        return inputs[: len(self.active)], inputs[len(self.active) :]
 
     def _those(self, which: Mask) -> Mask:
-        """Return a mask of x, from one of those that are active."""
+        """Return a mask of x from a mask of the active entries of x."""
         rest = iter(which)
         return tuple(m and next(rest) for m in self.active)
 
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return self.of.shapes(self.parts(xs)[0])
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
+        return self.of.shapes(self.parts(inputs)[0])
 
 
 class Back(Along):
-    """h(x, w) = J(x)^T w, of those of x that are active."""
+    """h(x, w) = J(x)^T w."""
 
-    def __call__(self, xs: list[Array]) -> list[Array]:
-        xs, ws = self.parts(xs)
-        return self.of.pull(xs, self.active, ws)
+    def __call__(self, inputs: list[Array]) -> list[Array]:
+        inputs, cotangents = self.parts(inputs)
+        return self.of.pull(inputs, self.active, cotangents)
 
-    def forward(self, xs: list[Array], active: Mask, vs: list[Array], run: Any) -> list[Array]:
+    def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
         del run
-        (xs, bars), (of_x, of_w) = self.parts(xs), self.parts(active)
-        dxs, dws = vs[: sum(of_x)], vs[sum(of_x) :]
-        found = [jnp.zeros(x.shape) for x in select(xs, self.active)]
+        (inputs, bars), (of_x, of_w) = self.parts(inputs), self.parts(active)
+        dxs, dws = tangents[: sum(of_x)], tangents[sum(of_x) :]
+        found = [jnp.zeros(x.shape) for x in select(inputs, self.active)]
         if dxs:
-            found = _by_rows(lambda es: self.of.twice(xs, of_x, dxs, self.active, es), xs, self.active, bars)
+            found = _by_rows(lambda units: self.of.twice(inputs, of_x, dxs, self.active, units), inputs, self.active, bars)
         if dws:
             dws = replaced([jnp.zeros(x.shape) for x in bars], of_w, dws)
-            found = [a + b for a, b in zip(found, self.of.backward(xs, self.active, dws, None), strict=True)]
+            found = [a + b for a, b in zip(found, self.of.backward(inputs, self.active, dws, None), strict=True)]
         return found
 
-    def backward(self, xs: list[Array], active: Mask, ws: list[Array], run: Any) -> list[Array]:
+    def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
         del run
-        (xs, bars), (of_x, of_w) = self.parts(xs), self.parts(active)
-        found = _by_rows(lambda es: self.of.twice(xs, self.active, ws, of_x, es), xs, of_x, bars)
-        return [*found, *(select(self.of.forward(xs, self.active, ws, None), of_w) if any(of_w) else [])]
+        (inputs, bars), (of_x, of_w) = self.parts(inputs), self.parts(active)
+        found = _by_rows(lambda units: self.of.twice(inputs, self.active, cotangents, of_x, units), inputs, of_x, bars)
+        return [*found, *(select(self.of.forward(inputs, self.active, cotangents, None), of_w) if any(of_w) else [])]
 
-    def shapes(self, xs: list[Array]) -> list[tuple[int, ...]]:
-        return [x.shape for x in select(self.parts(xs)[0], self.active)]
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
+        return [x.shape for x in select(self.parts(inputs)[0], self.active)]
 
 
-def _by_rows(rate: Callable[[list[Array]], list[Array]], xs: list[Array], active: Mask, ws: list[Array]) -> list[Array]:
-    """Return the gradient of w^T r(e) of a linear function r of changes e of those of x that are active: of each unit vector."""
-    some = [x.shape for x in select(xs, active)]
+def _by_rows(
+    rate: Callable[[list[Array]], list[Array]], inputs: list[Array], active: Mask, cotangents: list[Array]
+) -> list[Array]:
+    """Return the gradient with respect to e of w^T r(e), for a function r linear in tangents e of x, by all unit vectors e_i."""
+    some = [x.shape for x in select(inputs, active)]
     if not some:
         return []
-    row = lambda e: jnp.vdot(_flat(ws), _flat(rate(_split(e, some))))  # noqa: E731
+    row = lambda e: jnp.vdot(_flat(cotangents), _flat(rate(_split(e, some))))  # noqa: E731
     return _split(jax.vmap(row)(jnp.eye(sum(map(math.prod, some)))), some)
 
 
-def change_along(function: Callable, xs: list[Array], active: Mask, vs: list[Array]) -> tuple[Any, Any]:
-    """Return f(x), and its change along v, of those of x that are active, by forward mode."""
-    return jax.jvp(lambda *some: function(replaced(xs, active, some)), select(xs, active), vs)
+def change_along(function: Callable, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[Any, Any]:
+    """Return f(x) and its derivative along v, by forward mode."""
+    return jax.jvp(lambda *some: function(replaced(inputs, active, some)), select(inputs, active), tangents)
 
 
 # --- the linear map
 
 
 class Linear(eqx.Module):
-    """v -> J(x) v, or transposed w -> J(x)^T w, of those of x that are active."""
+    """The map v -> J(x) v, or transposed, w -> J(x)^T w."""
 
     function: DifferentiableFunction
-    xs: list[Array]
-    run: Any  # stored by the evaluation for its first derivatives; None: nothing
+    inputs: list[Array]
+    run: Any  # stored by the evaluation for its first derivatives, or None
     active: Mask = eqx.field(static=True)
     transposed: bool = eqx.field(static=True, default=False)
 
@@ -171,23 +178,23 @@ class Linear(eqx.Module):
         return replace(self, transposed=not self.transposed)
 
     @property
-    def inputs(self) -> list[tuple[int, ...]]:
-        """The shapes of what it is applied to."""
-        return self.function.shapes(self.xs) if self.transposed else [x.shape for x in select(self.xs, self.active)]
+    def argument_shapes(self) -> list[tuple[int, ...]]:
+        """The shapes of its arguments."""
+        return self.function.shapes(self.inputs) if self.transposed else [x.shape for x in select(self.inputs, self.active)]
 
-    def applied(self, vs: list[Array]) -> list[Array]:
-        return _split(_bind(self, _flat(vs)), self.T.inputs)
+    def applied(self, tangents: list[Array]) -> list[Array]:
+        return _split(_bind(self, _flat(tangents)), self.T.argument_shapes)
 
 
 def _apply(linear: Linear, vector: Array) -> Array:
-    function, vs = linear.function, _split(vector, linear.inputs)
+    function, tangents = linear.function, _split(vector, linear.argument_shapes)
     apply = function.backward if linear.transposed else function.forward
-    return _flat(apply(linear.xs, linear.active, vs, linear.run))
+    return _flat(apply(linear.inputs, linear.active, tangents, linear.run))
 
 
 @eqxi.filter_primitive_def
 def _shape(linear, vector):
-    return result_type((sum(map(math.prod, linear.T.inputs)),), jax.tree.leaves((linear, vector)), vector.dtype)
+    return result_type((sum(map(math.prod, linear.T.argument_shapes)),), jax.tree.leaves((linear, vector)), vector.dtype)
 
 
 @eqxi.filter_primitive_jvp
@@ -195,13 +202,15 @@ def _derivative(primals, tangents):
     linear, vector = primals
     at, change = tangents
     found = _bind(linear, vector)
-    if all(dx is None for dx in at.xs):
+    if all(dx is None for dx in at.inputs):
         return found, _bind(linear, change)
     kind = Back if linear.transposed else Along
-    parts = [None] * len(linear.inputs) if change is None else _split(change, linear.inputs)
-    dxs = [*at.xs, *parts]
+    parts = [None] * len(linear.argument_shapes) if change is None else _split(change, linear.argument_shapes)
+    dxs = [*at.inputs, *parts]
     active = tuple(dx is not None for dx in dxs)
-    further = Linear(kind(linear.function, linear.active), [*linear.xs, *_split(vector, linear.inputs)], None, active)
+    further = Linear(
+        kind(linear.function, linear.active), [*linear.inputs, *_split(vector, linear.argument_shapes)], None, active
+    )
     return found, _bind(further, _flat(select(dxs, active)))
 
 
@@ -216,7 +225,7 @@ _linear_p = linear_primitive("derivative_of_a_run", _apply, _shape, _derivative,
 
 @eqxi.filter_primitive_def
 def _apply_short(linear, vector):
-    """Apply a map of machine code; others take diffrax's loops, which are compiled in any case."""
+    """Apply a map if it is machine code; others contain diffrax's loops, which are compiled in any case."""
     if linear.run is None and linear.function.orders < 1:
         raise TooLongError
     return _apply(linear, vector)
@@ -229,8 +238,8 @@ def _bind(linear: Linear, vector: Array) -> Array:
     return eqxi.filter_primitive_bind(_linear_p, linear, vector)
 
 
-def _flat(xs: Sequence[Any]) -> Array:
-    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in xs])
+def _flat(inputs: Sequence[Any]) -> Array:
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in inputs])
 
 
 def _split(vector: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:

@@ -1,8 +1,7 @@
-"""A value and how it changes along directions, by one program where no transformation is left.
+"""A value and its tangent, computed by one program wherever no further transformation applies.
 
-What JAX differentiates comes in parts: a value, with what its derivative needs to know, then linear maps of tangents, which a
-linearization keeps for later and a batch of directions applies to all. Where both run side by side in any case, a program that
-finds both at once need not hand on what it knows.
+JAX splits a derivative into parts: the value with its residuals, then linear maps of tangents, which `linearize` stores and a
+batch of tangents shares. If both run together in any case, one program that computes both need not store the residuals.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,20 +19,22 @@ from jaxtyping import Array, PyTree
 from udkjax.programs.numpy_program import expand_as
 from udkjax.programs.varying_axes import result_type
 
-Shapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its change
-Parts = Callable[..., tuple[list[Array], list[Array]]]  # (at, direction) -> value, change, each a list of arrays
+OutputShapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its tangent
+SplitFunction = Callable[..., tuple[list[Array], list[Array]]]  # (at, direction) -> value, tangent: lists of arrays
 
 
-def split_jvp(seen: Parts, run: Parts, at: PyTree, direction: PyTree, shapes: Shapes) -> tuple[list[Array], list[Array]]:
-    """Return the value at `at` and its change along `direction`, trees of arrays: by `run`; transformations see what `seen` does.
+def split_jvp(
+    seen: SplitFunction, run: SplitFunction, at: PyTree, direction: PyTree, shapes: OutputShapes
+) -> tuple[list[Array], list[Array]]:
+    """Return the value at `at` and its derivative along `direction`, trees of arrays, by `run`; JAX transforms `seen` instead.
 
-    Both are mapped over any batch. `shapes` are those of the value and of the change.
+    Both are mapped over any batch. `shapes` are the shapes of the value and of the derivative.
     """
     direction = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, direction)  # a tangent may be 1.0
     (place, way), static = eqx.partition((at, direction), eqx.is_array)
     (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
 
-    def flat(parts: Parts) -> Callable[..., list[Array]]:
+    def flat(parts: SplitFunction) -> Callable[..., list[Array]]:
         def function(*xs: Array) -> list[Array]:
             given = places.unflatten(xs[: len(start)]), form.unflatten(xs[len(start) :])
             return [x for found in parts(*eqx.combine(given, static)) for x in found]
@@ -46,7 +47,7 @@ def split_jvp(seen: Parts, run: Parts, at: PyTree, direction: PyTree, shapes: Sh
 
 
 class Both:
-    """The two forms as functions of arrays: `start` of the place, then those of the direction, of the shapes `ways`."""
+    """Both forms as functions of arrays: first `start` arrays of the point, then those of the direction, of shapes `ways`."""
 
     def __init__(
         self,
@@ -54,13 +55,13 @@ class Both:
         run: Callable[..., list[Array]],
         start: int,
         ways: Sequence[jax.ShapeDtypeStruct],
-        shapes: Shapes,
+        shapes: OutputShapes,
     ):
         self.seen, self.run, self.start, self.ways, self.shapes = seen, run, start, ways, shapes
         self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "Both":
-        """Return both forms of a batch."""
+        """Return both forms for a batch."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
         ways = [
@@ -108,7 +109,7 @@ def _part(trace: Any, *xs: Array, both: Both) -> list[Array]:
 
 
 def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
-    """Divide under `jax.checkpoint`: the value is known where only directions are not; both are found again on the way back."""
+    """Split under `jax.checkpoint`: if only directions are unknown the value is computed; the backward pass recomputes both."""
     del saveable
     both: Both = eqn.params["both"]
     inputs = [x for x, t in zip(eqn.invars, there, strict=True) if not t and not isinstance(x, Literal)]

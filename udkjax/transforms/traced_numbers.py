@@ -1,4 +1,4 @@
-"""Trees of numbers some of which are traced: those alone are the arguments of a function with derivatives."""
+"""Trees of numbers that are partly traced: only the traced ones are arguments of a function with derivatives."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,15 +9,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
+from udkjax.annotations import TreeDef
 from udkjax.programs.varying_axes import vary_together
 from udkjax.scene.fields import number
-from udkjax.transforms.gradients import TreeDef
 
-Mask = tuple[bool, ...]  # of a list of arrays: those that have tangents
+Mask = tuple[bool, ...]  # True for the arrays of a list that have tangents
 
 
 class ConcreteNumbers:
-    """The known arrays among those of a tree, None in place of the others; compared by value, so that they are static."""
+    """The concrete arrays of a tree, None in place of traced ones; compared by value, so that they are static."""
 
     def __init__(self, arrays: Sequence[Array | None]):
         self.arrays = arrays
@@ -31,7 +31,7 @@ class ConcreteNumbers:
 
 
 class TreeOfNumbers(eqx.Module):
-    """A tree as a function of the arrays of floats in it that are traced. The others stay known: JAX would trace them all."""
+    """A tree as a function of its traced float arrays. The others stay concrete: JAX would trace them all."""
 
     rest: PyTree  # the tree without arrays of floats
     concrete: ConcreteNumbers = eqx.field(static=True)
@@ -43,18 +43,18 @@ class TreeOfNumbers(eqx.Module):
         return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
 
     def marks(self, active: Mask) -> Any:
-        """Return the tree with True in place of the arrays that are active, and False in place of the others."""
+        """Return the tree with True in place of active arrays, and False in place of others."""
         traced = iter(active)
         return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.concrete.arrays])
 
     def changes(self, active: Mask, some: Sequence[Array]) -> Any:
-        """Return the tree with some arrays in place of those that are active, and None in place of the others."""
+        """Return the tree with `some` arrays in place of active ones, and None in place of others."""
         marks, rest = jax.tree.leaves(self.marks(active)), iter(some)
         return jax.tree.unflatten(self.structure, [next(rest) if m else None for m in marks])
 
 
 def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
-    """Return a tree as a function of the arrays of floats in it that are traced, and these arrays."""
+    """Return a tree as a function of its traced float arrays, and these arrays."""
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     concrete = ConcreteNumbers([None if isinstance(x, Tracer) else number(x) if isinstance(x, np.ndarray) else x for x in leaves])
@@ -67,6 +67,6 @@ def select(xs: Sequence[Any], which: Mask) -> list[Any]:
 
 
 def replaced(xs: Sequence[Array], active: Mask, some: Sequence[Array]) -> list[Array]:
-    """Return the same, with others in place of those that are active."""
+    """Return the arrays with `some` in place of the active ones."""
     rest = iter(some)
     return [next(rest) if m else x for x, m in zip(xs, active, strict=True)]

@@ -186,12 +186,15 @@ def drawn(old="", new="", *, head=HEAD, pins="", end=""):
 MISTAKES = [
     # units
     (drawn('"0.5 kg"', '"0.5 m"', head=MM), 'link "rocker" (link[2]).mass: "m" does not fit; it is measured in kg, g'),
-    (drawn('"0.5 kg"', '"0.5 stone"', head=MM), 'link "rocker" (link[2]).mass: "stone" is no unit known here'),
+    (drawn('"0.5 kg"', '"0.5 stone"', head=MM), 'link "rocker" (link[2]).mass: "stone" is not a known unit'),
     (drawn('"0.5 kg"', '"half"', head=MM), 'link "rocker" (link[2]).mass: must be a number, or a text'),
     (drawn('"0.5 kg"', '"5"', head=MM), 'link "rocker" (link[2]).mass: "5" has no unit'),
     (drawn("[0, 0]", '[0, "1 s"]', head=MM), 'pins.O[1]: "s" does not fit; it is measured in m, mm, cm'),
-    (drawn(head=MM + "gravity = [0, -9.81]\n"), "gravity[1]: -9.81 of what? length is in mm here: write it with its unit"),
-    (drawn(head=MM, end='[[motor]]\npin = "O"\nspeed = 5'), 'motor "motor1" (motor[0]).speed: 5 of what? angle is in deg here'),
+    (drawn(head=MM + "gravity = [0, -9.81]\n"), "gravity[1]: -9.81 needs a unit, as length is in mm here: write"),
+    (
+        drawn(head=MM, end='[[motor]]\npin = "O"\nspeed = 5'),
+        'motor "motor1" (motor[0]).speed: 5 needs a unit, as angle is in deg here',
+    ),
     (drawn(head=HEAD + 'units = {lenght = "mm"}\n'), 'units.lenght: unknown quantity; did you mean "length"?'),
     (drawn(head=HEAD + 'units = {length = "kg"}\n'), 'units.length: "kg" does not fit'),
     # names
@@ -204,7 +207,7 @@ MISTAKES = [
     ),
     (
         drawn(end='[[motor]]\npin = "O"\nspeed = "60 RPM"'),
-        'motor "motor1" (motor[0]).speed: "RPM" is no unit known here; did you mean "rpm"?',
+        'motor "motor1" (motor[0]).speed: "RPM" is not a known unit; did you mean "rpm"?',
     ),
     (drawn('"C", "B"', '"C", "b"'), 'link "rocker" (link[2]).pins[1]: no pin named "b"; did you mean "B"?'),
     (drawn('ground = ["O", "C"]', 'ground = ["Q", "C"]'), 'ground[0]: no pin named "Q"'),
@@ -224,7 +227,7 @@ MISTAKES = [
     (drawn("density = 7850\n", ""), 'link "rod" (link[1]): give a density, with a thickness, or a mass'),
     (
         drawn(pins="S = [200, 9]\nT = [200, 90]\n", end='[[link]]\nname = "x"\npins = ["S", "T"]\nmass = 1'),
-        'link "x" (link[3]).pins: no other link and no ground shares one of them',
+        'link "x" (link[3]).pins: the link is not connected to the ground or to another link',
     ),
     (
         drawn('ground = ["O", "C"]', 'ground = ["O", "C", "A"]', end='[[motor]]\npin = "A"\nspeed = 1'),

@@ -114,7 +114,7 @@ def test_all_mistakes_of_a_file_are_told_at_once(mech, file):
         'no body named "cranc"; did you mean "crank"? (what is not to be read must be listed in `ignore`)',
         'there is no column "joint.O.fx"',
         '"deg" does not fit; it is measured in m, mm, cm',
-        '"furlong" is no unit known here',
+        '"furlong" is not a known unit',
         'must be a number, is "x"',
         "0.1 s does not exceed the one before, 0.2 s",
     ):
@@ -305,9 +305,9 @@ def test_units_are_told_as_people_write_them(units, wanted, expected):
         ("mm", "rad", '"mm" does not fit; it is measured in rad, deg, rev'),
         ("N", "N m", "it is measured in N m, N mm, kN m"),
         ("rad/s", "rad/s2", "it is measured in rad/s2, deg/s2"),
-        ("Hz", "rad/s", '"Hz" is no unit known here; cycles a second are rev/s'),
-        ("5 m", "m", "is no unit known here"),
-        ("%", "m", "is no unit known here"),
+        ("Hz", "rad/s", '"Hz" is not a known unit; cycles a second are rev/s'),
+        ("5 m", "m", "is not a known unit"),
+        ("%", "m", "is not a known unit"),
     ],
 )
 def test_units_that_do_not_fit_are_refused(units, wanted, problem):

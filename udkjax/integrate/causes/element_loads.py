@@ -15,7 +15,7 @@ from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 
-State = tuple[float, np.ndarray, np.ndarray]  # t (s), q and v (n,)
+TimedState = tuple[float, np.ndarray, np.ndarray]  # t (s), q and v (n,)
 
 
 class ElementLoads(NamedTuple):
@@ -28,7 +28,7 @@ class ElementLoads(NamedTuple):
     stiffness: np.ndarray  # (states, elements), 1/s
 
 
-def element_loads(mechanism: Mechanism, length: float, states: Sequence[State]) -> ElementLoads:
+def element_loads(mechanism: Mechanism, length: float, states: Sequence[TimedState]) -> ElementLoads:
     """Evaluate the loads of each force element at several states."""
     names, count = mechanism.force_names, len(mechanism.forces)
     ts, qs, vs = (np.stack([np.asarray(s[k], float) for s in states]) for k in range(3))

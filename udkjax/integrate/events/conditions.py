@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame, Point, between
 from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import Number, library_for
+from udkjax.scene.fields import library_for
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 

@@ -20,7 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.annotations import Scalar
+from udkjax.annotations import Number, NumberLike
 from udkjax.integrate.events.actions import Action, Impact, Stop
 from udkjax.integrate.events.checks import (
     number_if_any,
@@ -33,7 +33,7 @@ from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import Mistakes, quote, suggestion
-from udkjax.scene.fields import Number, is_traced, number
+from udkjax.scene.fields import is_traced, number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.requirements import describe
 
@@ -53,7 +53,7 @@ class Event(PrintsLine):
         name: name in lists.
     """
 
-    condition: Callable[[Number, Frames], Scalar]
+    condition: Callable[[Number, Frames], NumberLike]
     action: Action = Stop()
     direction: int = eqx.field(static=True, default=0)
     name: str = eqx.field(static=True, default="")

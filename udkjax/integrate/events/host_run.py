@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from udkjax.annotations import TreeDef
 from udkjax.equations.scales import mass_of
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import added_joints, joint_numbers
@@ -30,7 +31,7 @@ from udkjax.native.base.host_function import call_host
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.numpy_program import Meter, numpy_program
 from udkjax.scene.identity_cache import cached_by_identity
-from udkjax.transforms.gradients import TreeDef, stop_gradients
+from udkjax.transforms.gradients import stop_gradients
 
 SHARED, NUMBERS = 9, 5  # arrays of a run besides those of its phases, and which are the numbers of conditions
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 
 from udkjax.integrate.events.crossings import ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions
-from udkjax.integrate.events.runs import Members, RunState, take
+from udkjax.integrate.events.runs import MemberIndices, RunState, take
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.transforms.gradients import stop_gradients
 
@@ -26,7 +26,7 @@ class JumpResult(NamedTuple):
 
 def apply_event(
     system: System,
-    some: Members,
+    some: MemberIndices,
     k: Int[Any, "b"],
     before: RunState,
     values: ConditionValues,

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, first_crossing, side_of_zero
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
-from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberRuns, Members, RunState, take
+from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.integrate.solution import Result
 from udkjax.transforms.gradients import stop_gradients
@@ -31,7 +31,7 @@ def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
     return system.repeat(change, runs)
 
 
-def _settle(system: System, runs: MemberRuns, some: Members) -> MemberRuns:
+def _settle(system: System, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
     """Return the runs with all that happens now to some members: at the start, behind an event, or where they have come to."""
     plan, xp, E = system.plan, system.xp, system.plan.count
     state, event, sides = runs.state(some), take(runs.event, some), take(runs.sides, some)
@@ -72,7 +72,7 @@ def _settle(system: System, runs: MemberRuns, some: Members) -> MemberRuns:
     )
     happens = runs.running & (runs.event >= 0)
 
-    def jump(runs: MemberRuns, those: Members) -> MemberRuns:
+    def jump(runs: MemberRuns, those: MemberIndices) -> MemberRuns:
         if those is None:
             return _jump(system, runs, those, values, found)
         chosen = take(happens, some)
@@ -82,7 +82,7 @@ def _settle(system: System, runs: MemberRuns, some: Members) -> MemberRuns:
     return system.when(happens, jump, runs)
 
 
-def condition_values(system: System, some: Members, at: RunState) -> tuple[ConditionValues, StateValues]:
+def condition_values(system: System, some: MemberIndices, at: RunState) -> tuple[ConditionValues, StateValues]:
     """Return the conditions of some members at their states, and what is known of these besides."""
     xp, found, unit = system.xp, system.look(some, at), take(system.coordinates, some)
     rate, t = take(system.rate, some)[:, None], at.t[:, None]
@@ -93,7 +93,7 @@ def condition_values(system: System, some: Members, at: RunState) -> tuple[Condi
     return ConditionValues(found.g, found.rate, found.rate_2, found.a, scale if xp is np else stop_gradients(scale)), found
 
 
-def _settled(system: System, runs: MemberRuns, some: Members) -> Bool[Any, "b E"]:
+def _settled(system: System, runs: MemberRuns, some: MemberIndices) -> Bool[Any, "b E"]:
     """Return a mask of what the last event has settled: contacts that took part, and the condition that it took note of."""
     xp, plan = system.xp, system.plan
     last = xp.maximum(take(runs.count, some) - 1, 0)
@@ -102,7 +102,7 @@ def _settled(system: System, runs: MemberRuns, some: Members) -> Bool[Any, "b E"
     return (closed > OPEN) | ((np.arange(plan.count) == index[:, None]) & ~plan.changes)
 
 
-def _jump(system: System, runs: MemberRuns, some: Members, values: ConditionValues, found: StateValues) -> MemberRuns:
+def _jump(system: System, runs: MemberRuns, some: MemberIndices, values: ConditionValues, found: StateValues) -> MemberRuns:
     """Apply the events that happen to some members, and note them with the contacts that take part in them."""
     plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.max_events
     k, before, sides, carried = take(runs.event, some), runs.state(some), take(runs.sides, some), take(runs.carried, some)

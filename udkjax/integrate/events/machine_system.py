@@ -15,7 +15,7 @@ from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
-from udkjax.integrate.events.runs import Change, MemberRuns, Members, RunState, take
+from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.solution import Result
 from udkjax.native.base.layout import INFO
@@ -77,22 +77,22 @@ class MachineSystem:
         self._watched = [np.append(np.arange(E), E + np.flatnonzero(held)) for held in self.plan.held]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
-    def contacts(self, some: Members) -> Contacts:
+    def contacts(self, some: MemberIndices) -> Contacts:
         """Return the contacts of some members."""
         plan = self.plan
         numbers = take(self._restitution, some), take(self.rate, some)
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, *numbers)
 
-    def look(self, some: Members, at: RunState, is_free: bool = False) -> StateValues:
+    def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
         """Evaluate some members at states."""
         return StateValues(*self._by_phase(some, at, PhaseCode.at))
 
-    def project(self, some: Members, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities that the phases of states allow."""
         q, v = self._by_phase(some, at, PhaseCode.project)
         return q, v
 
-    def _by_phase(self, some: Members, at: RunState, function: Callable[..., Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
+    def _by_phase(self, some: MemberIndices, at: RunState, function: Callable[..., Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
         members, found = self._all if some is None else some, []
         for phase in set(at.phase.tolist()):
             of_phase = at.phase == phase
@@ -104,7 +104,7 @@ class MachineSystem:
                 to[of_phase] = x
         return found
 
-    def add_joints(self, some: Members, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
+    def add_joints(self, some: MemberIndices, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
         """Return the numbers of the joints that events have added, with those that some events add at q; -1: none."""
         members, start = self._all if some is None else some, 0
         for joint, numbers in zip(self._added, joints, strict=True):
@@ -127,7 +127,7 @@ class MachineSystem:
                 runs = change(runs)
         return runs
 
-    def advance(self, runs: MemberRuns, some: Members) -> MemberRuns:
+    def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
         """Take some members to their next crossings, or to their ends, by one call of machine code for each phase."""
         members = self._all if some is None else some
         phases = runs.phase[members]

@@ -21,7 +21,7 @@ from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
 from udkjax.integrate.events.hybrid import Added, Hybrid
 from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.loop import run_loop
-from udkjax.integrate.events.runs import Change, EventRun, MemberRuns, Members, RunState, results, runs_before
+from udkjax.integrate.events.runs import Change, EventRun, MemberIndices, MemberRuns, RunState, results, runs_before
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
@@ -76,17 +76,17 @@ class PlainSystem:
         self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
         self.inverse_mass = 1 / mass_of(hybrid.phases.mechanisms[0], jnp)[None]
 
-    def contacts(self, some: Members) -> Contacts:
+    def contacts(self, some: MemberIndices) -> Contacts:
         """Return the contacts."""
         plan = self.plan
         e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
 
-    def look(self, some: Members, at: RunState, is_free: bool = False) -> StateValues:
+    def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
         """Evaluate a state."""
         return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free))
 
-    def project(self, some: Members, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
+    def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
         """Return positions and velocities that the phase of a state allows."""
 
         def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
@@ -98,7 +98,7 @@ class PlainSystem:
         q, v = self.hybrid.in_phase(phase, of_phase, t, q, v, added, is_free=is_free)
         return q[None], v[None]
 
-    def add_joints(self, some: Members, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
+    def add_joints(self, some: MemberIndices, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
         """Return the joints that events have added, with that which an event adds at q; -1: none."""
         phases = self.hybrid.phases
         new = (phases.joint_at(i, q[0]) for i in range(len(joints)))
@@ -116,7 +116,7 @@ class PlainSystem:
         """Return the run after as many changes as it takes."""
         return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
 
-    def advance(self, runs: MemberRuns, some: Members) -> MemberRuns:
+    def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
         """Integrate a window, and go on to its end; or to the last node before something crosses, or may; or to the crossing."""
         hybrid, ts, window, state = self.hybrid, self.hybrid.ts, runs.window, without_member(runs.state(None))
         t, E, T = state.t, hybrid.count, len(ts)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from udkjax.annotations import TreeDef
 from udkjax.integrate.events.crossings import ZERO_RATE
 from udkjax.integrate.events.host_run import run_by_machine_code
 from udkjax.integrate.events.hybrid import Hybrid, rate_along
@@ -18,7 +19,7 @@ from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_me
 from udkjax.integrate.events.runs import EventRun, RunState
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import Conditions
-from udkjax.transforms.gradients import TreeDef, stop_gradients
+from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
 
 OUTPUTS = 32  # of one piece

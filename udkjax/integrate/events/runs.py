@@ -17,7 +17,7 @@ from udkjax.integrate.solution import Result
 # In place of an event: the conditions are not known yet, at the start of the run, or behind an event.
 BEGIN, AGAIN = -3, -2
 
-Members = Int[np.ndarray, "b"] | None  # the indices of some members; None: all of them
+MemberIndices = Int[np.ndarray, "b"] | None  # the indices of some members; None: all of them
 
 
 class RunState(NamedTuple):
@@ -81,11 +81,11 @@ class MemberRuns(NamedTuple):
     record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with room for one more, which takes what is not to be noted
     window: Any  # of the plain form
 
-    def state(self, some: Members) -> RunState:
+    def state(self, some: MemberIndices) -> RunState:
         """Return the states of some members."""
         return RunState(take(self.t, some), take(self.q, some), take(self.v, some), take(self.phase, some), self.joints)
 
-    def put(self, some: Members, **new: Any) -> "MemberRuns":
+    def put(self, some: MemberIndices, **new: Any) -> "MemberRuns":
         """Return the runs with new values of some members."""
         if some is None:
             return self._replace(**new)
@@ -93,7 +93,7 @@ class MemberRuns(NamedTuple):
             getattr(self, name)[some] = x
         return self
 
-    def note(self, some: Members, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
+    def note(self, some: MemberIndices, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
         """Return the runs with values of `RECORD`, each (b or 1, k or 1, ...), in some rows of the record."""
         members = (np.arange(len(self.t)) if some is None else some)[:, None]
         if isinstance(self.t, np.ndarray):
@@ -103,10 +103,10 @@ class MemberRuns(NamedTuple):
         return self._replace(record=tuple(x.at[members, rows].set(y) for x, y in zip(self.record, new, strict=True)))
 
 
-Change = Callable[[MemberRuns, Members], MemberRuns]  # of some members
+Change = Callable[[MemberRuns, MemberIndices], MemberRuns]  # of some members
 
 
-def take(x: Any, some: Members) -> Any:
+def take(x: Any, some: MemberIndices) -> Any:
     """Return the rows of some members."""
     return x if some is None else x[some]
 

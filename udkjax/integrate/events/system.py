@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import Contacts
-from udkjax.integrate.events.runs import Change, MemberRuns, Members, RunState
+from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState
 
 
 class StateValues(NamedTuple):
@@ -43,23 +43,23 @@ class System(Protocol):
     coordinates: Float[Any, "B n"]
     inverse_mass: Float[Any, "B n"]
 
-    def contacts(self, some: Members) -> Contacts:
+    def contacts(self, some: MemberIndices) -> Contacts:
         """Return the contacts of some members."""
         ...
 
-    def look(self, some: Members, at: RunState, is_free: bool = False) -> StateValues:
+    def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
         """Evaluate some members at states, of phases in which no contact is at rest where `is_free`."""
         ...
 
-    def project(self, some: Members, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
+    def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
         """Return positions and velocities that the phases of states allow."""
         ...
 
-    def add_joints(self, some: Members, event: Int[Any, "b"], q: Float[Any, "b n"], joints: Any) -> Any:
+    def add_joints(self, some: MemberIndices, event: Int[Any, "b"], q: Float[Any, "b n"], joints: Any) -> Any:
         """Return the joints that events have added, with those that some events add at q; -1: none."""
         ...
 
-    def advance(self, runs: MemberRuns, some: Members) -> MemberRuns:
+    def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
         """Take some members on, no farther than to the next crossing, which is then their `event`."""
         ...
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
@@ -34,7 +35,6 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import units_of
 
-Json = dict[str, Any]
 STEPS_OF_A_PAGE = 20_000  # of a run in it: beyond, it would not answer for seconds
 
 
@@ -47,7 +47,7 @@ class PortableEngine(NamedTuple):
         mechanism: the mechanism that is simulated.
     """
 
-    data: Json
+    data: JsonObject
     numbers: NumberProgram
     mechanism: Mechanism
 
@@ -120,7 +120,7 @@ def _engine(
     numbers = NumberProgram(
         mechanism, values, dress, lambda given: [*watched.numbers(given), *(x for _, x in drawn_points(given) if drawn)]
     )
-    data: Json = {
+    data: JsonObject = {
         "format": 1,
         "bodies": list(mechanism.body_names),
         "parameters": [{"name": name, "unit": units_of(mechanism, name), "value": x} for name, x in values.items()],
@@ -171,18 +171,18 @@ def floats(x: Any) -> str:
     return base64.b64encode(np.asarray(x, "<f8").tobytes()).decode()
 
 
-def _module(linked: LinkedModule, **further: Any) -> Json:
+def _module(linked: LinkedModule, **further: Any) -> JsonObject:
     code = base64.b64encode(zlib.compress(linked.code, 9)).decode()
     return {"code": code, "bytes": len(linked.code), "data_end": linked.data_end, **further}
 
 
-def _operation(operation: Operation) -> Json:
+def _operation(operation: Operation) -> JsonObject:
     linked, module = wasm_module(operation)
     names = {"inputs": [*INPUTS, *module.inputs], "results": [*module.results, *module.outputs]}
     return _module(linked, fields=list(module.call_fields), settings=list(operation.all_settings), **names)
 
 
-def _places(mechanism: Mechanism, pull: bool) -> Json:
+def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
     """Return the places in the vector of all numbers of the guess and of the pulls."""
     leaves, tree = jax.tree.flatten(mechanism.without_origin.without_samples)
     starts = np.cumsum([0, *(np.size(x) for x in leaves)])
@@ -208,7 +208,7 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
     return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))
 
 
-def _run(problem: Problem, data: Json, events: PortableEvents, rows: tuple[int, ...]) -> Json:
+def _run(problem: Problem, data: JsonObject, events: PortableEvents, rows: tuple[int, ...]) -> JsonObject:
     """Return the module of runs; its inputs go into the data."""
     operation, inputs = problem.compiled.plan.operation, packed(problem)
     assert operation is not None  # such a page runs machine code
@@ -228,17 +228,17 @@ def _run(problem: Problem, data: Json, events: PortableEvents, rows: tuple[int, 
     return modules
 
 
-def _close(mechanism: Mechanism) -> Json:
+def _close(mechanism: Mechanism) -> JsonObject:
     return _operation(Close(scene_programs(mechanism).with_all_rows))
 
 
-def _closing(analysis: Analysis) -> Json:
+def _closing(analysis: Analysis) -> JsonObject:
     """Return the inputs of closing."""
     length, tol = float(analysis.scales.length), float(analysis.scales.rank_tol)
     return {"thresholds": [tol**2, 0.0], "settings": [length, tol], "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}
 
 
-def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: Json) -> Json:
+def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: JsonObject) -> JsonObject:
     """Return the module of evaluations; which efforts it finds goes into the data."""
     code = scene_programs(mechanism, analysis.redundant_rows)
     evaluation = Evaluation(code, [numbers.function()])
@@ -251,14 +251,14 @@ def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram
     return _module(linked, places=evaluation.places, size=evaluation.size)
 
 
-def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[Json]:
+def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject]:
     """Return the row of each driver, and its place in the solution of the linear system."""
     names = [name for name, _ in code.row_names]
     rows = [names.index(name) for name in mechanism.driver_names]
     return [{"row": row, "place": code.eliminated_rows[row]} for row in rows]
 
 
-def joint_forces(mechanism: Mechanism, code: ScenePrograms) -> list[Json]:
+def joint_forces(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject]:
     """Return for each constraint at a point how the force on its second body is found (its first one, where that is the ground).
 
     The load of a constraint on a body is -Psi_q^T lambda = Psi_q^T x, with x the solution of the linear system for its rows. It

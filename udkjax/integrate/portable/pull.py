@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.bodies import Point
 from udkjax.scene.fields import NOT_NEGATIVE, given_number
-from udkjax.scene.forces import ForceElement, Load
+from udkjax.scene.forces import ForceElement, Wrench
 from udkjax.scene.mechanism import Mechanism
 
 PREFIX = "pull of "  # in the names of the elements
@@ -35,7 +35,7 @@ class Pull(ForceElement):
         stretch = Point(self.target[0] - place.x, self.target[1] - place.y)
         return 0.5 * self.stiffness * stretch.dot(stretch)
 
-    def loads(self, t, *frames) -> list[Load]:
+    def loads(self, t, *frames) -> list[Wrench]:
         body = frames[0]
         v, arm = body.velocity(self.point), body.vector(self.point)
         x, y = -self.damping * v.x, -self.damping * v.y

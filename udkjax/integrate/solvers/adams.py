@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from udkjax.annotations import Vector
 from udkjax.integrate.solvers.divided_differences import HIGHEST, DifferenceInterpolation, StepCoefficients, step_coefficients
 from udkjax.integrate.solvers.multistep import (
     LOST_STEP,
     STRICTER,
     Flag,
     Multistep,
-    Scalar,
     Tolerances,
     Unravel,
     check_orders,
@@ -54,37 +54,36 @@ TINY = 1e-300  # in the place of zero, where an error divides
 
 # --- the choice of order and step
 
-Vector = Float[Array, "y"]
-Field = Callable[[Scalar, Vector], Vector]
-Size = Callable[[Float[Array, "rows y"]], Float[Array, "rows"]]
+Field = Callable[[Float[Array, ""], Vector], Vector]
+Size = Callable[[Float[Array, "rows n"]], Float[Array, "rows"]]
 
 
 class ErrorEstimates(eqx.Module):
     """Estimated local errors of orders k - 2 to k + 1, relative to the tolerance, were all steps of one size."""
 
-    k_minus_2: Scalar
-    k_minus_1: Scalar
-    k: Scalar
-    k_plus_1: Scalar
+    k_minus_2: Float[Array, ""]
+    k_minus_1: Float[Array, ""]
+    k: Float[Array, ""]
+    k_plus_1: Float[Array, ""]
 
 
 class OrderControl(eqx.Module):
     """The state of the choice of order and step."""
 
     order: Int[Array, ""]  # of the next step
-    step: Scalar  # the next step that is planned
+    step: Float[Array, ""]  # the next step that is planned
     equal_steps: Int[Array, ""]  # the number of steps of equal size up to here
     starting: Bool[Array, ""]  # order and step rise with every step
 
 
-def first_order_control(h: Scalar) -> OrderControl:
+def first_order_control(h: Float[Array, ""]) -> OrderControl:
     """Return the state for a history of one value, with a first step h."""
     return OrderControl(jnp.array(1), jnp.asarray(h), jnp.array(1), jnp.array(True))
 
 
 def choose_order(
-    control: OrderControl, h: Scalar, points: Int[Array, ""], errors: ErrorEstimates, least: int, most: int
-) -> tuple[OrderControl, Scalar]:
+    control: OrderControl, h: Float[Array, ""], points: Int[Array, ""], errors: ErrorEstimates, least: int, most: int
+) -> tuple[OrderControl, Float[Array, ""]]:
     """Choose the next order and step after an accepted step.
 
     Args:
@@ -116,7 +115,7 @@ def choose_order(
     return OrderControl(order, h * growth, equal_steps, starting), growth
 
 
-def step_factor(error: Scalar, order: Int[Array, ""]) -> Scalar:
+def step_factor(error: Float[Array, ""], order: Int[Array, ""]) -> Float[Array, ""]:
     """Return the factor of a step with this error, of a method of this order."""
     factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
     return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
@@ -130,11 +129,11 @@ class History(eqx.Module):
 
     ages: Float[Array, "N"]  # t_n - t_{n-j}, j = 0, 1, ...
     phi: Float[Array, "N y"]
-    y: Float[Array, "y"]  # to which phi belongs
+    y: Vector  # to which phi belongs
     exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value that the corrector has used
     points: Int[Array, ""]  # number of known points, and of rows of phi that count
     control: OrderControl
-    rate: Scalar  # at which the iteration converged
+    rate: Float[Array, ""]  # at which the iteration converged
     evaluations: Int[Array, ""]
 
 
@@ -222,7 +221,7 @@ class Adams(Multistep):
         y_error = steer_error(self.root_finder, y0, y1, accept, jnp.where(accept, growth, shrink))
         return y1, y_error, dense, new, diffrax.RESULTS.successful
 
-    def _begin(self, h: Scalar, y: Vector, f: Vector, evaluations: Int[Array, ""]) -> History:
+    def _begin(self, h: Float[Array, ""], y: Vector, f: Vector, evaluations: Int[Array, ""]) -> History:
         """Return a history of one value."""
         rows, one = self.max_order + 2, jnp.array(1)
         phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
@@ -238,7 +237,7 @@ class Adams(Multistep):
         )
 
     def _update_newest(
-        self, f: Field, t0: Scalar, h: Scalar, y: Vector, state: History, made_jump: Flag
+        self, f: Field, t0: Float[Array, ""], h: Float[Array, ""], y: Vector, state: History, made_jump: Flag
     ) -> tuple[History, Bool[Array, ""]]:
         """Return the history with f(t0, y) as its newest value, or a new one; and whether y is not the end of the last step.
 
@@ -254,7 +253,7 @@ class Adams(Multistep):
 
     def _correct(
         self, f: Callable[[Vector], Vector], y: Vector, slope: Vector, rule: StepCoefficients, size: Size, state: History
-    ) -> tuple[Vector, Bool[Array, ""], Int[Array, ""], Scalar]:
+    ) -> tuple[Vector, Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:
         """Return d, by which f exceeds its extrapolated value `slope`, whether it was found, the calls of f, and the rate."""
         if self.corrector == "pece":
             return f(y) - slope, jnp.array(True), jnp.array(1), state.rate

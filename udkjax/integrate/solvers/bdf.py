@@ -17,7 +17,6 @@ from udkjax.integrate.solvers.multistep import (
     STRICTER,
     Flag,
     Multistep,
-    Scalar,
     Tolerances,
     Unravel,
     check_orders,
@@ -28,7 +27,6 @@ from udkjax.integrate.solvers.multistep import (
 )
 from udkjax.transforms.gradients import stop_gradients
 
-Vector = Float[Array, "n"]
 Terms = PyTree[diffrax.AbstractTerm]
 
 HIGHEST = 5  # the formula of order six is of little use, the seventh unstable (Hairer, Wanner II, section V.1)
@@ -84,8 +82,8 @@ class BDFState(eqx.Module):
 class BDFInterpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial through the states at the end of a step and before, as many as the order of the step and one."""
 
-    t0: Scalar
-    t1: Scalar
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
     times: Float[Array, "m"]
     phi: PyTree[Array]  # (m, ...)
 
@@ -144,7 +142,12 @@ class BDF(Multistep):
         return self._begin(newton.initial_state(len(y), y.dtype), vector_field(terms, t0, y0, args), t0, t1, y)
 
     def _begin(
-        self, iteration: newton.NewtonState, f: Float[Array, "n"], t0: Scalar, t1: Scalar, y: Float[Array, "n"]
+        self,
+        iteration: newton.NewtonState,
+        f: Float[Array, "n"],
+        t0: Float[Array, ""],
+        t1: Float[Array, ""],
+        y: Float[Array, "n"],
     ) -> BDFState:
         """Return a history of one state, as if the state had always changed at the rate f."""
         m, h = self.max_order + 2, t1 - t0
@@ -200,8 +203,8 @@ class BDF(Multistep):
     def _history(
         self,
         terms: PyTree[diffrax.AbstractTerm],
-        t0: Scalar,
-        t1: Scalar,
+        t0: Float[Array, ""],
+        t1: Float[Array, ""],
         y0: PyTree,
         args: PyTree,
         state: BDFState,
@@ -256,7 +259,7 @@ class _Size(eqx.Module):
         return self.factor * self.norm(self.unravel(x / self.scale))
 
 
-def _weights(times: Float[Array, "m"], t: Scalar) -> Float[Array, "m"]:
+def _weights(times: Float[Array, "m"], t: Float[Array, ""]) -> Float[Array, "m"]:
     """Return the weights of phi in the polynomial that it stands for, at t."""
     return jnp.concatenate([jnp.ones(1, times.dtype), jnp.cumprod((jnp.asarray(t) - times[:-1]) / (times[0] - times[1:]))])
 

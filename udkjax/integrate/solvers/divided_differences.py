@@ -23,7 +23,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-Scalar = Float[Array, ""]
 HIGHEST = 12  # order; beyond it the methods are hardly stable
 # Gauss's points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
 POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
@@ -62,7 +61,7 @@ def step_coefficients(h: Float[Array, ""], ages: Float[Array, "N"]) -> StepCoeff
     return StepCoefficients(h, beta, integrate_basis(jnp.ones(()), h, ages), h * sigma * GAMMA[: len(ages)])
 
 
-def integrate_basis(s: Scalar, h: Scalar, ages: Float[Array, "N"]) -> Float[Array, "N"]:
+def integrate_basis(s: Float[Array, ""], h: Float[Array, ""], ages: Float[Array, "N"]) -> Float[Array, "N"]:
     """Return the integrals of c_1, ..., c_N from 0 to s."""
     at = s * POINTS[:, None]
     factors = (at * h + ages[:-1]) / (h + ages[:-1])
@@ -73,8 +72,8 @@ def integrate_basis(s: Scalar, h: Scalar, ages: Float[Array, "N"]) -> Float[Arra
 class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial that the step itself has integrated, of the step's order."""
 
-    t0: Scalar
-    t1: Scalar
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
     y0: PyTree[Array]
     ages: Float[Array, "N"]
     terms: Float[Array, "N y"]  # phi*_1, ..., phi*_k, d, 0, ...

@@ -16,7 +16,6 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-Scalar = Float[Array, ""]
 Flag = Bool[ArrayLike, ""]
 Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
 
@@ -61,7 +60,7 @@ def steer_error(
     return jax.tree.map(lambda s: size / tolerances.norm(ones) * s, error_scale(tolerances, y0, y1))
 
 
-def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Scalar, y: PyTree[Array], args: PyTree) -> Float[Array, "n"]:
+def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Float[Array, ""], y: PyTree[Array], args: PyTree) -> Float[Array, "n"]:
     """Return the derivative of y, as a vector."""
     unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the time that a step would take
     return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]

@@ -6,7 +6,7 @@ import numpy as np
 
 from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, Address, Kernel, LoopProgram, Reset
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.program import Place, Writer, from_memory
+from udkjax.native.base.program import PointerPlace, Writer, from_memory
 
 
 class LoopWriter:
@@ -20,7 +20,7 @@ class LoopWriter:
         self._tables: dict[bytes, str] = {}
 
     def write(
-        self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
+        self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, PointerPlace], width: int | None = None
     ) -> None:
         """Write a program as a function of some pointers.
 

@@ -8,7 +8,7 @@ from udkjax.native.base.ir import POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory
-from udkjax.native.base.program import Place, consecutive, write
+from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.steps import POINTS
 
 # Once a run, beside singularities, or where a piece may end.
@@ -155,7 +155,7 @@ class Module(Memory):
         return names
 
     @property
-    def arrays(self) -> dict[str, Place]:
+    def arrays(self) -> dict[str, PointerPlace]:
         """The places of the arrays of the scene's programs."""
         named = {
             "t": "state t",
@@ -184,7 +184,7 @@ class Module(Memory):
             self.write_program(name, self.arrays | out)
         self.write_prologue("prologue", self.written_out)
 
-    def write_program(self, name: str, at: Mapping[str, Place]):
+    def write_program(self, name: str, at: Mapping[str, PointerPlace]):
         """Write one of the scene's programs, with its arrays where `at` says, as a function of `work` and `out`."""
         if self.written_out:
             self.write_scalars(self.written_out.program(name), name, ("work", "out"), at)
@@ -192,11 +192,16 @@ class Module(Memory):
             self.loops.write(self.programs[name], name, ("work", "out"), at)
 
     def write_scalars(
-        self, program: WrittenOutProgram, name: str, pointers: Sequence[str], at: Mapping[str, Place], width: int | None = None
+        self,
+        program: WrittenOutProgram,
+        name: str,
+        pointers: Sequence[str],
+        at: Mapping[str, PointerPlace],
+        width: int | None = None,
     ):
         """Write a program without loops."""
 
-        def find(places: Sequence[Place]) -> list[Place]:
+        def find(places: Sequence[PointerPlace]) -> list[PointerPlace]:
             return [(at[x][0], at[x][1] + k) if x in at else (pointers[0], 0) for x, k in places]
 
         lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers}

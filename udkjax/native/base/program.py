@@ -29,10 +29,10 @@ class UnsupportedError(ValueError):
     """Something in a scene that machine code has no instruction for."""
 
 
-Place = tuple[str, int]  # the name of a pointer, and an index from there
+PointerPlace = tuple[str, int]  # the name of a pointer, and an index from there
 
 
-def consecutive(pointer: str, count: int) -> list[Place]:
+def consecutive(pointer: str, count: int) -> list[PointerPlace]:
     """Return the places of so many numbers from a pointer on."""
     return [(pointer, k) for k in range(count)]
 
@@ -42,8 +42,8 @@ def write(
     name: str,
     width: int,
     pointers: Sequence[str],
-    inputs: Sequence[Place],
-    outputs: Sequence[Place],
+    inputs: Sequence[PointerPlace],
+    outputs: Sequence[PointerPlace],
     cold: bool = False,
     lanes: Mapping[str, int] | None = None,
 ) -> Function:

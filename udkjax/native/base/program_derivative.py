@@ -17,7 +17,7 @@ from udkjax.equations.differentiable_programs import PREFIXES, TWICE, Differenti
 from udkjax.expressions.loop_derivative import COTANGENT
 from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.base.module import Module
-from udkjax.native.base.program import Place
+from udkjax.native.base.program import PointerPlace
 
 WAYS = ("d", "e", "de")  # the changes along two directions and along both, of which tangents hold one each
 GIVEN = ("d", "e")  # directions of numbers and of the first state do not change along either
@@ -55,11 +55,11 @@ class ProgramDerivative:
         return self._stored[name]
 
     @property
-    def _at(self) -> dict[str, Place]:
+    def _at(self) -> dict[str, PointerPlace]:
         results = {x: ("stored", place) for x, place in self._stored.items()}
         return self._module.arrays | results | {"stored": ("stored", 0)}
 
-    def _along(self, prefixes: Sequence[str]) -> dict[str, Place]:
+    def _along(self, prefixes: Sequence[str]) -> dict[str, PointerPlace]:
         if self._module.written_out:
             return {}
         start, size = self._module.places["along"], sum(self._module.code.stored_sizes.values())
@@ -102,7 +102,7 @@ class ProgramDerivative:
         program = LoopProgram([*cleared, *program.parts])
         self._write(program, f"reverse{self._suffix}", ("work", "stored", "bar"), at | {f"{COTANGENT}a": ("bar", 0)})
 
-    def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, Place]):
+    def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, PointerPlace]):
         if self._module.written_out:
             self._module.write_scalars(self._written_out.derivative, name, pointers, at)
         else:

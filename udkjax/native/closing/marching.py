@@ -16,7 +16,7 @@ from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
-from udkjax.native.base.program import Place
+from udkjax.native.base.program import PointerPlace
 from udkjax.native.base.tableau import EULER
 from udkjax.native.base.weighted_rows import WeightedRows
 from udkjax.native.pseudoinverses.lu import LUCode
@@ -68,7 +68,7 @@ class Marching(Module):
         return ["newton_q", "value_derivatives", *(["dense_newton_q"] if self._has_sides else [])]
 
     @property
-    def arrays(self) -> dict[str, Place]:
+    def arrays(self) -> dict[str, PointerPlace]:
         named = ("psi_q", "root") if self._rows else ()
         return super().arrays | {name: ("work", self.places[name]) for name in named}
 

@@ -1,4 +1,4 @@
-"""Drawings: mechanisms as one draws them, of pins in world coordinates and links through them."""
+"""Drawings: mechanisms defined by pins in world coordinates and links through them."""
 
 from udkjax.lazy_names import lazy_names
 

@@ -1,4 +1,4 @@
-"""A drawing: a mechanism as it stands on paper, pins in world coordinates and links through them."""
+"""A drawing: a mechanism defined as on paper, by pins in world coordinates and links through them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Numbers, TomlTable
 from udkjax.printing import PrintedTable
 from udkjax.programs.deferred import deferred_if_traced
 from udkjax.scene.bodies import Body
@@ -26,70 +27,68 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, Pin
 from udkjax.scene.drawing.mistakes import joint_names, where
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, make_module, number
+from udkjax.scene.element_setup import name_elements
+from udkjax.scene.fields import make_module, number
 from udkjax.scene.forces import ForceElement
-from udkjax.scene.given_elements import name_elements
 from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.scene.schema import table_of
 
-Table = Mapping[str, Any]
-
 
 class Drawing(AbstractDrawing):
-    """Pins, links through them, and what else is drawn, each under its name; `mechanism()` makes it a `Mechanism`.
+    """Pins, links through them, and other elements by name; `mechanism()` returns the `Mechanism`.
 
-    At each pin that k links share, the ground counted, there are k - 1 revolutes, named as the pin: `B`, and `B-2` for a third
-    link. Links become bodies of the same names, whose frames have their origins at the centres of mass and their x axes in the
-    direction from the first pin to the second. All numbers are leaves, as in a mechanism: those of pins are parameters (`pin.A`).
+    A pin shared by k links, including the ground, becomes k - 1 revolutes named after the pin: `B`, and `B-2` for a third link.
+    Links become bodies of the same name. A body's frame has its origin at the centre of mass, and its x axis points from the
+    first pin towards the second. All numbers are leaves, as in a mechanism, and parameters, such as `pin.A`.
 
     Args:
         pins: World coordinates of each pin (m).
         links: The links: `Link`s, or tables of their keys.
         ground: The pins that are fixed.
-        slides: Links that slide along a line without turning on it. These and what follows, by name or as a list: tables of the
-            keys that files have for them, such as `{"pin": "O2", "speed": 6.28}`, or elements of `udkjax.scene.drawing`.
+        slides: Links that slide along a line without turning on it. Like all elements below, they are given by name or as a
+            list: as tables with the keys of files, such as `{"pin": "O2", "speed": 6.28}`, or elements of `udkjax.scene.drawing`.
         slots: Pins that are guided by a line.
         gears: Pairs of links that mesh.
         cams: Pins that stay on the profile of a link.
         motors: Motions, or torques, of a link on another one.
         springs: Springs between pins, or torsion springs at pins.
-        dampers: Dampers, likewise.
+        dampers: Dampers between pins, or rotational dampers at pins.
         loads: Constant forces and torques on links.
-        bodies: Bodies as a `Mechanism` has them, besides the links.
-        joints: Joints, likewise. They may name links, in whose frames their points are.
-        drivers: Drivers, likewise.
-        forces: Force elements, likewise.
+        bodies: More bodies, as in a `Mechanism`.
+        joints: More joints, as in a `Mechanism`. They may name links; points are then in the frame of the link.
+        drivers: More drivers, as in a `Mechanism`.
+        forces: More force elements, as in a `Mechanism`.
         velocities: Initial velocities of pins (m/s); the others are at rest. A link moves as its first two pins do.
         gravity: The acceleration of gravity, by default 9.81 m/s^2 along -y.
         name: The name of the mechanism.
-        units: Units of plain numbers, such as `{"length": "mm"}`; SI units and radians where it says nothing. A number may be a
-            text with its unit, such as "60 rpm".
+        units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a text with
+            its unit, such as "60 rpm".
 
     Raises:
-        SceneError: The drawing is wrong; the error lists every mistake. Numbers that are traced are not looked at.
+        SceneError: The drawing is wrong; the error lists all mistakes. Traced numbers are not checked.
     """
 
     name: str = eqx.field(static=True)
     gravity: Float[Array, "2"]  # m/s^2
     ground: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # the units that it was written in
-    _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # of the elements of each section
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # the units in which it was written
+    _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # names of the elements of each section
     _elements: tuple[tuple[Any, ...], ...]
 
     def __init__(
         self,
         pins: Mapping[str, Pin | Numbers],
-        links: Mapping[str, Link | Table],
+        links: Mapping[str, Link | TomlTable],
         ground: Sequence[str] = (),
-        slides: "Mapping[str, Slide | Table] | Sequence[Slide | Table] | None" = None,
-        slots: "Mapping[str, PinInSlot | Table] | Sequence[PinInSlot | Table] | None" = None,
-        gears: "Mapping[str, GearPair | Table] | Sequence[GearPair | Table] | None" = None,
-        cams: "Mapping[str, CamPair | Table] | Sequence[CamPair | Table] | None" = None,
-        motors: "Mapping[str, Motor | Table] | Sequence[Motor | Table] | None" = None,
-        springs: "Mapping[str, PinSpring | Table] | Sequence[PinSpring | Table] | None" = None,
-        dampers: "Mapping[str, PinDamper | Table] | Sequence[PinDamper | Table] | None" = None,
-        loads: "Mapping[str, Load | Table] | Sequence[Load | Table] | None" = None,
+        slides: "Mapping[str, Slide | TomlTable] | Sequence[Slide | TomlTable] | None" = None,
+        slots: "Mapping[str, PinInSlot | TomlTable] | Sequence[PinInSlot | TomlTable] | None" = None,
+        gears: "Mapping[str, GearPair | TomlTable] | Sequence[GearPair | TomlTable] | None" = None,
+        cams: "Mapping[str, CamPair | TomlTable] | Sequence[CamPair | TomlTable] | None" = None,
+        motors: "Mapping[str, Motor | TomlTable] | Sequence[Motor | TomlTable] | None" = None,
+        springs: "Mapping[str, PinSpring | TomlTable] | Sequence[PinSpring | TomlTable] | None" = None,
+        dampers: "Mapping[str, PinDamper | TomlTable] | Sequence[PinDamper | TomlTable] | None" = None,
+        loads: "Mapping[str, Load | TomlTable] | Sequence[Load | TomlTable] | None" = None,
         bodies: Mapping[str, Body] | None = None,
         joints: Mapping[str, Joint] | None = None,
         drivers: Mapping[str, Driver] | None = None,
@@ -115,7 +114,7 @@ class Drawing(AbstractDrawing):
 
     @classmethod
     def of_elements(cls, found: DrawingElements, ground: Sequence[str], name: str, units: Mapping[str, str]) -> "Drawing":
-        """Return the drawing of elements that were read, and have no mistakes."""
+        """Return the drawing of elements that were read without mistakes."""
         names, elements = _in_order(found.groups)
         gravity, choices = number(found.gravity), tuple(units.items())
         return make_module(cls, name=name, gravity=gravity, ground=tuple(ground), units=choices, _names=names, _elements=elements)
@@ -137,7 +136,7 @@ class Drawing(AbstractDrawing):
         return self.groups["link"]
 
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
-        """Return the last of the links through a pin, or the ground, and the point in its frame (m); None where it is no pin."""
+        """Return the last link at a pin, or the ground, and the pin's position in its frame (m); None for an unknown pin."""
         placement = placement_of(concrete_elements(self.groups), self.ground)
         if name not in placement.places:
             return None
@@ -146,11 +145,11 @@ class Drawing(AbstractDrawing):
 
     @property
     def polygons(self) -> list[str]:
-        """The links whose shape is the polygon of its corners: plates and outlines."""
+        """The links whose shape is a polygon: plates and outlines."""
         return [name for name, link in self.links.items() if link.kind in ("plate", "outline")]
 
     def shapes(self) -> dict[str, Array]:
-        """Return the points (n, 2) through which links are drawn, their pins or outlines, by name, in their own frames (m)."""
+        """Return the pins or the outline (n, 2) of each link, in its own frame (m), by name."""
         placement, found = placement_of(concrete_elements(self.groups), self.ground), {}
         for name, link in placement.links.items():
             places = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
@@ -158,7 +157,7 @@ class Drawing(AbstractDrawing):
         return found
 
     def free_pins(self) -> dict[str, tuple[str, Array]]:
-        """Return the pins that belong to one link alone: the link of each, and its place in the link's frame (m)."""
+        """Return the pins that belong to a single link: the link, and the position in its frame (m)."""
         placement, found = placement_of(concrete_elements(self.groups), self.ground), {}
         for pin, place in placement.places.items():
             members = placement.members(pin)
@@ -169,11 +168,11 @@ class Drawing(AbstractDrawing):
     def _table(self) -> PrintedTable:
         return drawing_table(self.name, self.groups, self.ground)
 
-    _shapes = _table  # traced numbers are named as such, element by element
+    _shapes = _table  # it marks traced numbers as such
 
     @deferred_if_traced
     def mechanism(self) -> Mechanism:
-        """Return the mechanism that is drawn; its numbers follow from those of the drawing, and may be traced."""
+        """Return the mechanism of the drawing; its numbers follow from those of the drawing, which may be traced."""
         groups = concrete_elements(self.groups)
         placement = placement_of(groups, self.ground)
         bodies = {name: drawn.body for name, drawn in placement.drawn.items()} | groups["body"]
@@ -193,7 +192,7 @@ class Drawing(AbstractDrawing):
             raise SceneError([_with_link(problem, placement.drawn) for problem in error.problems], self.name) from None
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
-        """Return the drawing with other numbers in its elements; raise `SceneError` where they make no mechanism."""
+        """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
         entries = [entry for section, group in groups.items() for entry in _entries(section, group)]
         found = read_drawing(entries, self.ground, gravity, Units())
         if found.problems:
@@ -202,7 +201,7 @@ class Drawing(AbstractDrawing):
 
 
 def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...], ...]]:
-    """Return the names and the elements of each section, as a drawing stores them: JAX would sort the keys of a dict."""
+    """Return the names and the elements of each section as tuples: JAX would sort the keys of a dict."""
     sections = [groups[section] for section in (*DRAWN, *BY_HAND)]
     return tuple(map(tuple, sections)), tuple(tuple(group.values()) for group in sections)
 
@@ -215,7 +214,7 @@ def _pins(pins: Mapping[str, Any], velocities: Mapping[str, Any]) -> dict[str, A
 
 
 def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> list[SceneEntry]:
-    """Return the entries of a section; elements of a list without names are called by the section and counted."""
+    """Return the entries of a section; unnamed elements of a list are numbered by section."""
     cls = (DRAWN | BY_HAND)[section]
     if isinstance(group, Mapping):
         items = list(group.items())
@@ -236,6 +235,6 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
 
 
 def _with_link(problem: str, links: Iterable[str]) -> str:
-    """Return a mistake with the link that its body's numbers follow from, if it is that of one."""
+    """Return a mistake; if its body is a link, name the link from which the body's numbers follow."""
     name = next((name for name in links if problem.startswith(f"body {abbreviate(name)} ")), None)
     return problem if name is None else f"{problem}; it follows from the mass or density, pins and width of link {quote(name)}"

@@ -1,10 +1,11 @@
-"""Reads the elements of a drawing from tables, and finds every mistake: of units, keys, names, of who meets whom, of geometry."""
+"""Read the elements of a drawing from tables, and find all mistakes: in units, keys, names, connections and geometry."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from udkjax.annotations import TomlTable
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import SceneEntry, abbreviate, check_table, gravity_mistakes, quote, suggestion
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
@@ -19,7 +20,6 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.schema import build
 
-Table = Mapping[str, Any]
 SECTIONS: Mapping[str, type[DrawnElement]] = {
     "slide": Slide,
     "slot": PinInSlot,
@@ -35,7 +35,7 @@ BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement
 
 
 class DrawingElements(NamedTuple):
-    """Elements that were read of a drawing, and its mistakes."""
+    """The elements of a drawing that could be read, and its mistakes."""
 
     groups: dict[str, dict[str, Any]]
     gravity: Any
@@ -43,7 +43,7 @@ class DrawingElements(NamedTuple):
 
 
 def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, units: Units) -> DrawingElements:
-    """Read elements of a drawing and find every mistake: of units, keys and shapes, of names, of who meets whom, of geometry."""
+    """Read the elements of a drawing and find all mistakes: in units, keys, shapes, names, connections and geometry."""
     problems = list(units.problems)
     if gravity is None:
         gravity = (0.0, -9.81)
@@ -63,7 +63,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     ]
     groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
     for section in groups:
-        if section == "body":  # elements that name joints come last: if pins and links are right, joints are known now
+        if section == "body":  # elements that name joints come last: if pins and links are valid, joints are known now
             layout = PinLayout(groups["link"], fixed, groups["slide"])
             known["revolute"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
             known["revolute"] |= named["joint"]
@@ -84,7 +84,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
 
 
 def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, group: dict[str, Any], problems: list[str]) -> None:
-    """Add an element to its group, or what is wrong with it to the problems."""
+    """Add an element to its group, or its mistakes to the problems."""
     place = entry.where if entry.section != "pin" else where("pin", entry.index, str(entry.name))
     if not isinstance(entry.name, str) or not entry.name:
         given = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
@@ -107,8 +107,8 @@ def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, gro
         group.setdefault(entry.name, entry.element if isinstance(entry.element, cls) else build(cls, table))
 
 
-def units_of_element(cls: type, table: Table) -> tuple[str, str]:
-    """Return the name by which the units of an element's numbers are known, and the unit of its motion law."""
+def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:
+    """Return the class name under which the units of an element are listed, and the unit of its motion law."""
     if cls in (PinSpring, PinDamper):
         return ("TorsionSpring" if "pin" in table else "Spring"), ""
     if cls is Motor:
@@ -117,7 +117,7 @@ def units_of_element(cls: type, table: Table) -> tuple[str, str]:
 
 
 def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str]) -> Placement:
-    """Return the placement of a drawing's elements, whose numbers are NumPy's or traced."""
+    """Return the placement of the elements of a drawing, with NumPy or traced numbers."""
     links = groups["link"]
     places = {name: pin.position for name, pin in groups["pin"].items()}
     speeds = {name: np.zeros(2) if pin.velocity is None else pin.velocity for name, pin in groups["pin"].items()}
@@ -127,5 +127,5 @@ def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str])
 
 
 def concrete_elements(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return elements with NumPy's arrays for all numbers that are not traced, in their order: JAX sorts the keys of a dict."""
+    """Return elements with NumPy arrays for all concrete numbers, in their order: JAX sorts the keys of a dict."""
     return {section: {name: with_concrete_numbers(x) for name, x in group.items()} for section, group in groups.items()}

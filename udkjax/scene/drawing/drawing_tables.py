@@ -1,4 +1,4 @@
-"""Drawings as the tables of a TOML file, version 2 of the scene format, and back; reading gives the same numbers, bit by bit."""
+"""Convert drawings to the tables of a TOML file, format 2, and back, with bitwise identical numbers."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -17,7 +17,7 @@ LISTS = tuple(section for section in DRAWN if section != "pin")  # sections of t
 
 
 def drawing_of_tables(scene: Mapping[str, Any], source: str) -> Drawing:
-    """Return the drawing of the tables of a file; raise `SceneError`, with the name of the file."""
+    """Return the drawing described by the tables of a file; raise a `SceneError` that names the file."""
     head = ("format", "name", "units", "gravity", "ground", "pins", "velocities")
     problems = list(head_mistakes(scene, (*head, *LISTS, *BY_HAND)))
     entries = list(_read_pins(scene, problems))
@@ -46,7 +46,7 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
 
 
 def drawing_text(drawing: Drawing) -> str:
-    """Return a drawing as the text of a TOML file, in the units that it was drawn in; raise `SceneError` where that cannot be."""
+    """Return a drawing as the text of a TOML file, in the units in which it was drawn; raise a `SceneError` if impossible."""
     check_known(drawing, drawing.name)
     units, groups = Units(dict(drawing.units)), drawing.groups
     problems = [

@@ -1,4 +1,4 @@
-"""Elements of a drawing that move its links or pull at them: motors, springs, dampers, loads."""
+"""Elements of a drawing that drive or load its links: motors, springs, dampers, loads."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -7,27 +7,28 @@ from typing import Literal
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, pair_mistakes
 from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
-from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, Number, array_namespace, given_names, given_number, given_or_none
+from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, array_namespace, given_names, given_number, given_or_none
 from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring
 
 
 class Motor(DrawnElement):
-    """A motor turns the second of two links at a `pin`, moves a `slide`, or is a cylinder `between` two pins.
+    """A motor turns the second of two links at a `pin` against the first, moves a `slide`, or is a cylinder `between` two pins.
 
-    It does so at a `speed`, by a `motion`, or by a `torque` at a pin. Speed and motion count from the drawn position; those of a
-    cylinder are of the distance of its pins.
+    It prescribes a `speed` or a `motion`, or applies a `torque` at a pin, anticlockwise positive on the second link. Speed and
+    motion are relative to the drawn position; for a cylinder they are those of the distance between its pins.
     """
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     slide: str | None = eqx.field(static=True, default=None, metadata=SLIDE)
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
-    speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; of a slide or a cylinder: m/s
-    motion: Motion | None = None  # rad or m, from the drawn position
+    speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; m/s for a slide or a cylinder
+    motion: Motion | None = None  # rad or m, relative to the drawn position
     torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m
 
     @property
@@ -70,12 +71,13 @@ class Motor(DrawnElement):
 
 
 class PinSpring(DrawnElement):
-    """A spring `between` two pins, unloaded at its `length`; or a torsion spring at a `pin`, unloaded at its `angle`.
+    """A spring `between` two pins with a free `length`, or a torsion spring at a `pin` with a free `angle`.
 
-    Both are unloaded as drawn unless told otherwise; an angle counts from there.
+    By default springs are unloaded in the drawn position. The angle is that of the second link relative to the first, measured
+    from the drawn position.
     """
 
-    stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N/m; of torsion: N m/rad
+    stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N/m; N m/rad in torsion
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
@@ -108,9 +110,9 @@ class PinSpring(DrawnElement):
 
 
 class PinDamper(DrawnElement):
-    """A damper `between` two pins, or of the turning at a `pin`."""
+    """A damper `between` two pins, or a rotational damper at a `pin`."""
 
-    damping: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N s/m; of turning: N m s/rad
+    damping: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N s/m; N m s/rad in rotation
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
@@ -136,7 +138,7 @@ class Load(DrawnElement):
     """A constant `force` at a pin or at a link's centre of mass, or a constant `torque` on a link."""
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # beside a pin: which of its links
+    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # the link that is loaded, if the pin has several
     force: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # N
     torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m, from the ground
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")  # the axes of the force
@@ -160,7 +162,7 @@ class Load(DrawnElement):
         assert self.force is not None
         point = (0.0, 0.0) if self.pin is None else placement.local(body, placement.places[self.pin])
         vector = self.force
-        if self.frame == "body":  # drawn in world coordinates, and turning with the body from then on
+        if self.frame == "body":  # given in world coordinates as drawn, and turning with the body
             vector = _turn_back(self.force, placement.angle(body))
         return Parts(force=Force(body, vector, point, self.frame))
 
@@ -171,7 +173,7 @@ class Load(DrawnElement):
 
 
 def shift_motion(motion: Motion, start: Number) -> Motion:
-    """Return a motion law that begins at another value: motion(t) + start."""
+    """Return the motion law motion(t) + start."""
     if isinstance(motion, Polynomial):
         xp = array_namespace(motion.coefficients, start)
         first = xp.zeros(len(motion.coefficients))
@@ -185,7 +187,7 @@ def shift_motion(motion: Motion, start: Number) -> Motion:
 
 
 class ShiftedMotion(Motion):
-    """A motion law of the user's own that begins at another value."""
+    """A user-written motion law plus a constant."""
 
     motion: Motion
     start: Float[Array, ""] = eqx.field(converter=given_number)
@@ -211,12 +213,12 @@ def _spring_between(
 
 
 def _points_of(placement: Placement, between: tuple[str, ...]) -> Array:
-    """Return the places of two pins, each in the frame of the first link there."""
+    """Return the positions of two pins, each in the frame of its first link."""
     return placement.points(placement.ends(between), [placement.places[pin] for pin in between])
 
 
 def _mistakes_of_ends(layout: PinLayout, between: tuple[str, ...], pin: str | None, of: tuple[str, ...]) -> Iterator[str]:
-    """Iterate over the mistakes of an element between two pins, or at one."""
+    """Iterate over the mistakes in an element between two pins, or at one."""
     if bool(between) == (pin is not None):
         yield "between: give two pins, or one pin to turn at"
     elif pin is not None:

@@ -1,26 +1,18 @@
-"""Joints of a drawing besides its pins: slides, slots, gears, cams."""
+"""Joints of a drawing other than pins: slides, slots, gears, cams."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
-from udkjax.scene.fields import (
-    LINK,
-    PIN,
-    POSITIVE,
-    Number,
-    array_namespace,
-    given_direction,
-    given_names,
-    given_or_none,
-)
+from udkjax.scene.fields import LINK, PIN, POSITIVE, array_namespace, given_direction, given_names, given_or_none
 from udkjax.scene.joints import Cam, Gear, Prismatic, Profile, Slot, as_profile
 
 
 class Slide(DrawnElement):
-    """A `link` slides along a line of another one, or the ground, and does not turn on it."""
+    """A `link` slides along a line of another link or of the ground, without relative rotation."""
 
     link: str = eqx.field(static=True, metadata=LINK)
     along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
@@ -30,7 +22,7 @@ class Slide(DrawnElement):
     def mistakes(self, layout):
         yield from line_mistakes(self.along, self.direction)
         if self.link not in layout.links:
-            yield f"link: {quote(self.link)} is no link with a pin to slide by"
+            yield f"link: {quote(self.link)} must be a link with a pin"
         if self.on == self.link:
             yield f"on: {quote(self.on)} is connected to itself"
 
@@ -52,7 +44,7 @@ class PinInSlot(DrawnElement):
     along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
     direction: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # rad or a vector; instead of `along`
     on: str = eqx.field(static=True, default=GROUND, metadata=LINK)
-    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # the guided one; needed where `on` shares the pin
+    link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # the guided link; needed if `on` shares the pin
 
     def mistakes(self, layout):
         yield from line_mistakes(self.along, self.direction)
@@ -76,7 +68,7 @@ class PinInSlot(DrawnElement):
 
 
 class GearPair(DrawnElement):
-    """Two wheels mesh. Their centres are the pins by which they turn on the `carrier`; `teeth`, or `radii`, give the ratio."""
+    """Two wheels mesh. Their centres are the pins by which they turn on the `carrier`; `teeth` or `radii` give the ratio."""
 
     links: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=LINK)
     teeth: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
@@ -99,14 +91,14 @@ class GearPair(DrawnElement):
 
     def parts(self, placement):
         radii = self.radii
-        if radii is None:  # such that the wheels touch
+        if radii is None:  # chosen so that the wheels touch
             assert self.teeth is not None
             one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
             radii = self.teeth * (placement.distance(one, two) / self._apart(self.teeth))
         return Parts(joint=Gear(self.links, radii, self.internal, self.carrier))
 
     def misfit(self, placement: Placement) -> tuple[float, float] | None:
-        """Return the distance of the centres, and the one that the radii require (m); None if there are no radii."""
+        """Return the distance between the centres, and the distance required by the radii (m); None without radii."""
         if self.radii is None:
             return None
         one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
@@ -118,10 +110,10 @@ class GearPair(DrawnElement):
 
 
 class CamPair(DrawnElement):
-    """A follower, the second pin, stays on the `profile` of a cam around the first one.
+    """A follower, the second pin, stays on the `profile` of a cam around the first pin.
 
-    The polar angle of the profile counts from the direction of the cam's x axis: from its first pin towards its second, or the
-    world's x axis for a cam of one pin.
+    The polar angle of the profile is measured from the cam's x axis: from its first pin towards its second, or the world's x axis
+    for a cam with one pin.
     """
 
     pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
@@ -141,6 +133,6 @@ class CamPair(DrawnElement):
         return Parts(joint=Cam(pair, placement.points(pair, [placement.places[pin] for pin in self.pins]), self.profile))
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
-        """Return the links, or the only moving ones of the pins."""
+        """Return the links, by default the only moving link of each pin."""
         found = [[m for m in layout.members(pin) if m != GROUND] for pin in self.pins]
         return self.links or tuple(members[0] for members in found if len(members) == 1)

@@ -1,4 +1,4 @@
-"""Numbers of tables with their units: texts such as "12 mm", and plain numbers in the units that a file chooses."""
+"""Numbers with units in tables: texts such as "12 mm", and plain numbers in the units of the file."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -9,13 +9,14 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from udkjax.annotations import TomlTable
 from udkjax.scene.checks import abbreviate, quote, suggestion
-from udkjax.scene.fields import Table, vector_as_angle
+from udkjax.scene.fields import vector_as_angle
 from udkjax.scene.joints import Profile
 from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity
 
-# Quantities that a file may choose a unit of, and their SI units, which are the choice where it says nothing.
+# Quantities whose units a file may choose, with their SI units, the default.
 QUANTITY_KINDS = {
     "length": "m",
     "angle": "rad",
@@ -34,14 +35,14 @@ QUANTITY_KINDS = {
     "torsional_damping": "N m s/rad",
 }
 _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
-VECTORS = ("axis", "direction")  # angles that may be given as vectors
+VECTORS = ("axis", "direction")  # angles that may also be vectors
 
 
 class Units:
-    """The units of the plain numbers of a file.
+    """The units of plain numbers in a file.
 
-    A quantity that a file says nothing about is in SI units. But where one of its parts has another unit (a stiffness in a file
-    of millimetres) a plain number could mean either, and is refused: it needs its unit. A density is in kg/m^3, as in tables.
+    A quantity whose unit the file does not choose is in SI units. But if a part of its unit is another one (a stiffness in a file
+    in millimetres), a plain number is ambiguous and is refused: it needs a unit. Densities are in kg/m^3, as in tables.
     """
 
     def __init__(self, chosen: object = None):
@@ -66,7 +67,7 @@ class Units:
                     self.problems.append(f"units.{kind}: {problem}")
 
     def convert(self, path: str, value: object, unit: str, problems: list[str]) -> object:
-        """Return a number, a text with its unit, or nested lists of them, in SI units; None where it is added to the problems."""
+        """Convert a number, a text with its unit, or nested lists of them, to SI units; None if it is added to the problems."""
         if isinstance(value, list | tuple):
             found = [self.convert(f"{path}[{i}]", item, unit, problems) for i, item in enumerate(value)]
             return None if any(x is None for x in found) else found
@@ -87,30 +88,30 @@ class Units:
             which = " and ".join(f"{k} is in {u}" for k, u in self._changed(unit).items())
             under = f", or choose a unit for {kind} under units" if kind else ""
             example = quote(f"{value} {unit}")
-            raise ValueError(f"{value} of what? {which} here: write it with its unit, such as {example}{under}")
+            raise ValueError(f"{value} needs a unit, as {which} here: write {example}{under}")
         return value if factor in (None, 1.0) else value * factor
 
     def _factor(self, unit: str) -> float | None:
-        """Return the factor of a plain number of a quantity in this SI unit; None where it could mean several things."""
+        """Return the factor that converts a plain number to this SI unit; None if the unit is ambiguous."""
         kind = _KIND_OF.get(unit, "")
         if kind in self.chosen:
             return conversion_factor(self.chosen[kind], unit)
         return None if kind != "density" and self._changed(unit) else 1.0
 
     def _changed(self, unit: str) -> dict[str, str]:
-        """Return the units of this file for parts of an SI unit, where they are others."""
+        """Return the units of the file that differ from parts of an SI unit."""
         parts = [_KIND_OF.get(part, "") for part in re.findall(r"[A-Za-z]+", unit)]
         return {
             k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
         }
 
     def shown(self, unit: str) -> str:
-        """Return the unit in which numbers of an SI unit are shown to who wrote the file: its own, or one made of its own."""
+        """Return the unit of the file, or one made of its units, in which numbers of an SI unit are shown."""
         of_parts = {"m/s": f"{self.chosen.get('length', 'm')}/s", "rad/s": "rpm" if self.chosen.get("angle") == "deg" else unit}
         return self.chosen.get(_KIND_OF.get(unit, ""), of_parts.get(unit, unit))
 
     def write(self, value: float, unit: str) -> float | str:
-        """Return a number in SI units as it is written, so that it is read as the same number, bit by bit."""
+        """Return a number in SI units in the form in which it is written, so that reading it gives bitwise the same number."""
         factor = self._factor(unit) if unit else 1.0
         if factor == 1.0 or value == 0.0:
             return value
@@ -122,7 +123,7 @@ class Units:
         return f"{value!r} {unit}"
 
     def write_table(self, element: eqx.Module, variant: str = "", law: str = "") -> dict[str, object]:
-        """Return an element as a table whose numbers are read as the same ones."""
+        """Return an element as a table from which the same numbers are read."""
         cls, found = type(element), {}
         for name, value in table_of(element).items():
             if isinstance(value, eqx.Module):
@@ -138,11 +139,11 @@ class Units:
         return found
 
     def convert_table(
-        self, path: str, cls: type, table: Table, problems: list[str], variant: str = "", law: str = ""
+        self, path: str, cls: type, table: TomlTable, problems: list[str], variant: str = "", law: str = ""
     ) -> dict[str, Any]:
-        """Return the table of an element of a class in SI units; mistakes of numbers are added to the problems.
+        """Convert the table of an element of a class to SI units; mistakes in numbers are added to the problems.
 
-        `variant` is the name by which the units of its fields are known, by default that of the class; `law` that of a motion.
+        `variant` is the name under which the units of its fields are listed, by default the class; `law` is that of a motion.
         """
         expected, found = keys(cls), {}
         for name, value in table.items():
@@ -166,7 +167,7 @@ class Units:
         return found
 
     def _convert_nested(self, path: str, annotation: Any, value: object, problems: list[str], law: str) -> object:
-        """Return the table of a motion law or of a profile in SI units; anything else as it is."""
+        """Convert the table of a motion law or of a profile to SI units; return anything else unchanged."""
         if not isinstance(value, Mapping) or not (isinstance(annotation, type) and issubclass(annotation, eqx.Module)):
             return value
         cls = Profile if annotation is Profile else CLASSES_BY_TYPE["motion"].get(str(value.get("type")))
@@ -174,7 +175,7 @@ class Units:
 
 
 def without_failed(found: Iterable[str], failed: Iterable[str]) -> list[str]:
-    """Return the mistakes of tables without those of numbers that are reported already."""
+    """Return the mistakes in tables without those of numbers already reported."""
     fields = {_field(problem) for problem in failed}
     return [problem for problem in found if _field(problem) not in fields]
 

@@ -9,63 +9,53 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Body, Frame
-from udkjax.scene.fields import (
-    NOT_NEGATIVE,
-    OUTLINE,
-    PIN,
-    POSITIVE,
-    Number,
-    array_namespace,
-    given_names,
-    given_number,
-    given_or_none,
-)
-from udkjax.scene.fields import Number as Scalar
+from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, array_namespace, given_names, given_number, given_or_none
 
-Points = Float[Array, "n 2"] | np.ndarray
+PointArray = Float[Array, "n 2"] | np.ndarray
 
 
 class Shape(NamedTuple):
     """A plane figure of uniform thickness.
 
-    All formulas are exact. They take numbers of NumPy or of JAX, and are differentiable where the shape is none of length zero.
+    All formulas are exact. They take NumPy or JAX numbers, and are differentiable unless the shape has zero length.
     """
 
     area: Number  # m^2
-    centre: Points  # m
-    square_radius: Number  # m^2: the square of the radius of gyration about the centre
+    centre: PointArray  # m
+    square_radius: Number  # m^2, squared radius of gyration about the centre
 
 
-def bar(start: Points, end: Points, width: Number) -> Shape:
-    """Return a bar of a width (m) around the way between two points, with half-round ends about them.
+def bar(start: PointArray, end: PointArray, width: Number) -> Shape:
+    """Return a bar of a width (m) between two points, with half-round ends about them.
 
     It is a rectangle between the points and two half discs of radius r = width / 2, whose second moments about the middle are
-    l w (l^2 + w^2) / 12 and, for both together, pi r^4 / 2 + pi r^2 l^2 / 4 + 4 r^3 l / 3. Of width zero it is a thin rod.
+    l w (l^2 + w^2) / 12 and, for both together, pi r^4 / 2 + pi r^2 l^2 / 4 + 4 r^3 l / 3. With zero width it is a thin rod.
     """
     xp = array_namespace(start, end, width)
     way = end - start
     length, w = xp.sqrt(way @ way), width
-    # Both over the width, which may be zero.
+    # Both divided by the width, which may be zero.
     area = length + np.pi * w / 4
     moment = length * (length**2 + w**2) / 12 + np.pi * w**3 / 32 + np.pi * w * length**2 / 16 + w**2 * length / 6
     return Shape(w * area, 0.5 * (start + end), moment / area)
 
 
-def disc(centre: Points, diameter: Number) -> Shape:
+def disc(centre: PointArray, diameter: Number) -> Shape:
     """Return a disc of a diameter (m)."""
     return Shape(np.pi * diameter**2 / 4, centre, diameter**2 / 8)
 
 
-def polygon(points: Points) -> Shape:
-    """Return the polygon of points in their order, either way around, by Green's theorem.
+def polygon(points: PointArray) -> Shape:
+    """Return the polygon of points in order, clockwise or anticlockwise, by Green's theorem.
 
     With c_k = x_k y_(k+1) - x_(k+1) y_k: twice the area is sum c, six times the area times the centre is sum (p_k + p_(k+1)) c,
     and twelve times the second moment about the origin is sum (|p_k|^2 + p_k . p_(k+1) + |p_(k+1)|^2) c.
     """
     xp = array_namespace(points)
-    middle = xp.mean(points, axis=0)  # near which nothing cancels
+    middle = xp.mean(points, axis=0)  # as the origin, to avoid cancellation
     p = points - middle
     q, cross = _next_and_cross(p)
     twice = xp.sum(cross)
@@ -74,37 +64,37 @@ def polygon(points: Points) -> Shape:
     return Shape(0.5 * xp.abs(twice), middle + centre, moment - centre @ centre)
 
 
-def twice_area(points: Points) -> Number:
-    """Return twice the area of a polygon (m^2), negative where its points go around clockwise."""
+def twice_area(points: PointArray) -> Number:
+    """Return twice the area of a polygon (m^2), negative if its points are in clockwise order."""
     return array_namespace(points).sum(_next_and_cross(points - points[0])[1])
 
 
-def _next_and_cross(points: Points) -> tuple[Points, Points]:
-    """Return the point after each one, and the cross product of both."""
+def _next_and_cross(points: PointArray) -> tuple[PointArray, PointArray]:
+    """Return the successor of each point, and the cross product of both."""
     after = array_namespace(points).roll(points, -1, axis=0)
     return after, points[:, 0] * after[:, 1] - after[:, 0] * points[:, 1]
 
 
-Places = Mapping[str, Points]  # world coordinates of pins (m)
+Places = Mapping[str, PointArray]  # world coordinates of pins (m)
 
 
 class Pin(PrintsLine):
-    """A point of a drawing, in world coordinates, where links meet, and its initial velocity."""
+    """A point where links meet, in world coordinates, and its initial velocity."""
 
     position: Float[Array, "2"] = eqx.field(converter=given_number)  # m
     velocity: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m/s; None: at rest
 
 
 class Link(PrintsLine):
-    """A rigid body through pins: a disc about one, a bar along two, a plate of more, or of an `outline`.
+    """A rigid body through pins: a disc about one pin, a bar along two, a plate of three or more, or any `outline`.
 
     A bar goes from the first pin to the last, with half-round ends of diameter `width` about them; more pins may lie on it.
-    Without a width a link of three or more pins is a plate, the polygon of its pins in their order. A link of one pin is a disc
-    of diameter `width` about it. Mass, centre and inertia follow from `density` and `thickness`; or from `mass` alone, for the
-    same shape, of which a bar without a width is a thin rod. `centre` and `inertia`, about it, may be given beside either.
+    Without a width a link of three or more pins is a plate, the polygon of its pins in order. A link of one pin is a disc of
+    diameter `width` about it. Mass, centre and inertia follow from the shape with `density` and `thickness`, or with `mass`; a
+    bar of given mass without a width is a thin rod. `centre` and `inertia` may be given in addition.
 
     Args:
-        pins: the names of its pins, in their order.
+        pins: the names of its pins, in order.
         density: in kg/m^3.
         width: of a bar, or the diameter of a disc (m).
         thickness: in m.
@@ -120,12 +110,12 @@ class Link(PrintsLine):
     thickness: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m
     mass: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # kg
     inertia: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # kg m^2
-    centre: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m, in world coordinates
-    outline: Float[Array, "n 2"] | None = eqx.field(converter=given_or_none, default=None, metadata=OUTLINE)  # m, likewise
+    centre: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m, world
+    outline: Float[Array, "n 2"] | None = eqx.field(converter=given_or_none, default=None, metadata=OUTLINE)  # m, world
 
     @property
     def kind(self) -> str:
-        """Shape it is drawn as: an outline, a disc, a bar, or a plate."""
+        """Kind of its shape: an outline, a disc, a bar, or a plate."""
         if self.outline is not None:
             return "outline"
         if len(self.pins) == 1:
@@ -133,7 +123,7 @@ class Link(PrintsLine):
         return "bar" if len(self.pins) == 2 or self.width is not None else "plate"
 
     def shape(self, places: Places) -> Shape:
-        """Return its shape, of the places of the pins. A disc needs a width; a bar without one is a thin rod."""
+        """Return its shape, given the positions of the pins. A disc needs a width; a bar without one is a thin rod."""
         width = 0.0 if self.width is None else self.width
         if self.outline is not None:
             return polygon(self.outline)
@@ -145,7 +135,7 @@ class Link(PrintsLine):
         return polygon(array_namespace(*points).stack(points))
 
     def body(self, places: Places, velocities: Places) -> "DrawnBody":
-        """Return its mass properties, place and velocity, of the places (m) and velocities (m/s) of the pins."""
+        """Return its mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
         if self.inertia is not None and self.centre is not None and self.mass is not None:
             shape = Shape(0.0, self.centre, 0.0)
         else:
@@ -170,16 +160,16 @@ class Link(PrintsLine):
 
 
 class DrawnBody(NamedTuple):
-    """A link as a body, and its frame: its origin at the centre of mass, its x axis from the first pin towards the second."""
+    """A link as a body, and its frame: origin at the centre of mass, x axis from the first pin towards the second."""
 
     frame: Frame
     body: Body
 
-    def local(self, point: Points) -> tuple[Scalar, Scalar]:
+    def local(self, point: PointArray) -> tuple[Number, Number]:
         """Return a point of the drawing in the frame of the body (m)."""
         return self.frame.local((point[0] - self.frame.x, point[1] - self.frame.y))
 
 
 def with_concrete_numbers(tree):
-    """Return a tree with NumPy's arrays in place of all that are not traced: results of these alone stay known."""
+    """Return a tree with NumPy arrays in place of concrete ones, so that results of these alone stay concrete."""
     return jax.tree.map(lambda x: x if isinstance(x, Tracer) else np.asarray(x), tree)

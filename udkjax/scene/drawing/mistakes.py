@@ -1,4 +1,4 @@
-"""Mistakes of a drawing as a whole: names that are taken, pins and links that hang on nothing, shapes that are none."""
+"""Mistakes in a drawing as a whole: names used twice, unconnected pins and links, degenerate shapes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
@@ -9,27 +9,27 @@ import numpy as np
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import quote
 from udkjax.scene.drawing.drawn_joints import GearPair, PinInSlot
-from udkjax.scene.drawing.link import Link, Points, twice_area
+from udkjax.scene.drawing.link import Link, PointArray, twice_area
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 
-Groups = Mapping[str, Mapping[str, Any]]
+DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name
 
-# Of the largest distance between two pins: below, what is drawn apart is drawn at one place, and an area is none.
+# Relative to the largest distance between two pins: nearer points count as coincident, smaller areas as zero.
 SAME_PLACE = 1e-9
-# Of the distances among the other pins: farther away, a pin is in another unit. Usual units of length differ by ten (cm and mm),
-# which no drawing shows, or by 25 (mm and inches) to 1,000; pins of a mechanism by less.
+# Relative to the distances between the other pins: a pin farther away is probably in another unit. Usual units of length differ
+# by ten (cm and mm), which a drawing does not show, or by 25 (mm and inches) to 1,000, more than pins of a mechanism do.
 FAR_POINT_RATIO = 100.0
-# Of the largest distance between two pins: a gap that assembly closes as drawing to scale would leave it.
+# Relative to the largest distance between two pins: a gap of this size, as left by drawing to scale, is closed by assembly.
 DRAWN_GAP = 0.01
 
 
 def where(section: str, index: int, name: str) -> str:
-    """Return the path of an entry of a drawing, as in error messages."""
+    """Return the path of an entry of a drawing for error messages."""
     return f"pins.{name}" if section == "pin" else f"{section} {quote(name)} ({section}[{index}])"
 
 
 def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """Return the revolutes of a drawing, one less than the links that share a pin: by name the pin and the two links."""
+    """Return pin and two links of each revolute, by name: a pin shared by k links has k - 1 revolutes."""
     found = {}
     for pin in pins:
         first, *others = layout.members(pin) or ("",)
@@ -38,10 +38,10 @@ def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, 
     return found
 
 
-def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str], all_read: bool) -> Iterator[str]:
-    """Iterate over the mistakes in how pins, links and other elements meet; all names are known.
+def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str], all_read: bool) -> Iterator[str]:
+    """Iterate over the mistakes in the connections of pins, links and other elements; all names are known.
 
-    Where not all elements could be read (`all_read`), what seems to hang on nothing may hang on one of the others.
+    If some elements could not be read (not `all_read`), unconnected links are not reported: these elements may hold them.
     """
     elements = {s: g for s, g in groups.items() if g and isinstance(next(iter(g.values())), DrawnElement)}
     yield from _taken_names(layout, groups)
@@ -58,14 +58,14 @@ def layout_mistakes(layout: PinLayout, groups: Groups, ground: Sequence[str], al
         place = where("link", k, name)
         yield from (f"{place}{problem}" for problem in _link_mistakes(link))
         if all_read and name not in attached:
-            yield f"{place}.pins: no other link and no ground shares one of them: the link hangs on nothing"
+            yield f"{place}.pins: the link is not connected to the ground or to another link"
     for section, group in elements.items():
         for k, (name, element) in enumerate(group.items()):
             yield from (f"{where(section, k, name)}.{problem}" for problem in element.mistakes(layout))
 
 
-def _taken_names(layout: PinLayout, groups: Groups) -> Iterator[str]:
-    """Iterate over names that two elements of the mechanism would have."""
+def _taken_names(layout: PinLayout, groups: DrawnGroups) -> Iterator[str]:
+    """Iterate over names that two elements of the mechanism would share."""
     motors = groups["motor"]
     spaces = (
         ("link", "body"),
@@ -89,8 +89,8 @@ def _taken_names(layout: PinLayout, groups: Groups) -> Iterator[str]:
                 owner.setdefault(name, f"{section}[{k}]")
 
 
-def _attached(layout: PinLayout, groups: Groups) -> set[str]:
-    """Return the links that something holds or pulls at."""
+def _attached(layout: PinLayout, groups: DrawnGroups) -> set[str]:
+    """Return the links that are connected to another element."""
     found = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
     for section in ("slide", "slot", "cam", "gear", "motor", "spring", "damper", "load", "joint", "driver", "force"):
         for element in groups[section].values():
@@ -102,7 +102,7 @@ def _attached(layout: PinLayout, groups: Groups) -> set[str]:
 
 
 def _link_mistakes(link: Link) -> Iterator[str]:
-    """Iterate over the mistakes of a link by itself, its numbers aside."""
+    """Iterate over the mistakes in a link by itself, apart from its numbers."""
     if not link.pins:
         yield ".pins: a link needs at least one pin"
         return
@@ -119,8 +119,8 @@ def _link_mistakes(link: Link) -> Iterator[str]:
         yield ".width: missing; the mass of a bar by density needs it"
 
 
-def shape_mistakes(places: Mapping[str, Points], links: Mapping[str, Link]) -> Iterator[str]:
-    """Iterate over pins and shapes that cannot be meant; all numbers are known, and finite."""
+def shape_mistakes(places: Mapping[str, PointArray], links: Mapping[str, Link]) -> Iterator[str]:
+    """Iterate over implausible pins and shapes; all numbers are concrete and finite."""
     size = extent(list(places.values()))
     for one, two in combinations(places, 2):
         if np.linalg.norm(places[two] - places[one]) <= SAME_PLACE * size:
@@ -130,13 +130,13 @@ def shape_mistakes(places: Mapping[str, Points], links: Mapping[str, Link]) -> I
         yield from (f"{where('link', k, name)}{problem}" for problem in _shape_mistakes(places, link))
 
 
-def extent(points: Sequence[Points]) -> float:
+def extent(points: Sequence[PointArray]) -> float:
     """Return the largest distance between two points (m)."""
     p = np.array(points).reshape(-1, 2)
     return float(np.max(np.linalg.norm(p[:, None] - p[None], axis=-1), initial=0.0))
 
 
-def _far_pins(places: Mapping[str, Points]) -> Iterator[str]:
+def _far_pins(places: Mapping[str, PointArray]) -> Iterator[str]:
     if len(places) < 3:
         return
     for name, place in places.items():
@@ -149,7 +149,7 @@ def _far_pins(places: Mapping[str, Points]) -> Iterator[str]:
             )
 
 
-def _shape_mistakes(places: Mapping[str, Points], link: Link) -> Iterator[str]:
+def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[str]:
     if not link.pins or len(set(link.pins)) < len(link.pins):
         return  # reported already
     if link.inertia is not None and link.centre is not None and link.mass is not None and link.outline is None:
@@ -177,7 +177,7 @@ def _shape_mistakes(places: Mapping[str, Points], link: Link) -> Iterator[str]:
 
 
 def _crosses_itself(corners: np.ndarray) -> bool:
-    """Tell whether two sides of a polygon that are not neighbours cross."""
+    """Return True if two sides of a polygon cross that are not neighbours."""
     sides = [*pairwise(corners), (corners[-1], corners[0])]
 
     def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
@@ -188,8 +188,8 @@ def _crosses_itself(corners: np.ndarray) -> bool:
     )
 
 
-def _reaches(corners: np.ndarray, point: Points) -> bool:
-    """Tell whether a point is within a polygon, or as near to it as drawing to scale would leave it."""
+def _reaches(corners: np.ndarray, point: PointArray) -> bool:
+    """Return True if a point is within a polygon, or as near to it as in a drawing to scale."""
     near = DRAWN_GAP * extent(list(corners))
     inside = False
     for a, b in [*pairwise(corners), (corners[-1], corners[0])]:
@@ -202,8 +202,8 @@ def _reaches(corners: np.ndarray, point: Points) -> bool:
     return inside
 
 
-def gap_mistakes(placement: Placement, groups: Groups) -> Iterator[str]:
-    """Iterate over slots and gears that do not fit as drawn; all numbers are known."""
+def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:
+    """Iterate over slots and gears that do not fit as drawn; all numbers are concrete."""
     size = extent(list(placement.places.values()))
     for k, (name, slot) in enumerate(groups["slot"].items()):
         off = _off_line(placement, slot) if slot.along else 0.0

@@ -1,4 +1,4 @@
-"""Pins of a drawing, their places, and the links that meet at them: other elements are attached to these."""
+"""Pins of a drawing, their positions, and the links that meet at them, to which other elements are attached."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -6,18 +6,19 @@ from typing import NamedTuple, Protocol
 
 from jaxtyping import Array, Float
 
+from udkjax.annotations import Number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import quote
-from udkjax.scene.drawing.link import DrawnBody, Link, Points
+from udkjax.scene.drawing.link import DrawnBody, Link, PointArray
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Number, array_namespace
+from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint
 
 
 class SlidingLink(Protocol):
-    """A slide: a link, and the line of another one that it slides along, which two pins or a direction (rad) give."""
+    """A slide: a link, and its line on another link, given by two pins or a direction (rad)."""
 
     link: str
     on: str
@@ -32,30 +33,30 @@ class PinLayout:
         self.links, self.ground, self.slides = links, ground, slides
 
     def members(self, pin: str) -> tuple[str, ...]:
-        """Return the ground, where the pin is fixed, and the links that share it, in their order."""
+        """Return the ground, if the pin is fixed, and the links that share the pin, in order."""
         fixed = (GROUND,) if pin in self.ground else ()
         return (*fixed, *(name for name, link in self.links.items() if pin in link.pins))
 
     def pair(self, pin: str, of: Sequence[str]) -> tuple[str, ...]:
-        """Return the two members of a pin that an element is between: those `of` which it is, or the only two."""
+        """Return the two members of a pin between which an element acts: `of`, by default the only two."""
         return tuple(of) or self.members(pin)
 
     def ends(self, between: Sequence[str]) -> tuple[str, ...]:
-        """Return the first member of each of two pins: a force at a pin moves all of its links alike."""
+        """Return the first member of each of two pins: a force at a pin acts alike on all of its links."""
         return tuple(self.members(pin)[0] for pin in between)
 
     def centre(self, wheel: str, carrier: str) -> str | None:
-        """Return the pin by which a wheel turns on its carrier; None where that is not one pin."""
+        """Return the pin by which a wheel turns on its carrier; None unless there is exactly one."""
         pins = self.ground if wheel == GROUND else self.links[wheel].pins if wheel in self.links else ()
         shared = [pin for pin in pins if carrier in self.members(pin)]
         return shared[0] if len(shared) == 1 else None
 
 
 class Placement(PinLayout):
-    """A layout with the places of its pins (m) and links; bodies that are not drawn have frames alone."""
+    """A layout with the positions of its pins (m) and links, and the frames of bodies that are not drawn."""
 
     def __init__(
-        self, layout: PinLayout, places: Mapping[str, Points], drawn: Mapping[str, DrawnBody], frames: Mapping[str, Frame]
+        self, layout: PinLayout, places: Mapping[str, PointArray], drawn: Mapping[str, DrawnBody], frames: Mapping[str, Frame]
     ):
         super().__init__(layout.links, layout.ground, layout.slides)
         self.places, self.drawn = places, drawn
@@ -69,24 +70,24 @@ class Placement(PinLayout):
         """Return the angle of body 2 relative to body 1 (rad)."""
         return self.angle(two) - self.angle(one)
 
-    def local(self, body: str, place: Points) -> Float[Array, "2"]:
-        """Return a place in the frame of a body (m)."""
+    def local(self, body: str, place: PointArray) -> Float[Array, "2"]:
+        """Return a position in the frame of a body (m)."""
         frame = self._frames[body]
         x, y = frame.local((place[0] - frame.x, place[1] - frame.y))
         return array_namespace(x, y).stack([x, y])
 
-    def points(self, bodies: Sequence[str], places: Sequence[Points]) -> Float[Array, "2 2"]:
-        """Return two places, each in the frame of its body (m)."""
+    def points(self, bodies: Sequence[str], places: Sequence[PointArray]) -> Float[Array, "2 2"]:
+        """Return two positions, each in the frame of its body (m)."""
         found = [self.local(body, place) for body, place in zip(bodies, places, strict=True)]
         return array_namespace(*found).stack(found)
 
     def distance(self, one: str, two: str) -> Number:
-        """Return the distance of two pins (m)."""
+        """Return the distance between two pins (m)."""
         way = self.places[two] - self.places[one]
         return array_namespace(way).sqrt(way @ way)
 
     def direction(self, on: str, along: Sequence[str], direction: Number | None) -> Number:
-        """Return the direction of a line in the frame of a body (rad): that from pin to pin, or one in world coordinates."""
+        """Return the direction of a line in the frame of a body (rad), given by two pins or by its angle in world coordinates."""
         if along:
             way = self.places[along[1]] - self.places[along[0]]
             direction = array_namespace(way).arctan2(way[1], way[0])
@@ -95,7 +96,7 @@ class Placement(PinLayout):
 
 
 class Parts(NamedTuple):
-    """Parts of the mechanism that an element of a drawing becomes, under its own name."""
+    """The parts of the mechanism that an element of a drawing becomes, with its name."""
 
     joint: Joint | None = None
     driver: Driver | None = None
@@ -103,15 +104,15 @@ class Parts(NamedTuple):
 
 
 class DrawnElement(PrintsLine):
-    """An element of a drawing besides pins and links, attached to these by name.
+    """An element of a drawing other than pins and links, attached to these by name.
 
-    It becomes a joint, a driver or a force element of the mechanism when the drawing is made one: `parts`, whose numbers are
-    NumPy's or traced. Motions, and free angles of springs, count from the drawn position.
+    In the mechanism it becomes a joint, a driver or a force element: its `parts`, with NumPy or traced numbers. Motions, and free
+    angles of springs, are relative to the drawn position.
     """
 
     @abstractmethod
     def mistakes(self, layout: PinLayout) -> Iterator[str]:
-        """Iterate over its mistakes in a layout, each a key and a text; all names are known."""
+        """Iterate over its mistakes in a layout, each a key and a text; all names exist."""
 
     @abstractmethod
     def parts(self, placement: Placement) -> Parts:
@@ -119,17 +120,17 @@ class DrawnElement(PrintsLine):
 
     @property
     def measured_as(self) -> str:
-        """The name of the class whose numbers are measured in the same units."""
+        """The name of the class under which the units of its numbers are listed."""
         return type(self).__name__
 
     @property
     def anchors(self) -> tuple[str, ...]:
-        """The pins that it needs, which may then be on the ground without a link."""
+        """The pins that it needs; these may be on the ground without a link."""
         return ()
 
 
 def line_mistakes(along: tuple[str, ...], direction: Number | None) -> Iterator[str]:
-    """Iterate over the mistakes of a line, which two pins or a direction give."""
+    """Iterate over the mistakes in a line given by two pins or a direction."""
     if bool(along) == (direction is not None):
         yield "along: give two pins, or a direction"
     elif along and (len(along) != 2 or along[0] == along[1]):
@@ -137,7 +138,7 @@ def line_mistakes(along: tuple[str, ...], direction: Number | None) -> Iterator[
 
 
 def pair_mistakes(layout: PinLayout, pin: str, of: tuple[str, ...]) -> Iterator[str]:
-    """Iterate over the mistakes of an element between two links that meet at a pin."""
+    """Iterate over the mistakes in an element between two links that meet at a pin."""
     members = layout.members(pin)
     listed = ", ".join(members) or "none"
     if not of and len(members) != 2:

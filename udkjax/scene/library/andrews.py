@@ -1,4 +1,4 @@
-"""Andrews' squeezing mechanism: a test problem of the field, with published numbers and a published motion."""
+"""Andrews' squeezing mechanism: a standard test problem, with published numbers and a published motion."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -6,8 +6,8 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import Numbers
 from udkjax.scene.forces import Spring, Torque
 from udkjax.scene.joints import Revolute
 from udkjax.scene.library.posed_bodies import bodies_on_pose, unit_vector, with_concrete_numbers
@@ -41,7 +41,7 @@ def andrews_squeezer(
     """Return Andrews' squeezing mechanism: seven bodies in three loops, driven by a constant torque against a stiff spring.
 
     The bodies K1 (the crank) to K7 start at rest; their angles are beta, beta + theta, gamma, phi + delta, delta, omega +
-    epsilon and epsilon of the source. Torque in N m, stiffness in N/m. It is so fast that 0.03 s are a long run.
+    epsilon and epsilon of the source. Torque in N m, stiffness in N/m. It is so fast that 0.03 s is a long run.
 
     Source: Schiehlen (ed.), Multibody Systems Handbook, 1990; Hairer and Wanner, Solving Ordinary Differential Equations II,
     section VII.7; the state at 0.03 s is published in the Test Set for Initial Value Problem Solvers.

@@ -1,4 +1,4 @@
-"""Mechanisms that are drawn: a four-bar, a slider-crank, a scissor lift. SI units, radians."""
+"""Mechanisms made from drawings: a four-bar, a slider-crank, a scissor lift. SI units, radians."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -64,8 +64,8 @@ def slider_crank(
     """Return a slider-crank on the x axis: crank of length `crank` on the origin, connecting rod, slider in a guide.
 
     `driven`: a motor turns the crank at constant `angular_velocity` from `angle`; otherwise these are its initial state.
-    `masses` are those of crank, rod (both uniform) and slider. `spring`: stiffness (N/m), length (m) and damping (N s/m) of one
-    that holds the slider to the origin, from which it is rod - crank to rod + crank away.
+    `masses` are those of crank, rod (both uniform) and slider. `spring`: stiffness (N/m), length (m) and damping (N s/m) of a
+    spring between slider and origin, whose distance is between rod - crank and rod + crank.
     """
 
     def places(s):
@@ -99,9 +99,10 @@ def scissor_lift(
     platform_mass: ArrayLike = 5.0,
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return a scissor lift: `stages` pairs of crossed bars and a platform, overconstrained by 2 rows by the platform's guide.
+    """Return a scissor lift: `stages` pairs of crossed bars and a platform, whose guide makes 2 rows redundant.
 
-    The bars rising0, falling0, ... cross at their middles, pinned, at `angle` to the horizontal; left ends stay on the y axis.
+    The bars rising0, falling0, ... are pinned where they cross, at their middles, at `angle` to the horizontal; their left ends
+    stay on the y axis.
     """
     left = ["foot", *(f"left{i}" for i in range(stages - 1)), "head"]  # pins, from the bottom up
     right = ["sliding foot", *(f"right{i}" for i in range(stages))]
@@ -144,7 +145,7 @@ def draw_on_pose(
     name: str,
     **more: Any,
 ) -> Mechanism:
-    """Draw links through pins at {name: place} of places(s), moving as s does at its rate; and more, as `Drawing` takes it."""
+    """Return a `Drawing` of links through pins at places(s), {name: position}, whose velocities follow from the rate of s."""
     pins, velocities = derivative(places, as_array(s), rate)
     drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name, **more)
     return drawing.mechanism()

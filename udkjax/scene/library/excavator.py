@@ -1,13 +1,14 @@
-"""The arm of an excavator: an open chain of three bodies, the last of which is moved through a four-bar. SI units, radians."""
+"""The arm of an excavator: an open chain of three bodies, the last one driven through a four-bar. SI units, radians."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, between
 from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.fields import Numbers, array_namespace
+from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Revolute
 from udkjax.scene.library.posed_bodies import (
@@ -22,12 +23,12 @@ from udkjax.scene.library.posed_bodies import (
 )
 from udkjax.scene.mechanism import Mechanism
 
-# Points of a body in units of its length, from its first pin on, the x axis towards its last one.
+# Points of each body in units of its length; origin at its first pin, x axis towards its last.
 BOOM = {"centre": (0.44, 0.09), "foot": (0.0, 0.0), "tip": (1.0, 0.0), "cylinder": (0.44, 0.12), "stick cylinder": (0.52, 0.20)}
 STICK = {"centre": (0.35, 0.05), "tip": (0.0, 0.0), "rocker": (0.855, 0.02), "bucket": (1.0, 0.0)}
 STICK |= {"cylinder": (-0.22, 0.10), "bucket cylinder": (0.05, 0.20)}
 BUCKET = {"centre": (0.45, 0.20), "bucket": (0.0, 0.0), "link": (-0.13, 0.28)}
-BASE = (0.13, -0.09)  # of the boom's cylinder on the ground, from the boom's foot, in units of the boom's length
+BASE = (0.13, -0.09)  # pin of the boom's cylinder on the ground, relative to the boom's foot, in units of the boom's length
 
 
 @with_concrete_numbers
@@ -45,14 +46,14 @@ def excavator(
 ) -> Mechanism:
     """Return the arm of an excavator of 20 t: boom, stick, rocker, link and bucket, 12 rows, three degrees of freedom.
 
-    `angles` are those of boom, stick and bucket to the horizontal; rocker and link, which close a four-bar with these two,
-    follow. `lengths` (m) and `masses` (kg) come in the order of the bodies: a bucket's is from its pin to its teeth, and where
-    cylinders are attached goes with the lengths. Inertias are those of rods.
+    `angles` are those of boom, stick and bucket to the horizontal; rocker and link form a four-bar with stick and bucket, which
+    determines their angles. `lengths` (m) and `masses` (kg) are in the order of the bodies; the bucket's length is from its pin
+    to its teeth, and attachment points of cylinders scale with the lengths. Inertias are those of rods.
 
     By default valves have shut while the arm moves at `angular_velocities`: the oil in the cylinders of boom, stick and bucket
-    makes each a spring of `stiffness` (N/m) and `damping` (N s/m), so long that the arm is in equilibrium at `angles`. `driven`:
-    the cylinders, from rest, get longer by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are reactions.
-    Neither motion meets a singular configuration within 20 s, with the default numbers.
+    acts as springs of `stiffness` (N/m) and `damping` (N s/m), with lengths that put the arm in equilibrium at `angles`.
+    `driven`: the cylinders, from rest, extend by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are
+    reactions. With the default numbers neither motion meets a singular configuration within 20 s.
     """
     boom, stick, rocker, link, bucket = lengths
     on_boom, on_stick, on_bucket = _points(BOOM, boom), _points(STICK, stick), _points(BUCKET, bucket)
@@ -81,7 +82,7 @@ def excavator(
         squares = as_array([way.dot(way) for way in ways])
         return array_namespace(squares).sqrt(squares), energy
 
-    # By how much the cylinders are longer unloaded: principle of virtual work over the three angles.
+    # Free minus actual length of each cylinder, by the principle of virtual work over the three angles.
     start = as_array(angles)
     values, rates = zip(*(derivative(extents_and_energy, start, along) for along in np.eye(3)), strict=True)
     length, virtual_work = values[0][0], as_array([energy for _, energy in rates])
@@ -115,15 +116,15 @@ def excavator(
 
 
 def _points(places, length) -> dict[str, Numbers]:
-    """Return points of a body of a length in its own frame, from its centre of mass."""
+    """Return the points of a body in its own frame, relative to its centre of mass."""
     return {name: length * (np.array(place) - np.array(places["centre"])) for name, place in places.items()}
 
 
 def _spot(placed, local):
-    """Return the place of a point of a body."""
+    """Return the position of a point of a body."""
     return as_array(Frame.at(*placed).point(local))
 
 
 def _held(local, spot, angle):
-    """Return position and angle of a body that is held at a point."""
+    """Return position and angle of a body, given the position of one of its points."""
     return spot - as_array(Frame.at((0.0, 0.0), angle).vector(local)), angle

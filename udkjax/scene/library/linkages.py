@@ -1,4 +1,4 @@
-"""Linkages with one degree of freedom, the paper's among them. SI units, radians."""
+"""Linkages with one degree of freedom, including the paper's. SI units, radians."""
 
 import numpy as np
 from jaxtyping import ArrayLike
@@ -26,7 +26,7 @@ def parallelogram(
     coupler_inertia: ArrayLike = 0.2,
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows of rank 11, one degree of freedom.
+    """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows, rank 11, one degree of freedom.
 
     Ground pivots at (0, 0), (1, 0), (2, 0); `angle` and `angular_velocity` are the links'. Bodies link1, link2, link3,
     coupler; rows A1, A2, A3 (link minus ground), then B1, B2, B3 (link minus coupler). The paper does not print the initial

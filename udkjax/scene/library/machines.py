@@ -31,12 +31,12 @@ def peaucellier(
     density: ArrayLike = 1.0,
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return the Peaucellier-Lipkin linkage, which turns a rotation into an exact straight line.
+    """Return the Peaucellier-Lipkin linkage, which converts a rotation to an exact straight line.
 
     Two arms from O = (0, 0) hold the corners A and B of a rhombus of `side`; the crank, pivoted at Q = (`crank`, 0), moves its
     corner C on a circle through O; the opposite corner D then moves on the line x = (arm^2 - side^2) / (2 crank). Pins of three
-    bars are two revolutes. Uniform bars, `density` in kg/m; `gravity` pulls along +x, in which it hangs. Arms and sides fall
-    in line, a singular configuration, at |angle| = 2 acos((arm - side) / (2 crank)): 96 degrees by default.
+    bars are two revolutes. Bars are uniform, `density` in kg/m; `gravity` acts along +x, so that the linkage hangs. Arms and
+    sides are collinear, a singular configuration, at |angle| = 2 acos((arm - side) / (2 crank)): 96 degrees by default.
     """
     r, a, b = crank, arm, side
 
@@ -81,9 +81,9 @@ def planetary_gear(
 ) -> Mechanism:
     """Return a planetary gear with a fixed ring: `planets` planets on a carrier mesh with the sun and the ring.
 
-    `sun` and `planet` are radii; the ring's is sun + 2 planet. `angular_velocity` is the sun's; `masses` those of sun, planet
-    (discs) and carrier (a disc that reaches the planets' centres). One degree of freedom; rows: 4 + 4 planets, redundant by
-    planets - 1. Flat by default: no `gravity`.
+    `sun` and `planet` are radii; the ring's radius is sun + 2 planet. `angular_velocity` is the sun's; `masses` are those of sun,
+    planet (discs) and carrier (a disc up to the planets' centres). One degree of freedom; 4 + 4 planets rows, of which
+    planets - 1 are redundant. By default it lies flat, without `gravity`.
     """
     r, p = sun, planet
     ring, reach = r + 2 * p, r + p

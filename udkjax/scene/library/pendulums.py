@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.scene.bodies import GROUND, Body
 from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.fields import Numbers
 from udkjax.scene.joints import Distance, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
@@ -28,9 +28,9 @@ def simple_pendulum(
     mass: ArrayLike = 1.0,
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return the IFToMM benchmark A01: a point mass on a massless rod, as long as `position` is from the origin.
+    """Return the IFToMM benchmark A01: a point mass on a massless rod from the origin to `position`.
 
-    A body needs an inertia: 1 kg m^2, which nothing feels, since the rod holds the bob at its centre.
+    A body needs an inertia: 1 kg m^2, which has no effect, since the rod holds the bob at its centre.
     """
     bodies = {"bob": Body(mass, 1.0, position, velocity=velocity)}
     return Mechanism(bodies, {"rod": Distance((GROUND, "bob"), ORIGINS)}, gravity=gravity_vector(gravity), name="simple pendulum")

@@ -1,8 +1,8 @@
 """Poses, and bodies that move with them, for the mechanisms of the library.
 
-Each mechanism starts closed, with velocities that its constraints allow: its pose q(s) is written over one coordinate s, and
-the velocity is the pose's derivative times the rate of s. NumPy computes it, which has nothing to compile; where a number of
-the pose is traced, JAX does. So it is written in the functions of `array_namespace` of its numbers.
+Each mechanism starts closed, with velocities that satisfy its constraints: its pose q(s) is a function of one coordinate s, and
+the velocity is the derivative of the pose times the rate of s. NumPy computes it, without compiling anything, or JAX if a number
+of the pose is traced. Poses are therefore written with the functions of `array_namespace` of their numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,12 +24,12 @@ from udkjax.scene.mechanism import Mechanism
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))  # the centres of mass of two bodies, as points of a joint
 P = ParamSpec("P")
-Several: TypeAlias = ArrayLike | Sequence[ArrayLike]  # a number or several
-COMPLEX_STEP = 1e-100  # of the coordinate: its square is lost beside 1, and a rate times it is no denormal number
+OneOrMore: TypeAlias = ArrayLike | Sequence[ArrayLike]  # one number or several
+COMPLEX_STEP = 1e-100  # its square is negligible relative to 1, and its product with a rate is not denormal
 
 
 def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Give a function of the library all numbers that are not traced as NumPy's: results of these alone stay known."""
+    """Pass concrete numbers to a function of the library as NumPy arrays, so that results of these alone stay concrete."""
     parameters, build_deferred = signature(build), deferred_if_traced(build)
 
     @wraps(build)
@@ -37,7 +37,7 @@ def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanis
         bound = bind_arguments(build.__name__, parameters, arguments, named)
         bound.apply_defaults()
         for name, value in bound.arguments.items():
-            if not isinstance(parameters.parameters[name].default, int):  # counts and switches stay what they are
+            if not isinstance(parameters.parameters[name].default, int):  # counts and switches are passed unchanged
                 bound.arguments[name] = jax.tree.map(_as_concrete, value)
         return build_deferred(*bound.args, **bound.kwargs)
 
@@ -48,8 +48,8 @@ def _as_concrete(value: ArrayLike) -> ArrayLike:
     return value if isinstance(value, Tracer) else np.asarray(value, float)
 
 
-def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: Several) -> tuple[PyTree, PyTree]:
-    """Return a function of s and its derivative along a rate of s, exact to rounding: JAX's, or by NumPy a complex step.
+def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -> tuple[PyTree, PyTree]:
+    """Return a function of s and its derivative for a rate of s, exact to rounding: by JAX, or by a complex step in NumPy.
 
     Source: Squire and Trapp, Using complex variables to estimate derivatives of real functions, SIAM Review 40, 1998.
     """
@@ -62,15 +62,17 @@ def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: Several) -> 
     return value, jax.tree.map(lambda *along: sum(slope * r for slope, r in zip(along, rates, strict=True)), *slopes)
 
 
-def bodies_on_pose(names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: Several, rate: Several) -> dict[str, Body]:
-    """Make the bodies of the (mass, inertia)s, at the [(position, angle), ...] of pose(s), moving as s does at its rate."""
+def bodies_on_pose(
+    names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: OneOrMore, rate: OneOrMore
+) -> dict[str, Body]:
+    """Make bodies from their (mass, inertia), at pose(s) = [(position, angle), ...], with velocities from the rate of s."""
     places, rates = derivative(pose, as_array(s), rate)
     bodies = zip(names, physics, places, rates, strict=True)
     return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
 
 
-def as_array(numbers: Several) -> Array | np.ndarray:
-    """Make an array of a number or several: JAX's where one is traced, else NumPy's."""
+def as_array(numbers: OneOrMore) -> Array | np.ndarray:
+    """Make an array of one number or several: a JAX array if one is traced, else a NumPy array."""
     return array_namespace(numbers).asarray(numbers)
 
 
@@ -100,17 +102,17 @@ def _angle_of(vector):
     angle = array_namespace(x, y).arctan2(y.real, x.real)
     if not isinstance(x, complex | np.complexfloating):
         return angle
-    return angle + 1j * (x.real * y.imag - y.real * x.imag) / (x.real**2 + y.real**2)  # the arc tangent's derivative
+    return angle + 1j * (x.real * y.imag - y.real * x.imag) / (x.real**2 + y.real**2)  # derivative of the arc tangent
 
 
 def hanging_rod_pose(pivot, length, angle):
-    """Return position and angle of a rod that hangs from a point, at an angle from straight down."""
+    """Return position and angle of a rod that hangs from a point, at an angle to the vertical."""
     xp = array_namespace(angle)
     return pivot + 0.5 * length * as_array([xp.sin(angle), -xp.cos(angle)]), angle - np.pi / 2
 
 
 def apex(start, end, a, b):
-    """Return the point at distances a from start and b from end, to the left of the way from start to end."""
+    """Return the point at distances a from start and b from end, to the left of the line from start to end."""
     xp = array_namespace(start, end, a, b)
     along = end - start
     square = along @ along

@@ -1,4 +1,4 @@
-"""The tree of bodies of an MJCF model in space, in the position in which it is written down."""
+"""The tree of bodies of an MJCF model in space, in the position of the file."""
 
 from collections.abc import Container, Iterator
 from itertools import count
@@ -16,38 +16,38 @@ JOINTS = ("hinge", "slide")
 
 
 class TreeJoint(NamedTuple):
-    """A hinge or a slide, of the body numbered `body`."""
+    """A hinge or a slide of the body with index `body`."""
 
     name: str
     kind: str
     body: int
-    axis: np.ndarray  # (3,) unit, in the world
-    anchor: np.ndarray  # (3,) m, in the world
+    axis: np.ndarray  # (3,) unit vector, in world coordinates
+    anchor: np.ndarray  # (3,) m, in world coordinates
     read: AttributeReader
 
 
 class TreeGeom(NamedTuple):
-    """A geom as far as contacts go."""
+    """The properties of a geom that matter for contacts."""
 
     name: str
     body: int
     types: tuple[int, int]  # contype, conaffinity
     centre: np.ndarray  # (3,) m
-    reach: float  # m; of the sphere around it
+    reach: float  # m, radius of the bounding sphere
 
 
 def unique_name(name: str, taken: Container[str]) -> str:
-    """Return a name, with a number behind it where it is taken."""
+    """Return a name, with a number appended if it is taken."""
     return next(found for k in count(1) if (found := name if k == 1 else f"{name}-{k}") not in taken)
 
 
 class TreeBody:
-    """A body: its frame in the world, its joints in their order, its masses. Body 0 is the world."""
+    """A body: its frame in the world, its joints in order, its masses. Body 0 is the world."""
 
     def __init__(self, name: str, parent: int, frame: SpaceFrame, where: str):
         self.name, self.parent, self.frame, self.where = name, parent, frame, where
         self.joints: list[TreeJoint] = []
-        self.given: list[SpaceMass] = []  # by <inertial>
+        self.given: list[SpaceMass] = []  # from <inertial>
         self.geoms: list[tuple[AttributeReader, str, np.ndarray, SpaceFrame]] = []  # with kinds, sizes and frames
 
 
@@ -77,18 +77,18 @@ class BodyTree:
         self.hosts = self._hosts()
 
     def index_of(self, read: AttributeReader, attribute: str, default: str = "world") -> int:
-        """Return the number of the body that an attribute names."""
+        """Return the index of the body that an attribute names."""
         return self.find(read, attribute, self._index, "body", default) or 0
 
     def find(self, read: AttributeReader, attribute: str, known: dict, what: str, default: str = ""):
-        """Return the object that an attribute names; None, and refuse it, where nothing has that name."""
+        """Return the object that an attribute names; if there is none, refuse the attribute and return None."""
         name = read.text(attribute, default)
         if name not in known:
             read.refuse(f"{attribute}={quote(name)}: no {what} has this name{suggestion(name, known)}")
         return known.get(name)
 
     def masses_of(self, host: int) -> list[SpaceMass]:
-        """Return the masses of a body and of those that are fixed to it."""
+        """Return the masses of a body and of the bodies fixed to it."""
         chosen, (low, high) = self.settings.mass_from_geoms, self.settings.mass_groups
         found: list[SpaceMass] = []
         for body in (body for k, body in enumerate(self.bodies) if k and self.hosts[k] == host):
@@ -100,11 +100,11 @@ class BodyTree:
         return found
 
     def moving(self) -> Iterator[tuple[int, TreeBody]]:
-        """Iterate over the bodies that have joints, with their numbers."""
+        """Iterate over the bodies that have joints, with their indices."""
         yield from ((k, body) for k, body in enumerate(self.bodies) if body.joints)
 
     def _hosts(self) -> list[int]:
-        """Return the number of the body to which each is fixed: itself, where it has joints; else as its parent is."""
+        """Return the index of the body to which each body is fixed: itself if it has joints, else its parent's."""
         hosts = [0]
         for k, body in enumerate(self.bodies[1:], 1):
             hosts.append(k if body.joints else hosts[body.parent])

@@ -1,4 +1,4 @@
-"""The coordinates of an MJCF model that springs, motors and equalities act on: those of its joints, and lengths of tendons."""
+"""Coordinates of an MJCF model on which springs, motors and equalities act: joint coordinates and tendon lengths."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -8,25 +8,25 @@ from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-EVEN = 1e-12  # of the largest term: the rounding of angles that cancel
+EVEN = 1e-12  # rounding of angles that cancel, relative to the largest term
 
 
 class CoupledLength(NamedTuple):
-    """A coordinate that springs, motors and equalities act on: that of a joint, or the length of a tendon.
+    """A coordinate on which springs, motors and equalities act: a joint coordinate or a tendon length.
 
-    It is made of angles of bodies, by their factors; or it is a slide; or the distance of two points. Negative numbers of bodies
-    stand for rods without mass, whose angles are nowhere.
+    It is a sum of angles of bodies with factors, a slide, or the distance between two points. Negative indices of bodies stand
+    for massless rods, whose angles are not coordinates.
     """
 
-    length: float  # rad or m, where the model is written down
-    at_rest: float  # likewise, where its springs are
+    length: float  # rad or m, in the position of the file
+    at_rest: float  # rad or m, where its springs are unloaded
     angles: Mapping[int, float] = {}
     slide: TreeJoint | None = None
     ends: Ends | None = None
 
 
 class CoupledLengths:
-    """The coordinates by the names of joints, `joints`, and of tendons, `tendons`; None where one is refused."""
+    """The coordinates of `joints` and `tendons` by name; None if refused."""
 
     def __init__(self, root: XmlElement, model: PlaneModel):
         self.model, self.settings = model, model.tree.settings
@@ -40,11 +40,11 @@ class CoupledLengths:
                 self.tendons[name], self.tendon_attributes[name] = self._tendon_length(read), read
 
     def named_joint(self, read: AttributeReader, attribute: str) -> CoupledLength | None:
-        """Return the coordinate of the joint that an attribute names; None, and refuse it, where there is none."""
+        """Return the coordinate of the joint that an attribute names; if it does not exist, refuse it and return None."""
         return self.model.tree.find(read, attribute, self.joints, "joint")
 
     def named_tendon(self, read: AttributeReader, attribute: str) -> CoupledLength | None:
-        """Return the length of the tendon that an attribute names; None, and refuse it, where there is none."""
+        """Return the length of the tendon that an attribute names; if it does not exist, refuse it and return None."""
         return self.model.tree.find(read, attribute, self.tendons, "tendon")
 
     def _joint_length(self, joint: TreeJoint) -> CoupledLength:
@@ -52,7 +52,7 @@ class CoupledLengths:
         if joint.kind == "slide":
             return CoupledLength(*lengths, slide=joint)
         sign, body, holder = self.model.sign(joint), joint.body, self.model.holder(joint.body)
-        if self.model.has_rod(body):  # its number is that of the body, negative
+        if self.model.has_rod(body):  # indexed by the negative index of the body
             holder, body = (holder, -body) if joint is self.model.tree.bodies[body].joints[0] else (-body, body)
         return CoupledLength(*lengths, angles={holder: -sign, body: sign})
 
@@ -90,7 +90,7 @@ class CoupledLengths:
         return Ends((hosts[one], hosts[two]), (self.model.plane.flat(first.origin), self.model.plane.flat(second.origin)))
 
     def sum_lengths(self, terms: list[tuple[CoupledLength, float]], read: AttributeReader) -> CoupledLength | None:
-        """Return a sum of coordinates, each times its factor; None, and refuse it, where it is made of slides."""
+        """Return a weighted sum of coordinates; if slides are among them, refuse it and return None."""
         if not all(term.angles for term, _ in terms):
             if len(terms) == 1 and terms[0][1] == 1.0:
                 return terms[0][0]

@@ -1,4 +1,4 @@
-"""Equalities of an MJCF model as joints: connect, weld, and angles and distances that are held."""
+"""Equalities of an MJCF model as joints: connect, weld, and fixed angles and distances."""
 
 from collections.abc import Mapping
 
@@ -16,9 +16,9 @@ MESHED = 1e-9  # rad; rounding between gears
 
 
 class EqualityReader:
-    """The joints, `joints`, that hold what the equalities of a model hold, by name; `taken` has the names of its other joints.
+    """The joints that represent the equalities of a model, `joints` by name; `taken` are the names of its other joints.
 
-    `motions` are those of the initial state.
+    `motions` are the motions of bodies in the initial state.
     """
 
     def __init__(self, root: XmlElement, lengths: CoupledLengths, motions: Mapping[int, PlaneMotion], taken: list[str]):
@@ -49,7 +49,7 @@ class EqualityReader:
         self._put_joint(read, ends, Weld(*self.model.attached(ends), angle))
 
     def _attachment(self, read: AttributeReader, anchored: str) -> tuple[Ends, np.ndarray]:
-        """Return the points that an equality holds together, and by which rotation (3, 3) it turns body 2 from where it is."""
+        """Return the points that an equality joins, and the rotation (3, 3) of body 2 from its position in the file."""
         tree, turned = self.model.tree, np.eye(3)
         if "site1" in read or "site2" in read:
             found = [tree.find(read, f"site{k}", tree.sites, "site") or (0, tree.bodies[0].frame) for k in (1, 2)]
@@ -89,11 +89,11 @@ class EqualityReader:
     def _line(self, read: AttributeReader) -> tuple[float, float]:
         found = read.numbers("polycoef", (0.0, 1.0, 0.0, 0.0, 0.0), fewest=1)
         if found[2:].any():
-            read.refuse(f"polycoef={quote(read.text('polycoef'))} is no straight line: only its first two numbers are taken over")
+            read.refuse(f"polycoef={quote(read.text('polycoef'))} is not linear: only its first two numbers are taken over")
         return float(found[0]), float(found[1])
 
     def _hold(self, read: AttributeReader, length: CoupledLength | None, offset: float) -> None:
-        """Add the joint that holds a length where it is written down, and an offset more."""
+        """Add the joint that fixes a length at its value in the file plus an offset."""
         if length is None:
             return
         angles = length.angles
@@ -109,7 +109,7 @@ class EqualityReader:
                 read.refuse(
                     "is not satisfied in the initial state, and gears start in mesh: change the ref or the key of a joint"
                 )
-            # The three factors add up to zero: any body may be the carrier. The ground, or else the one with the largest.
+            # The three factors add up to zero, so that any body may be the carrier: the ground, or that with the largest factor.
             carrier = 0 if 0 in angles else max(angles, key=lambda body: abs(angles[body]))
             one, two = (body for body in angles if body != carrier)
             radii, internal = (abs(angles[one]), abs(angles[two])), angles[one] * angles[two] < 0

@@ -1,4 +1,4 @@
-"""Springs, dampers and actuators of an MJCF model as force elements; other parts of them are refused or left out by name."""
+"""Springs, dampers and actuators of an MJCF model as force elements; unsupported parts are refused, or left out by name."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
 LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # parts of a model that a caller may leave out
-FAR_AWAY = 16.0  # times the size of a model: a point of a slide that it does not reach, but no number that looks mistyped
+FAR_AWAY = 16.0  # times the size of a model: a point that a slide cannot reach, but not so far that the number looks mistyped
 
 
 class LinearForce(NamedTuple):
@@ -42,7 +42,7 @@ class ForceReader:
                 self._add_actuator(self.settings.read(element), controls.get(element.attributes.get("name", ""), 0.0))
 
     def _add_passive(self, name: str, length: CoupledLength, read: AttributeReader) -> None:
-        """Add the spring and the damper of a joint or a tendon, and refuse what else it may have."""
+        """Add the spring and the damper of a joint or a tendon, and refuse its unsupported attributes."""
         off = self.settings.disabled
         if "limit" not in off and self.settings.is_limited(read, "limited", "range"):
             self._leave_or_refuse("limits", read, f"range is not taken over: {self._limit_cure(name, length, read)}")
@@ -71,7 +71,7 @@ class ForceReader:
         return "give an event, `udk.JointLimit` or `udk.Stop`"
 
     def _leave_or_refuse(self, kind: str, read: AttributeReader, text: str) -> None:
-        """Refuse a part of the model, unless the caller has named its kind as one to leave out."""
+        """Refuse a part of the model unless the caller leaves out parts of its kind."""
         if kind not in self.leave_out:
             read.refuse(f'{text}; leave_out=["{kind}"] reads the model without')
 
@@ -141,11 +141,11 @@ class ForceReader:
             return
         owner, other, axis = (held, holder, -axis) if kinds == "hs" else (holder, held, axis)
         bodies, end = self.model.names((owner, other)), self.model.local(other, pin)
-        if stiffness:  # of no length, from where it is at rest: along the slide it is linear on both sides
+        if stiffness:  # with zero length, from the rest position: linear along the slide in both directions
             self._put(
                 name, Spring(bodies, [self.model.local(owner, pin + axis * (at_rest - length.length)), end], stiffness, 0.0)
             )
-        if damping:  # from a point far along the slide, which it does not reach
+        if damping:  # from a point far along the slide that cannot be reached
             self._put(
                 name, Spring(bodies, [self.model.local(owner, pin - FAR_AWAY * self.model.size * axis), end], 0.0, 0.0, damping)
             )

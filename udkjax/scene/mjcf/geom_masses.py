@@ -1,4 +1,4 @@
-"""Mass, centre and inertia of what MJCF builds bodies from: spheres, capsules, cylinders, ellipsoids, boxes, or numbers."""
+"""Mass, centre and inertia of MJCF geoms (spheres, capsules, cylinders, ellipsoids, boxes) and of <inertial>."""
 
 from typing import NamedTuple
 
@@ -7,17 +7,17 @@ import numpy as np
 from udkjax.scene.mjcf.orientations import SpaceFrame, shortest_turn_of_z
 from udkjax.scene.mjcf.xml_tree import AttributeReader
 
-SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # number of sizes of each
-WITHOUT_MASS = ("plane", "hfield", "mesh", "sdf")  # the first two have none, that of the others is not computed here
-WATER = 1000.0  # kg/m^3, the density that MJCF starts from
+SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # number of sizes
+WITHOUT_MASS = ("plane", "hfield", "mesh", "sdf")  # the first two are massless; the masses of the others are not computed
+WATER = 1000.0  # kg/m^3, the default density of MJCF
 
 
 class SpaceMass(NamedTuple):
     """A mass in space."""
 
     mass: float  # kg
-    centre: np.ndarray  # (3,) m, in the world
-    inertia: np.ndarray  # (3, 3) kg m^2 about the centre, in axes of the world
+    centre: np.ndarray  # (3,) m, in world coordinates
+    inertia: np.ndarray  # (3, 3) kg m^2 about the centre, in world axes
 
     def about(self, axis: np.ndarray, point: np.ndarray) -> float:
         """Return the moment of inertia (kg m^2) about a line through a point along a unit axis."""
@@ -26,7 +26,7 @@ class SpaceMass(NamedTuple):
 
 
 def inertial_mass(read: AttributeReader, frame: SpaceFrame) -> SpaceMass:
-    """Return the mass that an <inertial> gives; `frame` is its own, in the world."""
+    """Return the mass given by <inertial>; `frame` is its frame in the world."""
     xx, yy, zz, xy, xz, yz = read.numbers("fullinertia", np.zeros(6))
     diagonal = read.numbers("diaginertia", (xx, yy, zz))
     local = np.diag(diagonal) + (0 if "diaginertia" in read else np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]]))
@@ -36,9 +36,9 @@ def inertial_mass(read: AttributeReader, frame: SpaceFrame) -> SpaceMass:
 
 
 def geom_shape(read: AttributeReader, frame: SpaceFrame) -> tuple[str, np.ndarray, SpaceFrame]:
-    """Return the kind of a geom, its sizes (3,) (m), and its frame in the world, from that which its `pos` gives or `fromto`.
+    """Return the kind of a geom, its sizes (3,) (m), and its frame in the world, given by its `pos` or `fromto`.
 
-    `frame` is the geom's own where it has no `fromto`; else that which its ends are given in.
+    `frame` is the frame of the geom, or if it has a `fromto`, the frame of these coordinates.
     """
     kind = read.choice("type", (*SHAPES, *WITHOUT_MASS), "sphere")
     if kind not in SHAPES:
@@ -59,7 +59,7 @@ def geom_shape(read: AttributeReader, frame: SpaceFrame) -> tuple[str, np.ndarra
 
 
 def geom_mass(read: AttributeReader, kind: str, size: np.ndarray, frame: SpaceFrame) -> SpaceMass | None:
-    """Return the mass of a geom of a kind, sizes (m) and its frame in the world; None where it has none."""
+    """Return the mass of a geom of a kind, with sizes (m) and frame in the world; None if it is massless."""
     if "mass" in read and not read.number("mass"):
         return None
     if kind not in SHAPES:

@@ -1,4 +1,4 @@
-"""MJCF models, the XML of MuJoCo, as mechanisms: those that move in a plane."""
+"""Read planar MJCF models, the XML format of MuJoCo, as mechanisms."""
 
 import os
 import warnings
@@ -22,32 +22,32 @@ from udkjax.scene.mjcf.plane_model import AXES_TOL, PlaneModel, PlaneMotion, con
 from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
 
-INITIAL = "initial"  # the keyframe that `mjcf_text` writes velocities and controls into
-OPEN_LOOP = 1e-9  # of the model's size: rounding of a closed loop
-ROTOR_MASS = 0.01  # of the mass of the body that carries it
+INITIAL = "initial"  # the keyframe with velocities and controls that `mjcf_text` writes
+OPEN_LOOP = 1e-9  # relative to the size of the model: rounding of a closed loop
+ROTOR_MASS = 0.01  # relative to the mass of the body that carries it
 
 
 class MjcfWarning(UserWarning):
-    """Something in an MJCF model is not as its author may take it to be: loops that are open, contacts that are not there."""
+    """An MJCF model may not behave as intended: loops are open, or contacts are ignored."""
 
 
 def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), key: str | None = None) -> Mechanism:
-    """Read a planar mechanism from an MJCF model, the XML of MuJoCo.
+    """Read a planar mechanism from an MJCF model, the XML format of MuJoCo.
 
-    Its axes may lie in any plane of the world: y of the mechanism is the world's z, or y where the plane is level. The motion is
-    that of ideal constraints; MuJoCo's own are soft. Loops that are open as written are named in a `MjcfWarning`.
+    The plane may have any orientation: y of the mechanism is the world's z, or the world's y if the plane is horizontal.
+    Constraints are ideal, whereas MuJoCo's are soft. A `MjcfWarning` lists loops that are open in the file.
 
     Args:
         source: The file, or its text.
-        leave_out: Parts to pass over, of "limits", "frictionloss", "forceranges" and "contacts"; the first three are else
-            refused, and contacts are warned of.
-        key: The keyframe of the initial state; by default that of the name "initial", or else the model as it is written.
+        leave_out: Parts to ignore, of "limits", "frictionloss", "forceranges" and "contacts". By default the first three are
+            refused, and contacts give a warning.
+        key: The keyframe of the initial state; by default the one named "initial", or else the position of the file.
 
     Returns:
         The mechanism.
 
     Raises:
-        SceneError: The model is wrong, does not stay in a plane, or has what a mechanism cannot hold: all of it, with its lines.
+        SceneError: The model is wrong, not planar, or has unsupported parts; the error lists all of them, with line numbers.
         OSError: The file cannot be read.
     """
     path = "" if isinstance(source, str) and is_xml(source) else os.fspath(source)
@@ -63,7 +63,7 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
 def mechanism_of_text(
     text: str, source: str, leave_out: Collection[str] = (), key: str | None = None, stacklevel: int = 3
 ) -> Mechanism:
-    """Return the mechanism of the text of a model; as `read_mjcf`, whose caller is `stacklevel` away."""
+    """Return the mechanism of the text of a model, as `read_mjcf`; warnings go to the caller `stacklevel` levels up."""
     root = parse_xml(text, source)
     problems = unknown_parts(root)
     unknown = len(problems)
@@ -105,7 +105,7 @@ def mechanism_of_text(
 
 
 def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tuple[dict[str, float], ...]:
-    """Return the values and the rates of joints, and the controls of actuators, by name, of a keyframe."""
+    """Return values and rates of joints, and controls of actuators, by name, from a keyframe."""
     keys = {element.attributes.get("name", ""): element for element in merge_parts(root, ("keyframe",)).children}
     problems, joints = model.tree.settings.problems, [joint.name for joint in model.joints]
     if key is not None and key not in keys:
@@ -123,7 +123,7 @@ def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tupl
 
 
 def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint | None:
-    """Return the joint that holds a body to its holder, made of its hinges and slides in their order; None: it is free."""
+    """Return the joint between a body and its holder, from its hinges and slides in order; None if it is free."""
     holder, kinds = model.holder(body), "".join(joint.kind[0] for joint in joints)
     names, angle = model.names((holder, body)), model.relative_angle(holder, body)
     anchors, axes = [model.plane.flat(joint.anchor) for joint in joints], [model.plane.flat(joint.axis) for joint in joints]
@@ -163,10 +163,10 @@ def _body(model: PlaneModel, number: int, motion: PlaneMotion) -> Body:
 def _add_armature(
     model: PlaneModel, joint: TreeJoint, name: str, number: int, bodies: dict[str, Body], joints: dict[str, Joint]
 ) -> None:
-    """Add a joint's rotor, whose energy is 1/2 A w^2, with w the rate of the joint and A its `armature`.
+    """Add the rotor of a joint, with energy 1/2 A w^2, w the rate of the joint and A its `armature`.
 
-    On the ground it is inertia, or mass, of the body. Between body 1 and body 2 it is a rotor that is pinned to the centre of
-    body 1 and geared to turn N = 1 + 2 A / I2 times as fast against it as body 2: with inertia J = A / (N (N - 1)) it has
+    On the ground it adds to the inertia, or mass, of the body. Between body 1 and body 2 it is a rotor pinned to the centre of
+    body 1 and geared to turn N = 1 + 2 A / I2 times as fast relative to it as body 2. With inertia J = A / (N (N - 1)) it has
 
         1/2 J (w1 + N (w2 - w1))^2 = 1/2 A (w2 - w1)^2 - 1/2 (A / N) w1^2 + 1/2 (A / (N - 1)) w2^2,
 
@@ -204,7 +204,7 @@ def _add_armature(
 
 
 def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str, float]]:
-    """Return the joints of loops that are open in the initial guess, and by how much (m, rad)."""
+    """Return the joints of loops that are open in the initial guess, and their gaps (m, rad)."""
     found = []
     for name in loops:
         joint = mechanism.joints[name]

@@ -1,4 +1,4 @@
-"""Mechanisms as MJCF models: a tree of bodies in the world's x-z plane, closed by equalities."""
+"""Write mechanisms as MJCF models: a tree of bodies in the world's x-z plane, closed by equalities."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.annotations import Number
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
 from udkjax.scene.checks import SceneError, quote
-from udkjax.scene.fields import Number
 from udkjax.scene.forces import Spring, Torque, TorsionSpring
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
@@ -25,27 +25,27 @@ from udkjax.scene.spanning_tree import spanning_tree
 from udkjax.scene.suspicions import body_sizes
 
 IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # joints that no equality can express come first
-NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, seen from where x is to the right and z is up
-THICKNESS = 0.04  # of bars that are drawn, beside the largest body
+NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, with x to the right and z up
+THICKNESS = 0.04  # of the drawn bars, relative to the size of the largest body
 
-Values = dict[str, str]
+Attributes = dict[str, str]
 
 
 class _TreeJoint(NamedTuple):
-    """A hinge or a slide as it is written, and its initial rate (rad/s, m/s)."""
+    """The text of a hinge or a slide, and its initial rate (rad/s, m/s)."""
 
     name: str
-    attributes: Values
+    attributes: Attributes
     rate: Number
 
 
 @checked
 def mjcf_text(mechanism: Mechanism | AbstractDrawing) -> str:
-    """Return a mechanism as an MJCF model, the XML of MuJoCo, in the world's x-z plane; `read_mjcf` reads it again.
+    """Return a mechanism as an MJCF model, the XML format of MuJoCo, in the world's x-z plane; `read_mjcf` reads it back.
 
-    Joints make a tree as far as they go, of hinges and slides; the others are equalities: `connect`, `weld`, or of tendons.
-    Bodies are drawn as thin bars without mass and contacts. Initial velocities, and torques as controls of motors, are in the
-    keyframe "initial". MuJoCo holds equalities softly: see its `solref`.
+    The joints of a spanning tree become hinges and slides, the others equalities: `connect`, `weld`, or equalities of tendons.
+    Bodies are drawn as thin bars without mass or contacts. Initial velocities, and torques as controls of motors, are in the
+    keyframe "initial". Equalities are soft in MuJoCo: see its `solref`.
 
     Args:
         mechanism: The scene.
@@ -54,7 +54,7 @@ def mjcf_text(mechanism: Mechanism | AbstractDrawing) -> str:
         The text.
 
     Raises:
-        SceneError: The mechanism has what MJCF has no element for, or what is not closed along the tree; all of it, by name.
+        SceneError: MJCF has no equivalent for an element, or a joint of the tree is open; the error lists all of them.
     """
     mechanism = mechanism.mechanism() if isinstance(mechanism, AbstractDrawing) else mechanism
     check_known(mechanism, mechanism.name)
@@ -66,15 +66,15 @@ class _Writer:
         self.mechanism, self.problems = mechanism, list[str]()
         self.size = max(body_sizes(mechanism).values())
         self.frames = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in mechanism.bodies.items()}
-        self.sites: dict[str, list[Values]] = {name: [] for name in self.frames}
-        self.springs: dict[str, Values] = {}  # attributes of hinges, by their names
+        self.sites: dict[str, list[Attributes]] = {name: [] for name in self.frames}
+        self.springs: dict[str, Attributes] = {}  # attributes of hinges by name
         self.sections: dict[str, list[str]] = {"tendon": [], "equality": [], "actuator": []}
         self.controls: list[float] = []
         self.taken: set[str] = set()  # names of sites and tendons
         preferred = [name for kinds in IN_TREE for name, joint in mechanism.joints.items() if isinstance(joint, kinds)]
         self.tree = {edge.body: edge for edge in spanning_tree(mechanism, {name: k for k, name in enumerate(preferred)})}
         held = {edge.joint for edge in self.tree.values()}
-        self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of a body
+        self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of each body
         self.joints = {name: self._joints(name) for name in self.tree}
         for name, joint in mechanism.joints.items():
             if name not in held:
@@ -88,7 +88,7 @@ class _Writer:
         ]
 
     def text(self) -> str:
-        """Return the model; raise `SceneError` where it is not all of the mechanism."""
+        """Return the model; raise a `SceneError` if it does not represent the whole mechanism."""
         gravity = _numbers(self.mechanism.gravity[0], 0.0, self.mechanism.gravity[1])
         lines = [
             f"<mujoco{_attributes(model=self.mechanism.name) if self.mechanism.name else ''}>",
@@ -119,7 +119,7 @@ class _Writer:
         return "\n".join([*lines, "</mujoco>", ""])
 
     def _joints(self, name: str) -> list[_TreeJoint]:
-        """Return the hinges and slides by which a body hangs on its parent."""
+        """Return the hinges and slides between a body and its parent."""
         _, parent, held = self.tree[name]
         one, two = self.frames[parent], self.frames[name]
         self.turns[name] = dict(self.turns[parent])
@@ -167,7 +167,7 @@ class _Writer:
         return found
 
     def _body_lines(self, name: str) -> list[str]:
-        """Return the lines of a body, but for those that hang on it and its end."""
+        """Return the lines of a body, without its children and its end tag."""
         body, one, two = self.mechanism.bodies[name], self.frames[self.tree[name].holder], self.frames[name]
         place = _in_space(one.local((two.x - one.x, two.y - one.y)))
         inertia = _numbers(body.inertia, body.inertia, body.inertia)
@@ -184,13 +184,13 @@ class _Writer:
             *(f"  <site{_attributes(**site)}/>" for site in self.sites[name]),
         ]
 
-    # --- what closes loops, and forces
+    # --- loop closures and forces
 
     def _add_loop(self, name: str, joint: Constraint) -> None:
         section = self.sections["equality"]
         if isinstance(joint, Revolute | Weld):
             kind = "connect" if isinstance(joint, Revolute) else "weld"
-            angle = float(joint.angle) if isinstance(joint, Weld) else 0.0  # by which body 2 is turned against body 1
+            angle = float(joint.angle) if isinstance(joint, Weld) else 0.0  # of body 2 relative to body 1
             one, two = self._add_sites(name, joint.bodies, joint.points, angle)
             section.append(f"<{kind}{_attributes(name=name, site1=one, site2=two)}/>")
         elif isinstance(joint, Distance):
@@ -240,12 +240,12 @@ class _Writer:
         if alone and hinge not in self.springs:
             self.springs[hinge] = {"springref": _numbers(sign * rest), **spring}
         else:
-            turned = -1.0 if rest < 0 else 1.0  # a springlength of -1 says that it is the length as written
+            turned = -1.0 if rest < 0 else 1.0  # a springlength of -1 means the length in the position of the file
             parts = {joint: turned * part for joint, part in hinges.items()}
             self._add_fixed(name, parts, "force", springlength=_numbers(abs(rest)), **spring)
 
     def _hinges(self, parts: dict[str, float]) -> dict[str, float]:
-        """Return a sum of angles of bodies, each times its factor, as one of hinges."""
+        """Return a weighted sum of angles of bodies as a weighted sum of hinges."""
         found: dict[str, float] = {}
         for body, factor in parts.items():
             for hinge, part in self.turns[body].items():
@@ -254,7 +254,7 @@ class _Writer:
         return {hinge: part for hinge, part in found.items() if abs(part) > least}
 
     def _add_fixed(self, name: str, hinges: dict[str, float], what: str, **attributes: str) -> str:
-        """Add a tendon that is a sum of hinges; return its name, or nothing where there are none."""
+        """Add a tendon that is a sum of hinges; return its name, or an empty text if the sum is empty."""
         if not hinges:
             self.problems.append(
                 f"{what} {quote(name)}: its bodies do not turn against each other, and MJCF knows angles of hinges alone"
@@ -281,13 +281,13 @@ class _Writer:
         return titles
 
     def _unique(self, name: str) -> str:
-        """Return a name of its own for a site or a tendon."""
+        """Return a unique name for a site or a tendon."""
         found = unique_name(name, self.taken)
         self.taken.add(found)
         return found
 
 
-def _damping(value: object) -> Values:
+def _damping(value: object) -> Attributes:
     return {} if value is None else {"damping": _numbers(value)}
 
 

@@ -1,4 +1,4 @@
-"""Settings of a whole MJCF model: its compiler's, what its options switch off, and its defaults."""
+"""Settings of a whole MJCF model: compiler, disabled options, and defaults."""
 
 import math
 
@@ -7,7 +7,7 @@ from udkjax.scene.mjcf.orientations import SpaceFrame, frame_of
 from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-MAIN = "main"  # the class of defaults that stands for none
+MAIN = "main"  # the default class
 _COMMON_TO_ACTUATORS = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")
 _STANDARD = "constraint equality limit contact spring damper gravity actuation frictionloss".split()
 
@@ -27,7 +27,7 @@ class ModelSettings:
             self.sequence = "xyz"
         self.autolimits = read.choice("autolimits", ("true", "false"), "true") == "true"
         self.mass_from_geoms = read.choice("inertiafromgeom", ("true", "false", "auto"), "auto")
-        self.total_mass = read.number("settotalmass", -1.0)  # kg; not positive: as it is
+        self.total_mass = read.number("settotalmass", -1.0)  # kg; unchanged if not positive
         self.mass_groups = read.numbers("inertiagrouprange", (0, 5))
         read = AttributeReader(flags, flags.attributes, problems)
         off = {name for name in _STANDARD if read.choice(name, ("enable", "disable"), "enable") == "disable"}
@@ -50,9 +50,9 @@ class ModelSettings:
                     found.setdefault(child.tag, {}).update(child.attributes)
 
     def read(self, element: XmlElement, childclass: str = MAIN, section: str = "") -> AttributeReader:
-        """Return the attributes of an element with their defaults: of its class, or of that of the body that holds it.
+        """Return the attributes of an element with the defaults of its class, or of the class of the body that holds it.
 
-        `section` is the tag that its defaults stand under, where it is another one than its own.
+        `section` is the tag of its defaults, if it differs from its own tag.
         """
         name = element.attributes.get("class", childclass)
         if name not in self._defaults:
@@ -68,17 +68,17 @@ class ModelSettings:
         return AttributeReader(element, values | dict(element.attributes), self.problems)
 
     def frame(self, read: AttributeReader) -> SpaceFrame:
-        """Return the frame of an element in the one that it stands in."""
+        """Return the frame of an element in its parent's frame."""
         return frame_of(read, self.radians, self.sequence)
 
     def is_limited(self, read: AttributeReader, limited: str, range_name: str) -> bool:
-        """Return whether a range is in force, by the attribute that says so or because it is given."""
+        """Return True if a range is active, by its attribute or because the range is given."""
         word = read.choice(limited, ("true", "false", "auto"), "auto")
         return word == "true" or (word == "auto" and self.autolimits and range_name in read)
 
 
 def merge_parts(root: XmlElement, path: tuple[str, ...]) -> XmlElement:
-    """Return all elements at a path below the outermost one as a single one: later attributes override earlier ones."""
+    """Merge all elements at a path below the root into one: later attributes override earlier ones."""
     found = [root]
     for tag in path:
         found = [child for element in found for child in element.children if child.tag == tag]

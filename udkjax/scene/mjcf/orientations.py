@@ -1,4 +1,4 @@
-"""Frames in space as MJCF writes them: quaternions, axes and angles, Euler angles, axes; and the frames that they nest in."""
+"""Nested frames in space in the forms of MJCF: quaternions, axis and angle, Euler angles, axes."""
 
 from typing import NamedTuple
 
@@ -10,17 +10,17 @@ ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
 
 
 class SpaceFrame(NamedTuple):
-    """A frame in space: the columns of `axes` are its x, y and z, seen from the world."""
+    """A frame in space: the columns of `axes` are its x, y and z axes in world coordinates."""
 
     axes: np.ndarray  # (3, 3)
     origin: np.ndarray  # (3,) m
 
     def point(self, local: np.ndarray) -> np.ndarray:
-        """Return a point of the frame in the world (m)."""
+        """Return the world coordinates (m) of a point of the frame."""
         return self.origin + self.axes @ local
 
     def within(self, child: "SpaceFrame") -> "SpaceFrame":
-        """Return a frame that is given in this one as the world sees it."""
+        """Return the frame in the world of a frame that is given in this one."""
         return SpaceFrame(self.axes @ child.axes, self.point(child.origin))
 
 
@@ -28,12 +28,12 @@ WORLD = SpaceFrame(np.eye(3), np.zeros(3))
 
 
 def frame_of(read: AttributeReader, radians: float, sequence: str) -> SpaceFrame:
-    """Return the frame of an element in the one that it stands in, from its `pos` and its orientation.
+    """Return the frame of an element in its parent's frame, from its `pos` and its orientation.
 
     Args:
         read: the element's attributes.
-        radians: radians in one unit of the file's angles.
-        sequence: of Euler angles, as in the compiler's `eulerseq`.
+        radians: the unit of angles in the file (rad).
+        sequence: the sequence of Euler angles, as in the compiler's `eulerseq`.
     """
     given = [name for name in ORIENTATIONS if name in read]
     if len(given) > 1:
@@ -64,7 +64,7 @@ def _axes(read: AttributeReader, kind: str, radians: float, sequence: str) -> np
     axes = np.eye(3)
     for letter, angle in zip(sequence, value * radians, strict=True):
         one = turn_about(np.eye(3)["xyz".index(letter.lower())], angle)
-        axes = axes @ one if letter.islower() else one @ axes  # small letters turn with the frame
+        axes = axes @ one if letter.islower() else one @ axes  # lower-case axes turn with the frame
     return axes
 
 

@@ -1,4 +1,4 @@
-"""An MJCF model in its plane: motions as complex numbers, x + iy; moving bodies, and how joint values turn and shift each."""
+"""An MJCF model in its plane: moving bodies, and their motions for values of the joints, as complex numbers x + iy."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
@@ -12,35 +12,35 @@ from udkjax.scene.mjcf.geom_masses import sum_masses
 from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.xml_tree import XmlElement
 
-AXES_TOL = 1e-6  # rad; how far axes may be off the plane: files write directions with seven digits
+AXES_TOL = 1e-6  # rad; deviation of axes from the plane's normal: files have seven digits
 
 
 class MotionPlane(NamedTuple):
-    """A plane through the origin of the world: its own x and y, and the axis about which angles are anticlockwise."""
+    """A plane through the origin of the world: its x and y axes, and the normal about which angles are anticlockwise."""
 
     across: np.ndarray  # (3,)
     up: np.ndarray  # (3,)
     normal: np.ndarray  # (3,)
 
     def flat(self, vector: np.ndarray) -> complex:
-        """Return a point or a vector of the world in the plane."""
+        """Return the projection of a point or a vector onto the plane."""
         return complex(vector @ self.across, vector @ self.up)
 
 
 class PlaneMotion(NamedTuple):
-    """Motion of a body in the plane from where it is written down, and its velocity."""
+    """Displacement of a body in the plane from its position in the file, and its velocity."""
 
     angle: float = 0.0  # rad
     shift: complex = 0j  # m; a point z is at exp(i angle) z + shift
     omega: float = 0.0  # rad/s
-    rate: complex = 0j  # m/s; that point moves with rate + i omega z
+    rate: complex = 0j  # m/s; its velocity is rate + i omega times its position
 
     def point(self, z: complex) -> complex:
-        """Return the place of a point (m)."""
+        """Return the position of a point (m)."""
         return np.exp(1j * self.angle) * z + self.shift
 
     def velocity(self, z: complex) -> complex:
-        """Return the velocity (m/s) of what is at a point now."""
+        """Return the velocity (m/s) of the body at a current position."""
         return self.rate + 1j * self.omega * z
 
     def turn(self, anchor: complex, angle: float, rate: float) -> "PlaneMotion":
@@ -56,9 +56,9 @@ class PlaneMotion(NamedTuple):
 
 
 def plane_of(joints: Sequence[TreeJoint], gravity: np.ndarray) -> MotionPlane:
-    """Return the plane in which all joints move, and refuse those that leave it.
+    """Return the plane in which all joints move, and refuse joints that leave it.
 
-    Its y is the world's z, or y where it is level; its x has a positive component along the world's x, or else y.
+    Its y is the world's z, or the world's y if it is horizontal; its x has a positive component along the world's x, or else y.
     """
     hinges, slides = ([joint.axis for joint in joints if joint.kind == kind] for kind in ("hinge", "slide"))
     across = (
@@ -89,7 +89,7 @@ Pair = tuple[float, float]
 
 
 class PlaneBody(NamedTuple):
-    """A moving body, in the position in which the model is written down."""
+    """A moving body, in the position of the file."""
 
     name: str
     centre: complex  # m
@@ -99,19 +99,19 @@ class PlaneBody(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Two points, of two bodies, and their distance (m) where the model is written down."""
+    """Two points of two bodies, and their distance (m) in the position of the file."""
 
     bodies: tuple[int, int]
     points: tuple[complex, complex]
 
     @property
     def distance(self) -> float:
-        """Distance of one point from the other (m)."""
+        """Distance between the points (m)."""
         return abs(self.points[1] - self.points[0])
 
 
 class PlaneModel:
-    """The bodies of a tree that have joints, by their numbers; number 0 is the ground."""
+    """The bodies of a tree that have joints, by index; 0 is the ground."""
 
     def __init__(self, tree: BodyTree, plane: MotionPlane):
         self.tree, self.plane = tree, plane
@@ -125,7 +125,7 @@ class PlaneModel:
             if not (mass > 0 and inertia > 0):
                 tree.settings.problems.append(f"{body.where}: must have mass and inertia, by its geoms or an <inertial>")
             side = plane.flat(body.frame.axes[:, 0])
-            angle = float(np.angle(side)) if abs(side) > 0.5 else 0.0  # of a frame that stands across the plane: any will do
+            angle = float(np.angle(side)) if abs(side) > 0.5 else 0.0  # arbitrary for a frame perpendicular to the plane
             name = unique_name(body.name, {b.name for b in self.bodies.values()})
             self.bodies[k] = PlaneBody(name, plane.flat(centre), angle, mass, inertia)
         places = [plane.flat(joint.anchor) for joint in tree.joints.values()] + [b.centre for b in self.bodies.values()]
@@ -133,15 +133,15 @@ class PlaneModel:
 
     @property
     def joints(self) -> list[TreeJoint]:
-        """The joints in the order of the model's coordinates."""
+        """The joints, in the order of the model's coordinates."""
         return [joint for body in self.tree.bodies for joint in body.joints]
 
     def holder(self, body: int) -> int:
-        """Return the number of the moving body, or the ground, that a body hangs on."""
+        """Return the index of the moving body (or the ground) that holds a body."""
         return self.tree.hosts[self.tree.bodies[body].parent]
 
     def has_rod(self, body: int) -> bool:
-        """Return whether a body hangs on two hinges, with a rod without mass between them."""
+        """Return True if a body is held by two hinges, with a massless rod between them."""
         return [joint.kind for joint in self.tree.bodies[body].joints] == ["hinge", "hinge"]
 
     def local(self, body: int, point: complex) -> Pair:
@@ -162,19 +162,19 @@ class PlaneModel:
         return self.names(ends.bodies), [self.local(body, point) for body, point in zip(*ends, strict=True)]
 
     def relative_angle(self, one: int, two: int) -> float:
-        """Return the angle (rad) of body two against body one."""
+        """Return the angle (rad) of body two relative to body one."""
         return self.bodies[two].angle - self.bodies[one].angle
 
     def sign(self, joint: TreeJoint) -> float:
-        """Return 1 where a hinge turns anticlockwise, else -1."""
+        """Return 1 if a hinge turns anticlockwise, else -1."""
         return float(np.sign(joint.axis @ self.plane.normal))
 
     def reference(self, joint: TreeJoint, name: str = "ref") -> float:
-        """Return the value (rad, m) of a joint where the model is written down, or where its spring is at rest."""
+        """Return the value (rad, m) of a joint in the position of the file, or where its spring is unloaded."""
         return joint.read.number(name) * (self.tree.settings.radians if joint.kind == "hinge" else 1.0)
 
     def motions(self, values: Mapping[str, float], rates: Mapping[str, float]) -> dict[int, PlaneMotion]:
-        """Return the motions of bodies for values and rates of joints, by default those of the model as written."""
+        """Return the motions of bodies for values and rates of joints, by default those of the file."""
         found = {0: PlaneMotion()}
         for k, body in self.tree.moving():
             motion = found[self.holder(k)]
@@ -189,23 +189,23 @@ class PlaneModel:
         return found
 
     def named_joints(self) -> Iterator[tuple[str, int, list[TreeJoint]]]:
-        """Iterate over moving bodies: the name of what holds each (its last hinge, if it has one), its number, its joints."""
+        """Iterate over moving bodies: the name of the joint (its last hinge, if it has one), the body's index, its joints."""
         for k, body in self.tree.moving():
             hinges = [joint.name for joint in body.joints if joint.kind == "hinge"]
             yield (hinges or [body.joints[0].name])[-1], k, body.joints
 
 
 def gap_of(ends: Ends, motions: Mapping[int, PlaneMotion]) -> float:
-    """Return the distance of two points (m) after motions of their bodies."""
+    """Return the distance between two points (m) after motions of their bodies."""
     one, two = (motions[body].point(point) for body, point in zip(*ends, strict=True))
     return abs(two - one)
 
 
 def contact_pairs(root: XmlElement, tree: BodyTree, plane: MotionPlane) -> list[str]:
-    """Return the pairs of geoms that MuJoCo looks for contacts between, in words.
+    """Return the pairs of geoms between which MuJoCo looks for contacts, in words.
 
-    Left out are those of one body, of a body and what it hangs on, of bodies that are excluded, those that nothing moves, and
-    spheres around them that stay beside each other, above and below the plane of the motion.
+    Pairs are left out if they belong to one body or to a body and its holder, are excluded, cannot move relative to each other,
+    or have bounding spheres that are separate along the normal of the plane.
     """
     parts = merge_parts(root, ("contact",)).children
     excluded = [{part.attributes.get("body1", ""), part.attributes.get("body2", "")} for part in parts if part.tag == "exclude"]

@@ -1,6 +1,6 @@
-"""Vocabulary of MJCF: what is taken over, what has no effect on a motion, and what is refused wherever it says more than nothing.
+"""Vocabulary of MJCF: parts that are read, parts without effect on a motion, and parts that are refused unless they are inactive.
 
-An element or an attribute that stands nowhere here is refused by its name.
+Elements and attributes that are not listed here are refused by name.
 """
 
 from collections.abc import Mapping
@@ -9,20 +9,20 @@ from typing import NamedTuple
 from udkjax.scene.checks import quote
 from udkjax.scene.mjcf.xml_tree import XmlElement
 
-WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on the motion
-TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # parents of children that have the tags of other elements
+WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on motions
+TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # parents whose children have the tags of other elements
 ACTUATORS = ("motor", "position", "velocity", "general")
-SHAPELESS = ("material", "mesh", "texture", "pair")  # in defaults alone
+SHAPELESS = ("material", "mesh", "texture", "pair")  # only in defaults
 
 _POSE = "pos quat axisangle xyaxes zaxis euler"
 _LOOK = "group material rgba user"
-_SOFT = "solref solimp"  # softness of constraints: here constraints are ideal
+_SOFT = "solref solimp"  # softness of constraints, which are ideal here
 
 
 class _Attributes(NamedTuple):
     used: str
-    idle: str = ""  # without effect on the motion
-    nothing: Mapping[str, str] = {}  # refused unless they say nothing: their value then
+    idle: str = ""  # attributes without effect on the motion
+    nothing: Mapping[str, str] = {}  # attributes refused unless they have this value, which has no effect
 
 
 def _actuator(used: str = "", **nothing: str) -> _Attributes:
@@ -106,7 +106,7 @@ _CURES = {
 
 
 def unknown_parts(root: XmlElement) -> list[str]:
-    """Return the parts of a model that are not taken over, by line: elements and attributes that could change its motion."""
+    """Return the unsupported parts of a model that could change its motion, elements and attributes, by line."""
     found: list[str] = []
     if root.tag != "mujoco":
         return [f"{root.where}: an MJCF model begins with <mujoco>"]

@@ -1,4 +1,4 @@
-"""XML with the line of each element, and attributes read as numbers; mistakes are collected, not raised."""
+"""XML with line numbers, and attributes read as numbers; mistakes are collected, not raised."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
 
 
 class XmlElement:
-    """An element: its tag, attributes, children, and the line where it begins, in the included file of this name if in one."""
+    """An element: its tag, attributes, children, its first line, and the name of the included file that contains it, if any."""
 
     def __init__(self, tag: str, attributes: Mapping[str, str], line: int, file: str = ""):
         self.tag, self.attributes, self.line, self.file = tag, attributes, line, file
@@ -18,12 +18,12 @@ class XmlElement:
 
     @property
     def where(self) -> str:
-        """The element and its place, as in error messages."""
+        """The element and its line, for error messages."""
         name = self.attributes.get("name", "")
         return f"<{self.tag}> {f'{quote(name)} ' if name else ''}(line {self.line}{f' of {self.file}' if self.file else ''})"
 
     def walk(self) -> Iterator[tuple["XmlElement", "XmlElement"]]:
-        """Iterate over all elements below this one, in their order, each with the one that holds it."""
+        """Iterate over all elements below this one, in order, each with its parent."""
         pending: list[tuple[XmlElement, XmlElement]] = [(child, self) for child in reversed(self.children)]
         while pending:
             element, parent = pending.pop()
@@ -32,13 +32,13 @@ class XmlElement:
 
 
 def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = ()) -> XmlElement:
-    """Return the outermost element of a text, each <include> in it replaced by what is in that file.
+    """Return the root element of a text, with each <include> replaced by the content of the file.
 
     Args:
-        text: XML; a byte order mark before it is passed over.
-        source: The model's file, in whose folder others are looked for; or empty.
-        file: The name of the file that is included, if it is one.
-        within: The files that it is included in.
+        text: XML; a leading byte order mark is skipped.
+        source: The file of the model, whose folder contains included files; or empty.
+        file: The name of the included file, if it is one.
+        within: The files that include it.
 
     Raises:
         SceneError: The text is not XML, or a file cannot be included.
@@ -76,7 +76,7 @@ def _included(element: XmlElement, source: str, within: tuple[str, ...]) -> list
 
 
 class AttributeReader:
-    """The attributes of one element, its defaults among them; mistakes are added to `problems`."""
+    """The attributes of one element, including defaults; mistakes are added to `problems`."""
 
     def __init__(self, element: XmlElement, values: Mapping[str, str], problems: list[str]):
         self.element, self.values, self._problems = element, values, problems
@@ -89,19 +89,19 @@ class AttributeReader:
         return name in self.values
 
     def text(self, name: str, default: str = "") -> str:
-        """Return an attribute as it is."""
+        """Return an attribute as text."""
         return self.values.get(name, default)
 
     def choice(self, name: str, choices: Sequence[str], default: str) -> str:
-        """Return an attribute that is one of some words."""
+        """Return an attribute with given choices."""
         value = self.values.get(name, default)
         if value in choices:
             return value
-        self.refuse(f"{name}={quote(value)} is none of {', '.join(choices)}{suggestion(value, choices)}")
+        self.refuse(f"{name}={quote(value)} must be one of {', '.join(choices)}{suggestion(value, choices)}")
         return default
 
     def numbers(self, name: str, default: Sequence[float] | np.ndarray, fewest: int | None = None) -> np.ndarray:
-        """Return an attribute of as many finite numbers as the default has, or `fewest`: the rest is the default's."""
+        """Return finite numbers: as many as the default, or at least `fewest`, completed from the default."""
         if name not in self.values:
             return np.array(default, float)
         words = self.values[name].split()
@@ -117,5 +117,5 @@ class AttributeReader:
         return np.array(default, float)
 
     def number(self, name: str, default: float = 0.0) -> float:
-        """Return an attribute that is one number."""
+        """Return an attribute that is a single number."""
         return float(self.numbers(name, [default])[0])

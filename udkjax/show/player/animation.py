@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from udkjax.annotations import JsonObject
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
@@ -18,9 +19,8 @@ from udkjax.scene.requirements import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
-from udkjax.show.player.marks import Shapes
+from udkjax.show.player.marks import BodyPoints
 from udkjax.show.player.measure_curves import Measures, ShownMotion
-from udkjax.show.player.packing import Json
 from udkjax.show.player.page import frame, page
 from udkjax.show.player.player_data import (
     Traces,
@@ -56,7 +56,7 @@ class Animation:
         failures: causes of failed runs, by their labels.
     """
 
-    def __init__(self, data: Json, failures: Mapping[str, str] | None = None):
+    def __init__(self, data: JsonObject, failures: Mapping[str, str] | None = None):
         self.data, self.failures = data, dict(failures or {})  # causes of failed runs, by their labels
         self._motions = [motion_of(record) for record in data["runs"]]
         self._arrows = [arrows_of(record) for record in data["runs"]]
@@ -141,7 +141,7 @@ def animate(
     measures: Measures = ("violation", "energy", "rank"),
     reactions: bool = False,
     traces: Traces | None = None,
-    shapes: Shapes | None = None,
+    shapes: BodyPoints | None = None,
     title: str | None = None,
     live: Live = False,
     events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),

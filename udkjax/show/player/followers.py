@@ -16,16 +16,16 @@ from typing import Any
 import jax
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.integrate.portable import drawn_points
 from udkjax.scene import GROUND, Gear, Mechanism, Rack
-from udkjax.show.player.packing import Json
 
 SAME_DIGITS = 7  # significant digits of the points of symbols
 
-Point = tuple[int, float, float]  # the number of a body, and a place in its frame, with so many digits
+BodyPoint = tuple[int, float, float]  # the number of a body, and a place in its frame, with so many digits
 
 
-def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[Json], drawn: int) -> Json:
+def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[JsonObject], drawn: int) -> JsonObject:
     """Return how the symbols, marks and traces of a run follow its mechanism, whose drawn points begin at `drawn`."""
     places: Mechanism = _places(mechanism)
     known = _points(mechanism, places)
@@ -35,7 +35,7 @@ def followers(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence
             drawn += 2
     angles = {_rounded(e.axis): int(places.joints[name].axis) for name, e in mechanism.joints.items() if hasattr(e, "axis")}
     radii = _radii(mechanism, places)
-    found: Json = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": [], "arrows": []}
+    found: JsonObject = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": [], "arrows": []}
     for k, symbol in enumerate(symbols):
         frame = symbol["frame"]
         pair = len(frame) == 2
@@ -71,14 +71,14 @@ def _rounded(x: Any) -> float:
     return float(f"{float(x):.{SAME_DIGITS}g}")
 
 
-def _key(body: float, x: float, y: float) -> Point:
+def _key(body: float, x: float, y: float) -> BodyPoint:
     return int(body), _rounded(x), _rounded(y)
 
 
-def _points(mechanism: Mechanism, places: Mechanism) -> dict[Point, tuple[int, int]]:
+def _points(mechanism: Mechanism, places: Mechanism) -> dict[BodyPoint, tuple[int, int]]:
     """Return the places of x and y of the points that elements have in the frames of bodies."""
     number = {GROUND: -1, **{name: k for k, name in enumerate(mechanism.body_names)}}
-    found: dict[Point, tuple[int, int]] = {}
+    found: dict[BodyPoint, tuple[int, int]] = {}
     elements = [*mechanism.constraints.values(), *mechanism.forces.values()]
     numbered = [*places.constraints.values(), *places.forces.values()]
     for element, place in zip(elements, numbered, strict=True):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.equations import analyse
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine
@@ -22,7 +23,6 @@ from udkjax.scene.requirements import ArgumentError
 from udkjax.show.player.followers import followers
 from udkjax.show.player.live_parameters import Live, Slider, in_sections, names_in, sliders_of
 from udkjax.show.player.measure_curves import ShownMotion
-from udkjax.show.player.packing import Json
 from udkjax.show.player.player_data import MOST_INSTANTS
 
 TOLERANCE = 1e-8  # rtol and atol of a run that does not know its own: those of `simulate`
@@ -31,7 +31,7 @@ SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteris
 
 def live_data(
     runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live, events: Sequence[ExpandsToEvents] = ()
-) -> Json:
+) -> JsonObject:
     """Return the further data of a live page of some runs, each with its data for the player.
 
     Args:
@@ -45,7 +45,7 @@ def live_data(
     """
     sliders: dict[str, Slider] = {}
     engines: dict[tuple[int, float, float], int] = {}
-    data: Json = {"engines": [], "runs": []}
+    data: JsonObject = {"engines": [], "runs": []}
     unknown = [] if isinstance(live, bool) else [n for n in live if not any(names_in(m, [n]) for m, _, _ in runs)]
     for mechanism, solution, record in runs:
         _require_solvable(mechanism, solution, events)
@@ -79,7 +79,9 @@ def _require_solvable(mechanism: Mechanism, solution: ShownMotion, events: Seque
         raise ArgumentError(f"live: a page solves by projection, and the run has stabilization={stabilization}: leave out live")
 
 
-def _engine(mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: float, events: Sequence[ExpandsToEvents]) -> Json:
+def _engine(
+    mechanism: Mechanism, sliders: Sequence[Slider], rtol: float, atol: float, events: Sequence[ExpandsToEvents]
+) -> JsonObject:
     try:
         engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol, events=events, drawn=True)
     except UnsupportedError as error:
@@ -99,7 +101,7 @@ def _times(solution: ShownMotion) -> list[float] | None:
     return np.interp(np.linspace(0, len(ts) - 1, min(len(ts), MOST_INSTANTS)), np.arange(len(ts)), ts).tolist()
 
 
-def _start(mechanism: Mechanism, solution: ShownMotion) -> Json | None:
+def _start(mechanism: Mechanism, solution: ShownMotion) -> JsonObject | None:
     """Return the initial state of a run that does not begin where the scene says."""
     t = float(np.asarray(solution.ts)[0])
     q, v = (np.asarray(x, float)[0] for x in (solution.q, solution.v))

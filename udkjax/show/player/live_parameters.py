@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.annotations import JsonObject
 from udkjax.equations import analyse
 from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene import Mechanism
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.units import conversion_factor, units_of
-from udkjax.show.player.packing import Json
 
 # Names of parameters, whole or one entry, by themselves or with the range of their sliders; True: all that a scene has.
 Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]
@@ -56,7 +56,7 @@ class Slider(NamedTuple):
     per_unit: float
 
     @property
-    def data(self) -> Json:
+    def data(self) -> JsonObject:
         """The slider as JSON."""
         return self._asdict()
 

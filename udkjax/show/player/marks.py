@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from udkjax.annotations import JsonObject
 from udkjax.integrate.events.conditions import Gap
 from udkjax.scene import (
     GROUND,
@@ -54,10 +55,9 @@ from udkjax.scene import (
     Weld,
 )
 from udkjax.scene.held import value_at
-from udkjax.show.player.packing import Json
 
-Mark = Json
-Shapes = Mapping[str, ArrayLike]  # points (n, 2) by body
+Mark = JsonObject
+BodyPoints = Mapping[str, ArrayLike]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # of a cam's outline
 SAME_PLACE = 1e-9  # of the largest coordinate: attachments that are closer are one point
@@ -65,7 +65,7 @@ ROD = 0.01  # of the inertia: how near to that of a uniform rod it must be for o
 MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
 
 
-def marks(mechanism: Mechanism, poses: ArrayLike, shapes: Shapes | None = None, gaps: Sequence[Gap] = ()) -> list[Mark]:
+def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = None, gaps: Sequence[Gap] = ()) -> list[Mark]:
     """Return the marks of a mechanism, the farthest first.
 
     Args:
@@ -119,7 +119,7 @@ def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"
 class _Drawing:
     """The marks of one mechanism, in the order in which they cover one another."""
 
-    def __init__(self, mechanism: Mechanism, poses: Poses, shapes: Shapes):
+    def __init__(self, mechanism: Mechanism, poses: Poses, shapes: BodyPoints):
         self.mechanism, self.poses = mechanism, poses
         drawn = {} if mechanism.drawing is None else mechanism.drawing.shapes()
         polygons = () if mechanism.drawing is None else mechanism.drawing.polygons

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-Json = dict[str, Any]  # an object of JSON
+from udkjax.annotations import JsonObject
 
 
-def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> Json:
+def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> JsonObject:
     """Return a table of finite numbers with its shape and the `step` of each column (or of all) as plain data."""
     table = np.asarray(table, float)
     steps = np.broadcast_to(np.asarray(step, float), table.shape[1:])

@@ -7,7 +7,7 @@ from functools import cache
 from importlib.resources import files
 from string import Template
 
-from udkjax.show.player.packing import Json
+from udkjax.annotations import JsonObject
 
 # Each after those it imports.
 SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
@@ -17,7 +17,7 @@ LAST = ("player", "mount")
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
-def page(data: Json, options: Json | None = None) -> str:
+def page(data: JsonObject, options: JsonObject | None = None) -> str:
     """Return the player of `data` (player_data.py) as one HTML page; `options` are those of `mount` in mount.js."""
     template = Template(files("udkjax.show.player").joinpath("page.html").read_text(encoding="utf-8"))
     return template.substitute(
@@ -28,7 +28,7 @@ def page(data: Json, options: Json | None = None) -> str:
     )
 
 
-def frame(data: Json, height: int) -> str:
+def frame(data: JsonObject, height: int) -> str:
     """Return the page inside an <iframe> of so many pixels, for notebooks and pages that show HTML."""
     text, title = (html.escape(words, quote=True) for words in (page(data), data["title"]))
     style = f"width:100%;height:{height}px;border:0;border-radius:8px"

@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.annotations import JsonObject
 from udkjax.extras import OptionalImport
-from udkjax.show.player.packing import Json
 from udkjax.show.player.sketch import THEMES, Circle, ForceArrow, Line, Sketch, TracedPath, View, view_of
 
 DXF_LAYERS = {
@@ -25,7 +25,7 @@ DXF_LAYERS = {
 class Posed(Protocol):
     """Animation as the writers of pictures need it: the data of the player, and the coordinates of each run at any time."""
 
-    data: Json
+    data: JsonObject
 
     def pose(self, t: float | None = None) -> list[Float[np.ndarray, "bodies 3"]]:
         """Return the coordinates of each run at time t."""

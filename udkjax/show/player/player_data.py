@@ -27,18 +27,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from udkjax.annotations import JsonObject
 from udkjax.equations import analyse
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
 from udkjax.positions.channels import locate
 from udkjax.scene import Mechanism
-from udkjax.show.player.marks import Shapes, body_points, marks, to_ground
+from udkjax.show.player.marks import BodyPoints, body_points, marks, to_ground
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
-from udkjax.show.player.packing import Json, floats, pack, unpack
+from udkjax.show.player.packing import floats, pack, unpack
 from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
 from udkjax.show.player.symbols import symbols_of
 
-Record = Json
+Record = JsonObject
 Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
 # Of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand.
 PRECISION = 1e-5
@@ -62,7 +63,7 @@ def run_record(
     measures: Measures,
     with_reactions: bool,
     traces: Traces | None,
-    shapes: Shapes | None = None,
+    shapes: BodyPoints | None = None,
     gaps: Sequence[Gap] = (),
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return one run as plain data, and its poses; a run that failed is shown as far as it came."""
@@ -132,7 +133,7 @@ def mode_record(
     return record, poses
 
 
-def _events_of(solution: ShownMotion) -> list[Json]:
+def _events_of(solution: ShownMotion) -> list[JsonObject]:
     """Return the events of a run in their order."""
     events = getattr(solution, "events", None)
     if events is None:

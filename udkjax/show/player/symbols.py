@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from udkjax.show.player.marks import Mark
 
 Symbol = Mark
-Frame = list
 ROUND = 48  # corners of a circle that is drawn as a line
 COIL_LENGTH = 11.0  # units: of a spring that is as long as usual
 STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # units at each end of it, but not more than this part of its length
@@ -32,12 +31,12 @@ def symbols_of(marks: Sequence[Mark], unit: float) -> list[Symbol]:
     return [{"layer": mark["kind"]} | symbol for mark in marks for symbol in SYMBOLS[mark["kind"]](mark, unit)]
 
 
-def _line(frame: Frame, points: ArrayLike, stroke: str, width: float, fill: str = "", closed: bool = False) -> Symbol:
+def _line(frame: list, points: ArrayLike, stroke: str, width: float, fill: str = "", closed: bool = False) -> Symbol:
     rows = [[float(f"{x:.7g}") for x in row] for row in np.asarray(points, float)]
     return {"frame": frame, "points": rows, "stroke": stroke, "width": width, "fill": fill, "closed": closed}
 
 
-def _circle(frame: Frame, radius: Sequence[float], fill: str = "", stroke: str = "", width: float = 1.5) -> Symbol:
+def _circle(frame: list, radius: Sequence[float], fill: str = "", stroke: str = "", width: float = 1.5) -> Symbol:
     return {"frame": frame, "radius": [float(r) for r in (*radius, 0.0, 0.0)[:3]], "stroke": stroke, "width": width, "fill": fill}
 
 
@@ -51,7 +50,7 @@ def _round(angles: ArrayLike) -> np.ndarray:
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _at(mark: Mark, angle: float = 0.0, turns: bool = True) -> Frame:
+def _at(mark: Mark, angle: float = 0.0, turns: bool = True) -> list:
     return [mark["body"], *mark["at"], angle, int(turns)]
 
 
@@ -63,7 +62,7 @@ def _tint(body: int) -> str:
     return f"tint:{body}"
 
 
-def _hatch(frame: Frame, places: ArrayLike, y: float, in_units: bool = False) -> Iterator[Symbol]:
+def _hatch(frame: list, places: ArrayLike, y: float, in_units: bool = False) -> Iterator[Symbol]:
     """Short strokes to the lower left of a line at height y: what does not move."""
     for x in np.asarray(places, float):
         start = [0.0, 0.0, x, y] if in_units else [x, 0.0, 0.0, y]
@@ -202,7 +201,7 @@ def _turn(mark: Mark, radius: float, sign: int) -> Iterator[Symbol]:
     yield _head(frame, flip * (line[-1] + 4 * direction), flip * direction)
 
 
-def _head(frame: Frame, tip: np.ndarray, direction: np.ndarray) -> Symbol:
+def _head(frame: list, tip: np.ndarray, direction: np.ndarray) -> Symbol:
     """Return the head of an arrow."""
     side, back = np.array([-direction[1], direction[0]]), tip - 7.5 * np.cos(0.42) * direction
     corners = [tip, back + 7.5 * np.sin(0.42) * side, back - 7.5 * np.sin(0.42) * side]

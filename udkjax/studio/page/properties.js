@@ -27,7 +27,7 @@ const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", to
 /** The unit of plain numbers of a quantity in a document. */
 function unitOf(document, quantity) {
   const chosen = document.units?.[{speed: "angular_velocity"}[quantity] ?? quantity];
-  if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // a plain number is refused: of what?
+  if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // a plain number is refused, as its unit is ambiguous
   return chosen ?? SI[quantity] ?? "";
 }
 

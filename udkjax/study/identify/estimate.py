@@ -21,7 +21,7 @@ from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.optimizer import Loss, squares, weighted_residuals
 from udkjax.study.identify.outliers import Outlier, outlier_sentences
-from udkjax.study.identify.prediction import Tolerances
+from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
 from udkjax.study.identify.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.uncertainty import Uncertainty
@@ -87,7 +87,7 @@ class Estimate:
     history: tuple[tuple[float, float], ...]
     evaluations: int
     seconds: float
-    tol: Tolerances
+    tol: TolerancePair
     z: Float[np.ndarray, "K"]
     problem: FitProblem
     loss: Loss

@@ -23,8 +23,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, build_problem
 from udkjax.study.identify.parameters import ParametersLike
-from udkjax.study.identify.prediction import MEDIUM_TOL, Tolerances
-from udkjax.study.identify.records import IdentificationError, Key, Noise, Record, Start
+from udkjax.study.identify.prediction import MEDIUM_TOL, TolerancePair
+from udkjax.study.identify.records import ChannelKey, IdentificationError, Noise, Record, Start
 from udkjax.study.identify.uncertainty import SMALLEST_PART
 
 Criterion = Literal["D", "A", "E"]
@@ -86,7 +86,7 @@ def design_experiment(
     mechanism: Mechanism,
     candidates: Sequence[Candidate | Mapping[str, ArrayLike] | Start | State],
     parameters: ParametersLike,
-    channels: Sequence[Key],
+    channels: Sequence[ChannelKey],
     ts: ArrayLike,
     noise: Noise,
     criterion: Criterion = "D",
@@ -179,7 +179,7 @@ def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.nda
     return np.array([names.index(name) for name in wanted])
 
 
-def _information_of_records(problem: FitProblem, tol: Tolerances) -> list[np.ndarray]:
+def _information_of_records(problem: FitProblem, tol: TolerancePair) -> list[np.ndarray]:
     """Return for each record rows J (., P) whose J^T J is its information; none for one that cannot be computed."""
     P = len(problem.unknowns.names)
     J = problem.evaluate(np.zeros((1, problem.K)), tol).J[0, : len(problem.index)]

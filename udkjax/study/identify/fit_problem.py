@@ -25,7 +25,7 @@ from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
 from udkjax.study.identify.parameters import ParametersLike, unknowns_of
-from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, Tolerances
+from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, TolerancePair
 from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
@@ -141,7 +141,7 @@ class FitProblem:
         """Return the members of some runs, with these parameters and unknowns of their initial states."""
         return Members(x, shift, jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+    def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian.
 
         Args:

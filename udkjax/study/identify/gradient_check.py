@@ -27,7 +27,7 @@ from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, 
 from udkjax.study.identify import prediction
 from udkjax.study.identify.fit_problem import FitProblem, Residuals, build_problem
 from udkjax.study.identify.parameters import ParametersLike
-from udkjax.study.identify.prediction import TIGHT_TOL, Tolerances
+from udkjax.study.identify.prediction import TIGHT_TOL, TolerancePair
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 
@@ -83,8 +83,8 @@ class GradientCheck:
     derivative_error: Float[np.ndarray, "D S"]
     size: Float[np.ndarray, "D S"]
     places: tuple[tuple[DisagreementPlace, ...], ...]
-    tol: Tolerances
-    other_tol: Tolerances
+    tol: TolerancePair
+    other_tol: TolerancePair
 
     @property
     def ok(self) -> bool:
@@ -177,7 +177,7 @@ def check_gradients(
     return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed)
 
 
-def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, seed: int = 0) -> GradientCheck:
+def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, seed: int = 0) -> GradientCheck:
     """Compare the derivatives of a problem at z with differences, at tolerances of the integration."""
     rows, names = len(problem.index), problem.all_names[: problem.K - problem.constrained]
     _, residuals = _evaluate_first(problem, z, [tol])
@@ -216,7 +216,7 @@ def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Toler
     )
 
 
-def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[Tolerances]) -> tuple[Tolerances, Residuals]:
+def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[TolerancePair]) -> tuple[TolerancePair, Residuals]:
     """Return the first of some tolerances at which runs come to their end, and the residuals with it."""
     for tol in tols:
         found = problem.evaluate(z[None], tol)
@@ -227,7 +227,7 @@ def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[Tolerance
     raise IdentificationError([f"there are no derivatives to be checked: {cause}"])
 
 
-def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B R"]:
+def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B R"]:
     """Return the predictions of channels, in their units; nan where a run does not come to its end."""
     rows = len(problem.index)
     # Few at a time, so that they are computed one by one: lanes would have to be compiled.

@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, Fit, History
+from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit
 from udkjax.study.identify.optimizer import Minimizer, huber, robust
-from udkjax.study.identify.prediction import Tolerances
+from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.noise import noise_of_differences
 
 GUESS_SPREAD = 1.0  # of an unknown: how far it is taken to be from its guess; a positive one by a factor of e
@@ -54,11 +54,11 @@ class HeldProblem:
     guess: Float[np.ndarray, "K"]
     noise: Float[np.ndarray, "R"]
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+    def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian: see `Problem.evaluate`. Single wrong numbers count less."""
         return robust(self.plain(z, tol, horizon), partial(huber, c=HUBER_LIMIT), len(self.noise))
 
-    def plain(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+    def plain(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
         """Compute the same with all numbers counted alike."""
         found = self.problem.evaluate(z, tol, horizon)
         scale = np.concatenate([1.0 / self.noise, np.ones(found.r.shape[1] - len(self.noise))])
@@ -71,7 +71,7 @@ class HeldProblem:
 
 
 def fit_growing_records(
-    problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, minimizer: Minimizer, known: Known | None = None
+    problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, minimizer: Minimizer, known: Known | None = None
 ) -> Fit:
     """Fit longer and longer parts of the records from a guess, and then the whole records.
 
@@ -79,7 +79,7 @@ def fit_growing_records(
     """
     noise = noise_of_records(problem) / problem.sigma
     held = HeldProblem(problem, z, noise)
-    history: History = []
+    history: CostHistory = []
     times, whole = _times(problem), problem.duration
     first = float(np.sort(times)[min(int(RESIDUALS_PER_UNKNOWN * problem.K), len(times) - 1)])
     at, begun, fitted, size, ahead = z, z, 0.0, np.inf, 0.0
@@ -123,7 +123,7 @@ def noise_of_records(problem: FitProblem) -> Float[np.ndarray, "R"]:
     return found
 
 
-def _predictable_time(held: HeldProblem, z: np.ndarray, tol: Tolerances, fitted: float, size: float) -> float:
+def _predictable_time(held: HeldProblem, z: np.ndarray, tol: TolerancePair, fitted: float, size: float) -> float:
     """Return the time since the beginnings of the records up to which they are predicted by a fit of their parts up to another.
 
     `size` is the root mean square of its residuals.

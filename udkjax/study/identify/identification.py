@@ -14,11 +14,11 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, Residuals, Strategy, build_problem
-from udkjax.study.identify.least_squares import Fit, History
+from udkjax.study.identify.least_squares import CostHistory, Fit
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
 from udkjax.study.identify.parameters import ParametersLike
-from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Tolerances
+from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, TolerancePair
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
@@ -129,7 +129,7 @@ def _require_finite(problem: FitProblem, found: SearchResult) -> None:
 # --- the end of a fit
 
 
-def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[Fit, History]:
+def _refit(found: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tuple[Fit, CostHistory]:
     """Fit to the end, each channel weighted by the noise that it has turned out to have."""
     problem = found.problem
     fit = minimizer.minimize(problem, found.fit.z, tol)
@@ -144,7 +144,7 @@ def _refit(found: SearchResult, tol: Tolerances, minimizer: Minimizer) -> tuple[
     return fit, history
 
 
-def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, loss: Loss, least: float = 0.0) -> bool:
+def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, loss: Loss, least: float = 0.0) -> bool:
     """Take what a fit leaves of each channel as its noise, where that is not known, and `least` of what the channel shows.
 
     Returns:
@@ -166,7 +166,7 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, los
     return bool(ratio.max() > SAME_WEIGHT_RATIO * ratio.min()) or loss is not squares or bool(len(problem.priors))
 
 
-def _estimate_of(fit: Fit, found: SearchResult, history: History, tol: Tolerances, loss: Loss, seconds: float) -> Estimate:
+def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: TolerancePair, loss: Loss, seconds: float) -> Estimate:
     """Return the estimate of a fit."""
     problem = found.problem
     unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z

@@ -30,8 +30,8 @@ MOST_REFUSED_STEPS = 8  # steps one after another, before a fit is given up
 ROUNDING = 4 * float(np.finfo(float).eps)  # of the unknowns: shorter steps change nothing
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
-Report: TypeAlias = Callable[[str], None]  # is called with a text after each step
-History: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an unknown by the next step: after each step
+ReportStep: TypeAlias = Callable[[str], None]  # is called with a text after each step
+CostHistory: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an unknown by the next step: after each step
 
 
 class Fit(NamedTuple):
@@ -40,7 +40,7 @@ class Fit(NamedTuple):
     z: Float[np.ndarray, "K"]
     cost: float
     settled: bool
-    history: History
+    history: CostHistory
 
 
 def minimize_squares(
@@ -48,7 +48,7 @@ def minimize_squares(
     z: Float[np.ndarray, "K"],
     steps: int = STEPS,
     settled: float = EXACT_STEP,
-    report: Report = lambda text: None,
+    report: ReportStep = lambda text: None,
 ) -> Fit:
     """Minimize r.r / 2 from a first guess. A fit has settled where its Gauss-Newton step is below `settled` (dimensionless)."""
     from scipy.optimize import least_squares
@@ -64,7 +64,7 @@ def minimize_squares(
 class Descent:
     """One fit, whose best point is `end`; StopIteration ends it."""
 
-    def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], settled: float, report: Report):
+    def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], settled: float, report: ReportStep):
         self.evaluate, self.guess, self.settled, self.report = evaluate, guess, settled, report
         self.end, self.size = Fit(guess, np.inf, False, []), np.inf
 

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
 from udkjax.equations.scales import concrete_scales
@@ -25,7 +26,6 @@ from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, eche
 from udkjax.positions.assembly import close, require_closed
 from udkjax.programs.deferred import deferred
 from udkjax.scene.checks import SceneError, quote
-from udkjax.scene.fields import Numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.wording import join_names, ratio
 from udkjax.study.identify.records import IdentificationError

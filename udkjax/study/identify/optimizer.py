@@ -13,8 +13,17 @@ from jaxtyping import Array, Float
 
 from udkjax.extras import OptionalImport
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
-from udkjax.study.identify.least_squares import EXACT_STEP, FINE_STEP, STEPS, Descent, Fit, Objective, Report, minimize_squares
-from udkjax.study.identify.prediction import Tolerances
+from udkjax.study.identify.least_squares import (
+    EXACT_STEP,
+    FINE_STEP,
+    STEPS,
+    Descent,
+    Fit,
+    Objective,
+    ReportStep,
+    minimize_squares,
+)
+from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.records import IdentificationError
 
 if TYPE_CHECKING:  # imported where a fit begins: it takes a second
@@ -111,12 +120,12 @@ ROBUST = {"huber": huber, "soft_l1": soft_l1}
 class Evaluated(Protocol):
     """An object that has residuals and a Jacobian: a `FitProblem`, or what is made of one."""
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: Tolerances, horizon: float | None = None) -> Residuals:
+    def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian: see `Problem.evaluate`."""
         ...
 
 
-def weighted_residuals(problem: Evaluated, tol: Tolerances, loss: Loss, horizon: float | None = None) -> Objective:
+def weighted_residuals(problem: Evaluated, tol: TolerancePair, loss: Loss, horizon: float | None = None) -> Objective:
     """Return the residuals whose squares are minimized, of the first `horizon` seconds of each record (None: all of it)."""
     return lambda z: loss(problem.evaluate(z, tol, horizon))
 
@@ -127,13 +136,13 @@ class Minimizer:
 
     method: GradientMethod | None = None
     loss: Loss = squares
-    report: Report = lambda text: None
+    report: ReportStep = lambda text: None
 
     def minimize(
         self,
         problem: Evaluated,
         z: Float[np.ndarray, "K"],
-        tol: Tolerances,
+        tol: TolerancePair,
         horizon: float | None = None,
         steps: int = STEPS,
         settled: float = EXACT_STEP,
@@ -155,7 +164,7 @@ def minimize_by_gradient(
     z: Float[np.ndarray, "K"],
     steps: int = GRADIENT_STEPS,
     settled: float = FINE_STEP,
-    report: Report = lambda text: None,
+    report: ReportStep = lambda text: None,
 ) -> Fit:
     """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from a first guess.
 

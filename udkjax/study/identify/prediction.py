@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from udkjax.annotations import NumericArray
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State, close
 from udkjax.positions.channels import Channel, Quantity
@@ -30,8 +31,7 @@ TIGHT_TOL, MEDIUM_TOL, LOOSE_TOL = 1e-11, 1e-9, 1e-7
 FEWEST_IN_LANES = 1024  # members that are computed together in vector lanes; fewer one by one, which needs no second compilation
 CACHE_SIZE, CACHE_BYTES = 6, 2**24  # predictions stored, since a fit goes back to its best one, and the largest of them
 
-Numbers: TypeAlias = np.ndarray | Array
-Tolerances: TypeAlias = tuple[float, float]  # relative and absolute
+TolerancePair: TypeAlias = tuple[float, float]  # relative and absolute
 
 
 class Runs(NamedTuple):
@@ -47,8 +47,8 @@ class Runs(NamedTuple):
 class Members(NamedTuple):
     """The numbers of M members, by which a compiled prediction varies: parameters, and the run of each."""
 
-    x: Numbers  # (M, P) parameters
-    shift: Numbers  # (M, S) unknowns of the initial state
+    x: NumericArray  # (M, P) parameters
+    shift: NumericArray  # (M, S) unknowns of the initial state
     runs: Runs
 
 
@@ -81,7 +81,7 @@ class Predictor:
         self._arrays, static = eqx.partition((mechanism, dict(settings)), eqx.is_array)
         self._run = _MemberRun(static, targets, channels, ends)
 
-    def __call__(self, members: Members, tol: Tolerances) -> Prediction:
+    def __call__(self, members: Members, tol: TolerancePair) -> Prediction:
         """Predict members, integrated with these tolerances."""
         size = len(members.x)
         key = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves((members, tol)))
@@ -159,8 +159,8 @@ def _guess(run: _MemberRun, arrays: PyTree, member: Members) -> State:
     return run.place(arrays, member)[1]
 
 
-def _with_state(mechanism: Mechanism, q: Numbers, v: Numbers) -> Mechanism:
-    values: dict[str, Numbers] = {}
+def _with_state(mechanism: Mechanism, q: NumericArray, v: NumericArray) -> Mechanism:
+    values: dict[str, NumericArray] = {}
     for k, body in enumerate(mechanism.body_names):
         values |= {f"body.{body}.position": q[k, :2], f"body.{body}.angle": q[k, 2]}
         values |= {f"body.{body}.velocity": v[k, :2], f"body.{body}.angular_velocity": v[k, 2]}

@@ -12,7 +12,7 @@ from udkjax.positions.channels import Channel, Quantity, channel_of
 from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import conversion_factor
-from udkjax.study.identify.records import ByChannel, IdentificationError, Key, Noise, Record, key_of
+from udkjax.study.identify.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
 from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
@@ -49,7 +49,7 @@ def records_of(
     if not found and not reader.problems:
         reader.problems.append("data: there are no records")
     measured = {channel for record in found for channel in record.values}
-    given: dict[Key, ArrayLike | None] = dict.fromkeys(measured)
+    given: dict[ChannelKey, ArrayLike | None] = dict.fromkeys(measured)
     if isinstance(noise, Mapping):
         given = reader.by_channel(noise, "noise")
     elif noise is not None:
@@ -90,9 +90,9 @@ class _TableReader:
             if len(self.problems) == before:
                 yield from self.record(label, places, times, values, noise)
 
-    def channels(self, headings: Sequence[str]) -> tuple[dict[Key, np.ndarray], dict[Key, np.ndarray]]:
+    def channels(self, headings: Sequence[str]) -> tuple[dict[ChannelKey, np.ndarray], dict[ChannelKey, np.ndarray]]:
         """Return the values of each channel, and the standard deviations where they have a column."""
-        found: dict[Key, tuple[str, str]] = {}  # headings and units
+        found: dict[ChannelKey, tuple[str, str]] = {}  # headings and units
         for heading in headings:
             of = heading.removesuffix(NOISE)
             if of != heading:
@@ -147,7 +147,12 @@ class _TableReader:
         self.add_each(time, present[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
 
     def record(
-        self, label: str, places: np.ndarray, times: np.ndarray, values: dict[Key, np.ndarray], noise: dict[Key, np.ndarray]
+        self,
+        label: str,
+        places: np.ndarray,
+        times: np.ndarray,
+        values: dict[ChannelKey, np.ndarray],
+        noise: dict[ChannelKey, np.ndarray],
     ) -> Iterator[Record]:
         """Make a record of some rows, of those channels that were measured in it."""
         measured = [name for name, x in values.items() if not np.isnan(x[places]).all()]
@@ -217,14 +222,14 @@ class _DataReader:
             for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
-    def channel(self, given: Key) -> Channel | Quantity:
+    def channel(self, given: ChannelKey) -> Channel | Quantity:
         """Return the channel of a name, or the user's own. Raises ValueError."""
         own = given if isinstance(given, Quantity) else self.quantities.get(str(given))
         return channel_of(self.mechanism, str(given)) if own is None else own
 
-    def by_channel(self, given: ByChannel[T], place: str) -> dict[Key, T]:
+    def by_channel(self, given: ByChannel[T], place: str) -> dict[ChannelKey, T]:
         """Return the same values under the usual names of the channels; those of the user go by themselves."""
-        found: dict[Key, T] = {}
+        found: dict[ChannelKey, T] = {}
         for text, value in given.items():
             try:
                 key = key_of(self.channel(text))
@@ -245,7 +250,7 @@ class _DataReader:
         noise = dict(zip(values, record.noise.values(), strict=True))
         return record.changed(values=values, noise=noise)
 
-    def with_noise(self, record: Record, given: dict[Key, ArrayLike | None]) -> Record:
+    def with_noise(self, record: Record, given: dict[ChannelKey, ArrayLike | None]) -> Record:
         """Return the record with the `given` standard deviation for those channels that have none of their own."""
         if all(own is not None or given.get(channel) is None for channel, own in record.noise.items()):
             return record

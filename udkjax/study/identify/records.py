@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
 Estimated = Literal["nothing", "position", "velocity", "both"]
-Key: TypeAlias = str | Quantity  # the name of a channel, or a quantity of the user's own
+ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a quantity of the user's own
 T = TypeVar("T")
-ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[Key, T]
+ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[ChannelKey, T]
 Noise = TypeAliasType(
     "Noise", ByChannel[ArrayLike] | ByChannel[ArrayLike | None] | float | None
 )  # standard deviations, or one for all
@@ -93,7 +93,7 @@ class Record:
         self.name = name
         self.times: Float[np.ndarray, "T"] = _numbers("time", times, None, problems)
         self._check_times(t0, problems)
-        self.values: dict[Key, np.ndarray] = {
+        self.values: dict[ChannelKey, np.ndarray] = {
             key_of(c): _numbers(str(c), v, self.times.shape, problems) for c, v in values.items()
         }
         self.t0 = float(self.times[0]) if t0 is None and self.times.size else float(t0 or 0.0)
@@ -136,9 +136,9 @@ class Record:
         elif t0 is not None and not t0 <= self.times[0]:
             problems.append(f"t0: the motion begins at {t0} s, after the first time measured, {self.times[0]} s")
 
-    def _noise(self, given: Noise, problems: list[str]) -> dict[Key, Float[np.ndarray, "T"] | None]:
+    def _noise(self, given: Noise, problems: list[str]) -> dict[ChannelKey, Float[np.ndarray, "T"] | None]:
         by_channel = {key_of(c): s for c, s in given.items()} if isinstance(given, Mapping) else dict.fromkeys(self.values, given)
-        found: dict[Key, np.ndarray | None] = dict.fromkeys(self.values)
+        found: dict[ChannelKey, np.ndarray | None] = dict.fromkeys(self.values)
         for channel, sigma in by_channel.items():
             if channel not in self.values:
                 problems.append(f"noise: {quote(str(channel))} is not among the channels")
@@ -172,7 +172,7 @@ def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "len
     return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
 
 
-def tabulate(records: Sequence[Record], keys: Sequence[Key]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Arrange records in tables of one length: times (records, T), values and their noise (records, T, C), nan where unknown."""
     times = [output_times(record) for record in records]
     length = max(2, *(len(ts) for ts, _ in times))
@@ -214,7 +214,7 @@ def dataset_of_fit(
     return xarray.Dataset(data, {"record": labels(records), "time": (along[:2], time, {"units": "s"}), "channel": list(channels)})
 
 
-def key_of(channel: Key | Channel) -> Key:
+def key_of(channel: ChannelKey | Channel) -> ChannelKey:
     """Return the key of a channel in a record: its name, or the user's own quantity."""
     return channel if isinstance(channel, Quantity) else str(getattr(channel, "name", channel))
 

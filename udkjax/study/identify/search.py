@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Strategy
 from udkjax.study.identify.growing_records import Known, fit_growing_records
-from udkjax.study.identify.least_squares import LOOSE_STEP, SOME_STEPS, Fit, History
+from udkjax.study.identify.least_squares import LOOSE_STEP, SOME_STEPS, CostHistory, Fit
 from udkjax.study.identify.optimizer import Minimizer
-from udkjax.study.identify.prediction import LOOSE_TOL, MEDIUM_TOL, Tolerances
+from udkjax.study.identify.prediction import LOOSE_TOL, MEDIUM_TOL, TolerancePair
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
 from udkjax.study.identify.unknowns import sample_guesses
 
@@ -40,14 +40,14 @@ class SearchResult(NamedTuple):
     agreeing: int
     guesses: int
     ways: tuple[str, ...]
-    history: History
+    history: CostHistory
     problem: FitProblem  # the problem of these unknowns
 
 
 def search(
     problem: FitProblem,
     z: Float[np.ndarray, "B K"],
-    tol: Tolerances,
+    tol: TolerancePair,
     minimizer: Minimizer,
     more: int = N_STARTS,
     seed: int = 0,
@@ -118,7 +118,7 @@ def _shows_most(problem: FitProblem, fit: Fit) -> bool:
 
 
 def fit_in_pieces(
-    problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances, minimizer: Minimizer, most: int = MOST_GUESSES_IN_PIECES
+    problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair, minimizer: Minimizer, most: int = MOST_GUESSES_IN_PIECES
 ) -> SearchResult | None:
     """Fit the records in pieces, from the `most` promising guesses until one explains them; None: none does.
 
@@ -140,7 +140,7 @@ def fit_in_pieces(
     return None
 
 
-def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances) -> bool:
+def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair) -> bool:
     """Return whether derivatives grow along a record faster than where motions only fall out of step: like t or t^2."""
     record, time, _ = problem.index.T
     late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
@@ -149,7 +149,7 @@ def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances) 
         return bool((J[late].max(0, initial=0.0) / J[~late].max(0, initial=0.0) > CHAOTIC_GROWTH).any())
 
 
-def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: Tolerances) -> Float[np.ndarray, "B K"]:
+def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B K"]:
     """Return guesses, the best first: those that leave least of the records and of their first parts, which all count alike."""
     record, time, _ = problem.index.T
     r, since = problem.evaluate(z, tol).r[:, : len(record)], problem.ts[record, time] - problem.ts[record, 0]
@@ -171,7 +171,7 @@ def horizons(problem: FitProblem) -> list[float]:
     return [*(begin + length * PART_GROWTH ** (k - count) for k in range(count)), problem.duration]
 
 
-def explains(problem: FitProblem, fit: Fit, tol: Tolerances) -> bool:
+def explains(problem: FitProblem, fit: Fit, tol: TolerancePair) -> bool:
     """Return whether a fit leaves nothing but noise."""
     if not (np.isfinite(fit.cost) and fit.settled):
         return False

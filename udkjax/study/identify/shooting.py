@@ -32,7 +32,7 @@ from udkjax.study.identify.least_squares import (
     minimize_squares,
 )
 from udkjax.study.identify.optimizer import Minimizer
-from udkjax.study.identify.prediction import Prediction, Predictor, Runs, Tolerances
+from udkjax.study.identify.prediction import Prediction, Predictor, Runs, TolerancePair
 from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
 
 MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
@@ -64,7 +64,7 @@ class MultipleShooting(FitProblem):
         scale: distance that coordinates move in a piece (S,).
     """
 
-    def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: Tolerances, samples: float = RESIDUALS_PER_UNKNOWN):
+    def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, samples: float = RESIDUALS_PER_UNKNOWN):
         """Cut the records, and find initial states of all pieces along them with the unknowns z of the whole problem."""
         super().__init__(whole.mechanism, whole.unknowns, whole.records, whole.settings)
         self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.settings, ends=True)
@@ -110,7 +110,7 @@ class MultipleShooting(FitProblem):
             self.runs.q[p] += q - found.q
             self.runs.v[p] += v - found.v
 
-    def _guess_along(self, z: np.ndarray, tol: Tolerances) -> tuple[np.ndarray, np.ndarray]:
+    def _guess_along(self, z: np.ndarray, tol: TolerancePair) -> tuple[np.ndarray, np.ndarray]:
         """Find initial states of the pieces one after another, and how far the coordinates move in a piece (S,).
 
         Each begins where the piece before leads to, moved to fit what was measured in its own.
@@ -133,11 +133,11 @@ class MultipleShooting(FitProblem):
         size = np.sqrt(np.mean(np.square(moved), axis=0)) if moved else np.ones(self.S)
         return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
 
-    def _predict_piece(self, p: int, x: np.ndarray, shift: Float[np.ndarray, "B S"], tol: Tolerances) -> Prediction:
+    def _predict_piece(self, p: int, x: np.ndarray, shift: Float[np.ndarray, "B S"], tol: TolerancePair) -> Prediction:
         """Predict a piece with parameters x, from B initial states."""
         return self.predictor(self.members_of(np.full(len(shift), p), np.tile(x, (len(shift), 1)), shift), tol)
 
-    def _residuals_of_piece(self, p: int, x: np.ndarray, tol: Tolerances) -> Objective:
+    def _residuals_of_piece(self, p: int, x: np.ndarray, tol: TolerancePair) -> Objective:
         """Return residuals of a piece as a function of its initial state, held near to where the piece before leads to."""
         rows, S, damping = np.flatnonzero(self.run == p), self.S, None
         at, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.y[self.present][rows]
@@ -172,7 +172,7 @@ class MultipleShooting(FitProblem):
         """The weight of defects over the scale of coordinates, where residuals are in standard deviations."""
         return float(self.weight / np.median(self.sigma / self.channel_scale[self.index[:, 2]]))
 
-    def gaps(self, z: np.ndarray, tol: Tolerances) -> np.ndarray:
+    def gaps(self, z: np.ndarray, tol: TolerancePair) -> np.ndarray:
         """Return the largest defect (B,), over how far coordinates move in a piece."""
         r = self.evaluate(z, tol).r[:, len(self.index) + self.whole.extra_rows :]
         return np.abs(r).max(1, initial=0.0) / self._defect_weight
@@ -185,7 +185,7 @@ class PieceFailed(Exception):
 def fit_pieces(
     problem: FitProblem,
     z: Float[np.ndarray, "K"],
-    tol: Tolerances,
+    tol: TolerancePair,
     minimizer: Minimizer,
     samples: float = RESIDUALS_PER_UNKNOWN,
 ) -> tuple[MultipleShooting, Fit]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from udkjax.study.members import concurrent_chunks
 from udkjax.study.sweep.dataset import bytes_per_member
-from udkjax.study.sweep.executors import Done, Engine, run
+from udkjax.study.sweep.executors import Done, Executor, run
 from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 
@@ -30,7 +30,7 @@ TOLERANCE_POWER = 1 / 16
 
 def compute_members(
     plan: SweepPlan,
-    engine: Engine,
+    engine: Executor,
     done: Int[np.ndarray, "n"] | Sequence[int] = (),
     memory: int = MEMORY,
     expect: Callable[[Sequence[Chunk]], None] = lambda chunks: None,

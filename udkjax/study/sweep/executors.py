@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import distributed
 
 Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long that took (s)
-Engine: TypeAlias = Callable[[SweepPlan, Sequence[Chunk]], Generator[Done, None, None]]  # hands over chunks as they are done
+Executor: TypeAlias = Callable[[SweepPlan, Sequence[Chunk]], Generator[Done, None, None]]  # hands over chunks as they are done
 
 CHUNK_RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
 TASKS_AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
@@ -79,7 +79,7 @@ class ClusterError(RuntimeError):
     """A cluster cannot do a sweep."""
 
 
-def dask_engine(client: "distributed.Client | None" = None) -> Engine:
+def dask_engine(client: "distributed.Client | None" = None) -> Executor:
     """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
 
     Workers may come and go: another one computes what a lost one had not delivered. Each result is handed over when it

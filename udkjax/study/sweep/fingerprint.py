@@ -19,13 +19,13 @@ from udkjax.study.sweep.axes import AxisColumn
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import SweepPlan
 
-Json: TypeAlias = "str | int | float | bool | Sequence[Json] | Mapping[str, Json] | None"
+JsonValue: TypeAlias = "str | int | float | bool | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
 MOST_LINES = 24  # on differences; more are counted
 MOST_NUMBERS = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
 
-def fingerprint(plan: SweepPlan) -> dict[str, Json]:
+def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
     """Return everything that two plans of the same results have in common."""
     return {
         **_mechanism(plan.mechanism),
@@ -39,15 +39,15 @@ def fingerprint(plan: SweepPlan) -> dict[str, Json]:
     }
 
 
-def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, Json]:
-    of: Json = None if callable(column.of) else column.of
+def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, JsonValue]:
+    of: JsonValue = None if callable(column.of) else column.of
     if callable(column.of):
         of = _function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
     return {"of": of, "values": [_value(value) for value in column.values] if column.is_choice else _value(column.values)}
 
 
-def _measure(plan: SweepPlan, measure: Measure) -> dict[str, Json]:
-    found: dict[str, Json] = {"variables": list(measure.labels)}
+def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
+    found: dict[str, JsonValue] = {"variables": list(measure.labels)}
     if measure.function is not None:
         found["function"] = _function(measure.function, plan.mechanism, _solution(plan))
     if callable(measure.reference):
@@ -65,7 +65,7 @@ def _solution(plan: SweepPlan) -> Solution:
     return Solution(plan.ts, states, states, count, number, stats, number, number, plan.mechanism.body_names, ())  # pyright: ignore[reportArgumentType]
 
 
-def _function(function: Callable, *arguments: PyTree) -> dict[str, Json]:
+def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
     """Describe a function by what it computes: its name, and digests of its operations and of the numbers in them."""
     program = eqx.filter_make_jaxpr(function)(*arguments)[0]
     text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
@@ -74,12 +74,12 @@ def _function(function: Callable, *arguments: PyTree) -> dict[str, Json]:
     return {"name": name, "operations": digest(text.encode()), "constants": digest(constants)}
 
 
-def _mechanism(mechanism: Mechanism) -> dict[str, Json]:
+def _mechanism(mechanism: Mechanism) -> dict[str, JsonValue]:
     numbers = {name: _value(x) for name, x in mechanism.parameters().items()}
     return {"scene": scene_text(mechanism), "parameters": numbers}
 
 
-def _value(value: PyTree) -> Json:
+def _value(value: PyTree) -> JsonValue:
     """Describe a number, an array, a choice or a mechanism."""
     if value is None or isinstance(value, str | bool | int):
         return value
@@ -113,7 +113,7 @@ def digest(content: bytes) -> str:
 # --- differences
 
 
-def differences(before: Json, now: Json) -> list[str]:
+def differences(before: JsonValue, now: JsonValue) -> list[str]:
     """Return lines on what differs between two JSON values: the path, what was there, what is there now.
 
     Of texts of several lines, such as scenes, the lines that differ are shown.
@@ -133,7 +133,7 @@ def differences(before: Json, now: Json) -> list[str]:
     return found if len(found) <= MOST_LINES else [*found[:MOST_LINES], f"and {len(found) - MOST_LINES} more"]
 
 
-def _leaves(value: Json, path: str = "") -> Iterator[tuple[str, Json]]:
+def _leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
     """Iterate over the paths and values of what is neither a list nor a mapping in a JSON value, nor an empty one."""
     if isinstance(value, dict) and value:
         for key, part in value.items():

@@ -2,13 +2,14 @@
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy import stats
 
+from udkjax.annotations import TomlTable
 from udkjax.extras import OptionalImport
 from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion, unknown_key
 from udkjax.scene.mechanism_tables import parse_toml
@@ -17,7 +18,6 @@ from udkjax.study.choices import CHOICES, Choice, choice
 from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped
 
 Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"
-Table: TypeAlias = Mapping[str, Toml]
 TOP = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")
 SETTINGS = ("rtol", "atol", *CHOICES, "max_steps", "drift_tol", "dt0")
 DESIGNS = {"sobol": Sobol, "latin-hypercube": LatinHypercube, "random": Random}
@@ -59,7 +59,7 @@ class _GridReader:
         self.drawn, self.folder = drawn, folder
         self.problems: list[str] = []
 
-    def sweep(self, given: Table) -> dict[str, Any]:
+    def sweep(self, given: TomlTable) -> dict[str, Any]:
         self.check_keys("", given, TOP)
         axes = self.table("axes", given.get("axes", {}))
         if given.get("axes", {}) == {}:
@@ -91,7 +91,7 @@ class _GridReader:
         except (OSError, KeyError, ValueError) as error:
             return self.wrong("reference", f"{self.folder / given} has no coordinates q of a simulation ({error})")
 
-    def times(self, given: Table) -> np.ndarray | None:
+    def times(self, given: TomlTable) -> np.ndarray | None:
         """Read output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
         if "ts" in given:
             for key in ("t0", "t1", "dt"):
@@ -145,7 +145,7 @@ class _GridReader:
             return [] if numbers is None else numbers
         return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
 
-    def range(self, place: str, given: Table) -> Values:
+    def range(self, place: str, given: TomlTable) -> Values:
         """Read a range: for a design its two ends, else the `num` numbers between them."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
         self.check_keys(place, given, (*needed, "scale"))
@@ -165,7 +165,7 @@ class _GridReader:
             return (low, high) if scale == "linear" else cast(Distribution, stats.loguniform(low, high))
         return ()
 
-    def distribution(self, place: str, given: Table) -> Values:
+    def distribution(self, place: str, given: TomlTable) -> Values:
         """Read a distribution of scipy.stats by its name and its numbers."""
         name, numbers = given["distribution"], {key: value for key, value in given.items() if key != "distribution"}
         known = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
@@ -196,7 +196,7 @@ class _GridReader:
             return InitialAngle(self.names(f"{place}.angle", given["angle"]))
         return Scaled({name: self.number(f"{place}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
 
-    def settings(self, given: Table) -> dict[str, Any]:
+    def settings(self, given: TomlTable) -> dict[str, Any]:
         self.check_keys("settings", given, SETTINGS)
         found: dict[str, Any] = {}
         for name, value in given.items():
@@ -209,7 +209,7 @@ class _GridReader:
                 found[name] = self.number(place, value)
         return found
 
-    def design(self, given: Table) -> SweepDesign | None:
+    def design(self, given: TomlTable) -> SweepDesign | None:
         self.check_keys("design", given, ("type", "members", "seed"))
         kind = given.get("type")
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
@@ -224,7 +224,7 @@ class _GridReader:
         """Note a mistake."""
         self.problems.append(f"{place}: {problem}")
 
-    def check_keys(self, place: str, given: Table, expected: Iterable[str]) -> None:
+    def check_keys(self, place: str, given: TomlTable, expected: Iterable[str]) -> None:
         """Note the keys of a table that are not expected."""
         expected = tuple(expected)
         for key in given:
@@ -239,7 +239,7 @@ class _GridReader:
             self.wrong(place, str(error))
             return None
 
-    def table(self, place: str, given: Toml) -> Table:
+    def table(self, place: str, given: Toml) -> TomlTable:
         """Read a table."""
         if isinstance(given, dict):
             return given

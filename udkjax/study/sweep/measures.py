@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
-from udkjax.annotations import Numbers, Scalar
+from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations.quantities import energy, violation
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
@@ -22,7 +22,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
 from udkjax.study.sweep.dimensions import SweepError
 
-UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, Scalar]])
+UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, NumberLike]])
 OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)
 MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure] | Mapping[str, OneMeasure])
 # Coordinates (T, bodies, 3) that runs are compared with, or a function (mechanism, ts) of them.

@@ -17,7 +17,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from udkjax.scene.checks import abbreviate
-from udkjax.study.sweep.fingerprint import Json, differences, digest
+from udkjax.study.sweep.fingerprint import JsonValue, differences, digest
 from udkjax.study.sweep.plan import Chunk
 
 FORMAT = 2  # of what a folder holds: another one is another sweep
@@ -26,7 +26,7 @@ MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
 MEMBERS, STORED_PREFIX = "members", "stored/"  # in a file: whom its numbers belong to, and what goes before the names of these
 ADVICE = "choose another folder, or remove this one to begin anew"
 
-Data = Mapping[str, np.ndarray]
+Variables = Mapping[str, np.ndarray]
 
 
 class StoreError(OSError):
@@ -37,7 +37,7 @@ class MemoryStore:
     """The finished chunks of a sweep, where nothing is to outlive the process."""
 
     def __init__(self):
-        self._done: list[tuple[np.ndarray, Data]] = []
+        self._done: list[tuple[np.ndarray, Variables]] = []
 
     def __enter__(self) -> "MemoryStore":
         return self
@@ -45,11 +45,11 @@ class MemoryStore:
     def __exit__(self, *_: object) -> None:
         return None
 
-    def write(self, chunk: Chunk, data: Data) -> None:
+    def write(self, chunk: Chunk, data: Variables) -> None:
         """Store the results of a chunk: one array for each name, whose first axis is the chunk's members."""
         self._done.append((np.asarray(chunk.members), data))
 
-    def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
+    def read_chunks(self) -> Iterator[tuple[np.ndarray, Variables]]:
         """Iterate over finished chunks: members, and their data."""
         yield from self._done
 
@@ -61,7 +61,7 @@ class FolderStore:
     out. Raises `StoreError`.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, Json]):
+    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, JsonValue]):
         self.folder = Path(folder)
         try:
             (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
@@ -89,14 +89,14 @@ class FolderStore:
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def write(self, chunk: Chunk, data: Data) -> None:
+    def write(self, chunk: Chunk, data: Variables) -> None:
         """Write the results of a chunk, whole or not at all: one array for each name, whose first axis is the chunk's members."""
         stream = io.BytesIO()
         np.savez(stream, allow_pickle=False, **{MEMBERS: chunk.members}, **{STORED_PREFIX + name: x for name, x in data.items()})
         content = stream.getvalue()
         self._write(f"{CHUNKS}/{chunk.index:06d}-{self._sweep}-{digest(content)}.npz", content)
 
-    def read_chunks(self) -> Iterator[tuple[np.ndarray, Data]]:
+    def read_chunks(self) -> Iterator[tuple[np.ndarray, Variables]]:
         """Iterate over finished chunks, one file at a time: members, and their data. Damaged files are removed."""
         for file in self._files():
             try:
@@ -111,7 +111,7 @@ class FolderStore:
                 data = dict(archive)
             yield data.pop(MEMBERS), {name.removeprefix(STORED_PREFIX): values for name, values in data.items()}
 
-    def _begin(self, sweep: dict[str, Json]) -> None:
+    def _begin(self, sweep: dict[str, JsonValue]) -> None:
         """Write the description of the sweep; compare it with one that is there already."""
         for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
             file.unlink(missing_ok=True)  # of a process that was killed while it wrote
@@ -151,7 +151,7 @@ class FolderStore:
             raise StoreError(f"cannot write {name}: {error.strerror or error}; {valid}; {advice}") from error
 
 
-def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Json]) -> MemoryStore | FolderStore:
+def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, JsonValue]) -> MemoryStore | FolderStore:
     """Return the store of finished chunks: the folder `out`, or, without one, memory."""
     return MemoryStore() if out is None else FolderStore(out, fingerprint)
 

@@ -18,8 +18,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import AxisValues, SweepDesign
 from udkjax.study.sweep.chunks import MEMORY, compute_members
 from udkjax.study.sweep.dataset import assemble
-from udkjax.study.sweep.executors import Engine as Compute
-from udkjax.study.sweep.executors import compute_on_devices, dask_engine
+from udkjax.study.sweep.executors import Executor, compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.groups import RESULT
 from udkjax.study.sweep.measures import MeasureChoice, Reference
@@ -102,7 +101,7 @@ def sweep(
         return assemble(plan, store.read_chunks())
 
 
-def _engine(engine: str, client: "distributed.Client | None") -> Compute:
+def _engine(engine: str, client: "distributed.Client | None") -> Executor:
     """Return the engine that computes chunks: a client that is given is there to be used."""
     return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices
 

@@ -26,7 +26,7 @@ FARTHEST = 1e8  # units: beyond, Newton's method has left for infinity
 SURE = 1e-3  # relative: a Newton step, rounding included, beyond which more digits do not help either
 EPS = float(np.finfo(float).eps)
 
-System = Callable[[Ball], tuple[Ball, Ball]]
+BallFunction = Callable[[Ball], tuple[Ball, Ball]]
 
 
 class Certificate(NamedTuple):
@@ -52,7 +52,7 @@ class Certificate(NamedTuple):
         return Ball(self.middle, self.radius)
 
 
-def certify(system: System, u: np.ndarray, exact: System | None = None) -> Certificate:
+def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = None) -> Certificate:
     """Improve approximate solutions and prove that they are some.
 
     Args:
@@ -79,13 +79,13 @@ def certify(system: System, u: np.ndarray, exact: System | None = None) -> Certi
     return found
 
 
-def _evaluate(exact: System, m: np.ndarray) -> Ball:
+def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
     """Return F at points, computed in fractions, and rounded."""
     F = exact(Ball.fractions(m))[0].mid.astype(float)
     return Ball.of(F, EPS * np.abs(F) + SMALLEST)
 
 
-def _prove(system: System, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
+def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
     """Return boxes about points with F there; those that satisfy Krawczyk's condition are proven."""
     proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     step = _product(inverse, F)
@@ -100,7 +100,7 @@ def _prove(system: System, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certi
     return Certificate(m, radius, proven)
 
 
-def _improved(system: System, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _improved(system: BallFunction, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points improved by Newton's method, F in long numbers, and inverses of F' (M, N, N) there."""
     for k in range(NEWTON_STEPS + 1):
         F, slopes = system(Ball.of(m))

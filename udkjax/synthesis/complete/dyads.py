@@ -25,26 +25,26 @@ from udkjax.expressions.complex_scalars import ComplexScalar, solve_complex
 from udkjax.expressions.selection import absolute
 from udkjax.synthesis.complete.balls import LONG, Ball
 
-Numbers = Any  # arrays or balls
+ArrayOrBall = Any  # arrays or balls
 
 
 class Displacements(NamedTuple):
     """Ways of the traced point from its first position (J, 1), and cosines less one and sines of turns, where known."""
 
-    x: Numbers
-    y: Numbers
-    p: Numbers = None
-    s: Numbers = None
+    x: ArrayOrBall
+    y: ArrayOrBall
+    p: ArrayOrBall = None
+    s: ArrayOrBall = None
 
 
 class DyadEquations(NamedTuple):
     """g at all displacements (J, M), and its derivatives by x (two), r (two), p and s, (6, J, M)."""
 
-    g: Numbers
-    slopes: tuple[Numbers, ...]
+    g: ArrayOrBall
+    slopes: tuple[ArrayOrBall, ...]
 
 
-def dyad_equations(x: Numbers, y: Numbers, a: Numbers, b: Numbers, d: Displacements) -> DyadEquations:
+def dyad_equations(x: ArrayOrBall, y: ArrayOrBall, a: ArrayOrBall, b: ArrayOrBall, d: Displacements) -> DyadEquations:
     """Return the equations of a moving joint (x, y) and a crank (a, b)."""
     p, s = d.p, d.s
     ex, ey = d.x + (p * x - s * y), d.y + (s * x + p * y)

@@ -1,7 +1,7 @@
-"""Numbers of a drawn mechanism that were changed by hand: they stay as they are when its drawing changes.
+"""Numbers of a drawn mechanism that were changed directly, not through its drawing: they stay when the drawing changes.
 
-`Mechanism.changed` has a mark for each entry of a number of the elements: one where it was changed, zero where it follows from
-the drawing. Marks are numbers, not structure: mechanisms with and without changes share one program, and may be stacked.
+`Mechanism.changed` has a mark for each entry of each number of the elements: one if it was changed, zero if it follows from the
+drawing. Marks are numbers, not structure: mechanisms with and without changes share one program, and may be stacked.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from udkjax.scene.fields import is_traced, number
 from udkjax.scene.number_fields import (
-    Groups,
+    ElementGroups,
     NumberField,
     Sections,
     groups_of,
@@ -47,12 +47,12 @@ def marks_by_name(mechanism: Marked) -> dict[str, Any]:
     return {name: part.reshape(np.shape(fields[name].value)) for name, part in zip(fields, parts, strict=False)}
 
 
-def mark_changes(mechanism: Marked, groups: Groups, names: Collection[str]) -> Float[Array, "K"]:
-    """Return the marks of new elements of a mechanism, of which the numbers with these names, or entries of them, are set."""
+def mark_changes(mechanism: Marked, groups: ElementGroups, names: Collection[str]) -> Float[Array, "K"]:
+    """Return the marks of new elements of a mechanism, after the named numbers, or entries of numbers, were set."""
     before, found = marks_by_name(mechanism), {}
     for name, field in _present(groups).items():
         mark, shape = before.get(name), np.shape(field.value)
-        found[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # samples in place of a number are set, too
+        found[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # new samples count as set
     for given in names:
         name, index = split_index(given, found)
         if name in found:
@@ -62,8 +62,8 @@ def mark_changes(mechanism: Marked, groups: Groups, names: Collection[str]) -> F
     return number(_joined(list(found.values())))
 
 
-def changed_by_hand(mechanism: Marked, redrawn: Sections) -> dict[str, Any]:
-    """Return the numbers that differ from those of the mechanism that is drawn anew, since they, or entries, were set by hand."""
+def directly_changed(mechanism: Marked, redrawn: Sections) -> dict[str, Any]:
+    """Return the directly changed numbers by name, with their unchanged entries taken from the redrawn mechanism."""
     known, drawn = parameters_of(mechanism), parameters_of(redrawn)
     held = [name for name in held_names(known) if f"{name}.values" not in drawn]
     found = {name: value_of(known, name, groups_of(mechanism)) for name in held}
@@ -78,12 +78,12 @@ def _kept(name: str, mark: Any, value: Any, drawn: Any) -> dict[str, Any]:
         return {name: value}
     if not is_traced(mark) and (mark.all() or not mark.any()):
         return {name: value} if mark.any() else {}
-    xp = jnp if is_traced((mark, value, drawn)) else np  # known numbers stay known
+    xp = jnp if is_traced((mark, value, drawn)) else np  # concrete numbers stay concrete
     return {name: number(xp.where(mark != 0, value, drawn))}
 
 
-def _present(groups: Groups) -> Mapping[str, NumberField]:
-    """Return the numbers that there are in elements, by name."""
+def _present(groups: ElementGroups) -> Mapping[str, NumberField]:
+    """Return the numbers of elements by name, without absent ones."""
     return {name: field for name, field in parameters_in(groups).items() if field.value is not None}
 
 

@@ -1,4 +1,4 @@
-"""Elements as they are given to a mechanism: named, checked, and with the numbers that they leave to its initial guess."""
+"""Name and check the elements given to a mechanism, and complete the numbers that follow from the initial guess."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,17 +9,18 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from udkjax.annotations import Numbers
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, problems_of
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Numbers, Requirement, StaticValue, given_number, is_traced, number
+from udkjax.scene.fields import Requirement, StaticValue, given_number, is_traced, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
 from udkjax.scene.schema import table_of, type_name
 
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
-    """Name each element that has no name TYPE1, TYPE2, ... by its place among those of its type (classes or their names)."""
+    """Return names for elements (or the names of their types): unnamed ones are numbered by type, TYPE1, TYPE2, ..."""
     found, counts = [], {}
     for i, element in enumerate(elements):
         kind = element if isinstance(element, str) else type_name(type(element))
@@ -29,14 +30,14 @@ def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | No
 
 
 def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
-    """Return the names of the bodies whose frames an element gets, in that order, where `joints` are those of its mechanism."""
+    """Return the names of the bodies whose frames an element takes, in order; `joints` are the joints of its mechanism."""
     if isinstance(element, Friction):
         return joints[element.joint].frame_names
     return element.frame_names if isinstance(element, Constraint) else element.bodies
 
 
 def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> dict[str, list[tuple[str, Any]]]:
-    """Return all elements with plain numbers made arrays; raise `SceneError` where anything is wrong with any of them."""
+    """Return all elements with plain numbers converted to arrays; raise a `SceneError` that lists all mistakes."""
     kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
     problems, entries, found = [], [], {section: [] for section in given}
     for section, items in given.items():
@@ -60,7 +61,7 @@ def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> di
 
 
 def _check_hashable(element: eqx.Module) -> Iterator[str]:
-    """Iterate over the mistakes of the static fields of a user-written element."""
+    """Iterate over the mistakes in the static fields of a user-written element."""
     try:
         hash(jax.tree.structure(element))
     except TypeError as error:
@@ -82,14 +83,14 @@ def _as_static(leaf: object) -> object:
 
 
 def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
-    """Return a constraint with the numbers that it leaves to the initial guess, which the bodies hold."""
+    """Return a constraint with its missing numbers taken from the initial guess of the bodies."""
     its_own = type(constraint).complete
     filled = getattr(its_own, "fills", None)
     if its_own is Constraint.complete or (filled and getattr(constraint, filled) is not None):
-        return constraint  # as most are: spares the sines and cosines of every body
+        return constraint  # the usual case, which skips the sines and cosines of the bodies
     places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
     is_concrete = not is_traced((constraint, places))
-    if is_concrete:  # NumPy has nothing to compile
+    if is_concrete:  # NumPy compiles nothing
         constraint, places = jax.tree.map(np.asarray, (constraint, places))
     frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
     eager = jax.ensure_compile_time_eval() if is_concrete else nullcontext()  # while something else is traced
@@ -99,7 +100,7 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
 
 
 def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
-    """Return the mistakes of numbers that constraints took from the initial guess; those that are traced pass."""
+    """Return the mistakes in concrete numbers that constraints took from the initial guess."""
     found = []
     for section, elements in after.items():
         for k, ((name, completed), (_, given)) in enumerate(zip(elements, before[section], strict=True)):
@@ -109,7 +110,7 @@ def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapp
 
 
 def _mistakes_of_guess(where: str, before: eqx.Module, after: eqx.Module) -> Iterator[str]:
-    """Iterate over the mistakes of the numbers that an element left to the initial guess, from what they are there."""
+    """Iterate over the mistakes in the numbers that an element took from the initial guess."""
     for field in dataclasses.fields(after):
         value = getattr(after, field.name)
         if getattr(before, field.name, None) is not None or not isinstance(value, np.ndarray | jax.Array):

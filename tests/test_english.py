@@ -1,0 +1,138 @@
+"""Phrases that no native speaker writes are found by their patterns in docstrings, comments, messages and pages.
+
+`CLEAN` lists the rooms and pages without any. Patterns cannot find all: a sentence that has to be read twice is a defect as well.
+"""
+
+import ast
+import io
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+import udkjax
+
+ROOT = Path(udkjax.__file__).parents[1]
+CLEAN = [  # folders with all below them, or files
+    "udkjax/__init__.py",
+    "udkjax/annotations.py",
+    "udkjax/expressions",
+    "udkjax/extras.py",
+    "udkjax/lazy_names.py",
+    "udkjax/pinv",
+    "udkjax/printing.py",
+    "udkjax/programs",
+    "udkjax/progress.py",
+    "udkjax/scene",
+    "udkjax/transforms",
+]
+
+# Pattern of the beginning of a docstring or a comment: (pattern, an example, a correct sentence).
+BEGINNINGS = [
+    (r"Of\b", "Of a step: nearer to an end than this, ...", "Fraction of a step."),
+    (r"What(ever)?\b", "What a batch comes to.", "Batching rule."),
+    (r"Those?\b", "Those that are done.", "These steps are done."),
+    (r"That\b", "That of the bodies.", "The frame of the bodies."),
+    (r"Whether\b", "Whether it is finite.", "True if it is finite."),
+    (r"How\b", "How many there are.", "Number of bodies."),
+]
+# Pattern of any text: likewise.
+PHRASES = [
+    (r"\bwhat is (no|none|not)\b", "Skip what is not finite.", "See what is new."),
+    (r"\bwhere (it|there|they) (is|are) none\b", "Raise `TypeError` where it is none.", "There are none."),
+    (r"\bthat is none\b", "A name that is none.", "None is given."),
+    (r"\bnone of (which|whom)\b", "all lanes, none of which may be NaN", "None of them is."),
+    (r"\b(of|from|in|by|beside|besides|than|with|before|after) what\b", "a function of what it reads", "See what happens."),
+    (r"\bbehind (one another|each other|it|them|the last)\b", "They lie behind one another.", "the wall behind the house"),
+    (r"\bone behind (another|the other)\b", "one behind another", "one after another"),
+    (r"\b(besides|beside) (those|these|that|this|it|them)\b", "steps besides those asked for", "extra steps"),
+    (r"\bso (many|much) (\w+ )?(as|numbers|entries|times|rows|steps)\b", "So many numbers.", "there were so many that it failed"),
+    (
+        r"\bas many( \w+)? as (it|they|he) (has|have|gives?|takes?)\b",
+        "coordinates as many as he gives",
+        "as many rows as columns",
+    ),
+    (r"\b(is|are|be) told\b", "the engine is told the unit", "it was untold"),
+    (r"\bwhich one,", "a letter says which one, and", "which one is it?"),
+    (r"(?<!there )\b(is|are) no (number|name|batch|program)\b", "where something is no name", "there is no number"),
+    (r"\blikewise\b\.?$", "y: likewise.", "Likewise, rows are scaled."),
+]
+
+
+def texts(source: str) -> tuple[list[str], list[str]]:
+    """The docstrings and comments of a module, and its other texts of several words."""
+    tree = ast.parse(source)
+    owners = [node for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)]
+    docs = [node.body[0].value for node in owners if ast.get_docstring(node)]  # pyright: ignore[reportAttributeAccessIssue]
+    messages = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    comments: list[str] = []
+    blocks: dict[int, str] = {}  # of lines that are comments alone, by the last line
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type != tokenize.COMMENT:
+            continue
+        comment = token.string[1:].strip()
+        if token.line.strip() != token.string:
+            comments.append(comment)
+        else:
+            blocks[token.start[0]] = f"{blocks.pop(token.start[0] - 1, '')} {comment}".strip()
+    return [*(doc.value for doc in docs), *comments, *blocks.values()], [text for text in messages if " " in text.strip()]
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def prose(page: str) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^( *)```.*?^\1```", "", page, flags=re.M | re.S)
+
+
+def findings(begun: list[str], other: list[str]) -> list[str]:
+    """The phrases that patterns find: those of a beginning in the first texts, the others in all."""
+    found = [match[0] for text in begun for pattern, *_ in BEGINNINGS if (match := re.match(pattern, text))]
+    lines = [line for text in (*begun, *other) for line in (*text.splitlines(), one_line(text))]
+    found += [match[0] for line in lines for pattern, *_ in PHRASES if (match := re.search(pattern, line, re.IGNORECASE))]
+    return sorted(set(found))
+
+
+def files(name: str) -> list[Path]:
+    place = ROOT / name
+    return [place] if place.is_file() else sorted(x for x in place.rglob("*") if x.suffix in (".py", ".md"))
+
+
+def problems(file: Path) -> list[str]:
+    text = file.read_text(encoding="utf-8")
+    found = findings(*texts(text)) if file.suffix == ".py" else findings([], prose(text).split("\n\n"))
+    return [f"{file.relative_to(ROOT)}: {phrase}" for phrase in found]
+
+
+@pytest.mark.parametrize("name", CLEAN)
+def test_no_phrase_is_found(name):
+    assert files(name)
+    assert [problem for file in files(name) for problem in problems(file)] == []
+
+
+@pytest.mark.parametrize(("pattern", "wrong", "right"), BEGINNINGS)
+def test_each_beginning_finds_its_example_alone(pattern, wrong, right):
+    assert findings([wrong], []) and re.match(pattern, wrong)
+    assert not findings([right], [])
+
+
+@pytest.mark.parametrize(("pattern", "wrong", "right"), PHRASES)
+def test_each_phrase_finds_its_example_alone(pattern, wrong, right):
+    assert findings([], [wrong]) and re.search(pattern, wrong, re.IGNORECASE)
+    assert not findings([], [right])
+
+
+def test_texts_of_a_module_are_found():
+    source = '"""Module of two."""\nA = 1  # one\n# Two\n# three\nB = f"four five {A}"\n'
+    assert texts(source) == (["Module of two.", "one", "Two three"], ["Module of two.", "four five "])
+
+
+def test_phrases_across_lines_are_found():
+    assert findings(["Of\nall."], ["none\nof which"]) == ["Of", "none of which"]
+
+
+def test_code_on_a_page_is_passed_over():
+    assert prose("a\n```python\nof what\n```\nb") == "a\n\nb"
