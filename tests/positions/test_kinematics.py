@@ -402,7 +402,7 @@ def test_transmission_angle_and_mechanical_advantage():
     )
     advantage = udk.mechanical_advantage(mech, found, "body.rocker.angle")
     np.testing.assert_allclose(advantage, 1 / np.asarray(found.v[:, 2, 2]), rtol=1e-12)
-    with pytest.raises(udk.SceneError, match="pins besides"):
+    with pytest.raises(udk.SceneError, match="other pins"):
         udk.transmission_angle(mech, found, "A")
 
 

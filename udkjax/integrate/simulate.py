@@ -70,7 +70,7 @@ def simulate(
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. The result has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred
     runs and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there; one above 0.01 L
-    or 0.01 rad behind a step that was projected ends a run by machine code.
+    or 0.01 rad after a projected step ends a run by machine code.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
@@ -80,41 +80,42 @@ def simulate(
             tolerances, nor by `dt0`.
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
             their rates by 1/T of that, with L the characteristic length (`analyse`) and T the shortest of the characteristic
-            time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. So the same tolerances
-            mean the same accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
+            time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. The same tolerances
+            thus mean the same accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
         method: the pseudoinverse; by default `Auto()`.
         stabilization: `Projection()`, a `Baumgarte`, or None.
-        solver: any diffrax solver for ordinary differential equations; by default Dopri8, of those measured in benchmarks/ the
-            fastest at equal error, but for the tightest tolerances through singular configurations.
+        solver: any diffrax solver for ordinary differential equations; by default Dopri8, the fastest at equal error in
+            benchmarks/, except for the tightest tolerances through singular configurations.
         adjoint: an adjoint of diffrax; by default derivatives are those of JAX.
-        max_steps: the largest number of steps that are tried.
-        drift_tol: the largest violation of Psi, of L or in rad.
-        dt0: the first step that is tried, in s; by default it is chosen.
+        max_steps: the largest number of steps tried.
+        drift_tol: the largest violation of Psi, relative to L or in rad.
+        dt0: the first step tried (s); by default it is chosen.
         formulation: finds the accelerations in another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`,
             `NullSpaceSVD` or `CoordinatePartitioning`; `method` then serves projection and derivatives.
-        throw: whether a run that does not reach its end raises; where numbers are traced, it never does.
-        progress: True prints how far the run is; a progress meter of diffrax is used as it is.
-        analysis: the mechanism's `Analysis`, by default made here.
+        throw: whether a run that does not reach its end raises; a traced run never does.
+        progress: True prints the progress of the run; a progress meter of diffrax is used as it is.
+        analysis: the mechanism's `Analysis`; by default computed here.
         engine: "native" is machine code made of the scene's expressions, on the CPU: explicit Runge-Kutta methods with
-            elimination, under vmap in lanes that step each on its own. "diffrax" is `diffrax.diffeqsolve`: every solver,
-            adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` says which it
-            was, and why.
+            elimination, under vmap in lanes that step independently. "diffrax" is `diffrax.diffeqsolve`: every solver,
+            adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` names the
+            engine and the reason.
         events: consequences where conditions cross zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
             actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. They are located to rounding, whatever `ts` is, and
-            the run starts anew behind each; contacts that act on one another are hit together. Both engines serve them, and
+            the run restarts after each; contacts that act on one another are hit together. Both engines serve them, and
             batches: each member has its own events. Such runs have first derivatives, forward and reverse, through the times of
             the events (saltation), but none by `ts`.
-        max_events: most events that may happen.
+        max_events: the largest number of events.
 
     Returns:
         A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` tells how the
-        run ended, `Solution.events` the times of events with the states before and after; an output at the very time of an
-        event is the state after it.
+        run ended, `Solution.events` the times of events with the states before and after; an output at the time of an event
+        is the state after it.
 
     Raises:
         SimulationError: the run does not reach its end; it carries the solution.
         AssemblyError: the initial guess cannot be closed.
-        ValueError: an argument cannot be used, or the engine that is asked for cannot run this.
+        ArgumentError: the tolerances are below rounding.
+        ValueError: an argument cannot be used, or the requested engine cannot run this.
 
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.

@@ -8,7 +8,7 @@ the smallest change that removes the linearized residual; s limits the length of
 and is halved until the residual falls: no step makes a state worse. Velocities by v - M^(-1/2) D^+ Psi_dot, which leaves the free
 motion of the guess as it is and satisfies the drivers. D^+ is truncated, so redundant rows do no harm, and its derivative is the
 one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
-They take the characteristic length as fixed: from a guess so far away that steps are limited, it has a share in where they lead.
+They take the characteristic length as fixed, although from a guess so far away that steps are limited it affects the result.
 """
 
 from collections.abc import Iterator, Sequence
@@ -67,11 +67,11 @@ class State(PrintsTable):
 
 
 class AssemblyError(ValueError):
-    """A mechanism cannot be closed, or not moved as its drivers ask. `state` is the best that was found.
+    """A mechanism cannot be closed, or its drivers ask for an impossible motion.
 
     Attributes:
         message: the joints that stay open.
-        state: the best `State` that was found.
+        state: the best `State` found.
     """
 
     def __init__(self, message: str, state: State):
@@ -80,7 +80,7 @@ class AssemblyError(ValueError):
 
 
 class Closure(NamedTuple):
-    """An assembled state, what is left of Psi (m, rad) and Psi_dot (m/s, rad/s), row by row, and the rank of D there."""
+    """An assembled state, its residuals Psi (m, rad) and Psi_dot (m/s, rad/s) by row, and the rank of D."""
 
     state: State
     psi: Float[Array, "m"]
@@ -94,12 +94,24 @@ class Closure(NamedTuple):
 def assemble(
     mechanism: Mechanism, t: NumberLike = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
 ) -> State:
-    """Close a mechanism at time t (s), from `state` or from the initial guess of its bodies.
+    """Return a state with Psi(t, q) = 0 and Psi_dot(t, q, v) = 0, near a given one.
 
-    A state that satisfies all constraints is returned as it is, up to rounding. Differentiable to second order with respect to
-    every number of the mechanism and the guess, also where constraints are redundant. `analysis` is that of `udkjax.analyse`, by
-    default made here. Raises `AssemblyError`, which names the joints that stay open; with `throw=False`, or when numbers are
-    traced, the best state found is returned instead.
+    A state that satisfies all constraints is returned unchanged, up to rounding. Differentiable to second order with respect to
+    every number of the mechanism and the guess, also where constraints are redundant.
+
+    Args:
+        mechanism: the mechanism.
+        t: time (s).
+        state: the state to start from; by default the initial guess of the bodies.
+        throw: whether a mechanism that cannot be closed raises; with False, or where numbers are traced, the best state found is
+            returned instead.
+        analysis: the mechanism's `Analysis`; by default computed here.
+
+    Returns:
+        A `State`: q and v (bodies, 3): x, y in m and angle in rad, and their rates.
+
+    Raises:
+        AssemblyError: joints stay open; it names them and carries the best state found.
     """
     closure = close(mechanism, t, state, analysis=analysis)
     if throw:
@@ -113,23 +125,23 @@ def close(
     state: State | None = None,
     analysis: Analysis | None = None,
 ) -> Closure:
-    """Close a mechanism as `assemble` does, and return the residuals with the state, in place of an error.
+    """Close a mechanism as `assemble` does, and return the residuals with the state instead of raising.
 
-    Where all numbers are known the closure is, too, also while something else is traced.
+    Concrete numbers give a concrete closure, also while something else is traced.
     """
     if not mechanism.is_concrete or is_traced((t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
-        close = _close if is_within_jit() else _close_compiled  # in which known numbers are traced, too
+        close = _close if is_within_jit() else _close_compiled  # under jit concrete numbers become tracers, too
         moment = mechanism.without_origin.at(t)
         if isinstance(t, Tracer) and not has_rheonomic_joints(moment):
             moment, t = from_moment(moment, t), 0.0
         return close(moment, analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
-        analysis = None  # the analysis of the known mechanism lasts
+        analysis = None  # a traced one cannot be stored
     return _closure_of_concrete(mechanism, np.asarray(t).item(), state, analysis)
 
 
-@cached_by_identity  # a second run of a mechanism need not close it again
+@cached_by_identity  # a second run of a mechanism reuses its closure
 def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
     with jax.ensure_compile_time_eval():
         scales = (analyse(mechanism) if analysis is None else analysis).scales
@@ -144,12 +156,12 @@ def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, an
 
 
 def _close_concrete(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
-    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, of known numbers."""
-    if scene_programs(mechanism).is_small:  # for which it takes longer to compile anything
+    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, by NumPy."""
+    if scene_programs(mechanism).is_small:  # compiling anything takes longer
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_closing.can_close(mechanism):
         return native_closing.close_concrete(mechanism.at(t), scales, t, q, v)
-    from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
+    from udkjax.equations.sparse_rows import SparseRows  # imports SciPy, which small scenes need not
 
     return SparseRows(mechanism).assemble(t, q, v)
 
@@ -179,12 +191,12 @@ def require_closed(mechanism: Mechanism, closure: Closure, t: NumberLike = 0.0, 
 
 @prints_table
 class Check(NamedTuple):
-    """The findings on a mechanism's constraints before it moves."""
+    """Findings of `check` on a mechanism's constraints."""
 
     bodies: int
     coordinates: int
     rows: int
-    rank: int  # in general: elsewhere than in a singular configuration
+    rank: int  # away from singular configurations
     degrees_of_freedom: int
     redundant: tuple[tuple[str, int], ...]  # rows that can be left out: the constraint and the row within it
     dependent: tuple[str, ...]  # the constraints that depend on each other
@@ -194,7 +206,7 @@ class Check(NamedTuple):
     length: float  # m; characteristic, as in `analyse`
     time: float  # s
     mass: float  # kg
-    moved: tuple[str, ...] = ()  # by assembly, far beside their sizes
+    moved: tuple[str, ...] = ()  # bodies moved far by assembly, relative to their sizes
     suspicious: tuple[str, ...] = ()  # likely mistakes
 
     def _table(self) -> PrintedTable:
@@ -203,10 +215,16 @@ class Check(NamedTuple):
 
 @checked
 def check(mechanism: Mechanism) -> Check:
-    """Count rows, rank and degrees of freedom, name redundant rows, and say how well the initial guess closes.
+    """Count rows, rank and degrees of freedom, name redundant rows, and measure how well the initial guess closes.
 
-    Bodies that assembly moves by more than a hundredth of their size are named, and what is likely a mistake: points far outside
-    of all bodies, angles that look like degrees, bodies without a joint.
+    Names bodies that assembly moves by more than a hundredth of their size, and likely mistakes: points far outside all bodies,
+    angles that look like degrees, bodies without a joint.
+
+    Args:
+        mechanism: a mechanism of concrete numbers.
+
+    Returns:
+        A `Check`: the counts, |Psi| before and after assembly (m, rad), and the findings as text.
     """
     closure = close(mechanism)
     before = constraints.psi(mechanism, 0.0, mechanism.q0)
@@ -253,11 +271,11 @@ def check_lines(found: Check) -> dict[str, str]:
 
 
 def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
-    """Return texts by one title, counted where there are more than one."""
+    """Return texts by title, numbered if there is more than one."""
     return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
 
 
-# Of a body's size: what a drawing to scale, or numbers of three digits, leave open. A number that is mistyped closes silently.
+# Fraction of a body's size, as rough drawings and numbers of three digits leave open. A mistyped number closes silently.
 WORTH_SAYING = 0.01
 
 
@@ -266,7 +284,7 @@ class AssemblyWarning(UserWarning):
 
 
 def moves_of_assembly(mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> tuple[str, ...]:
-    """Return, in words, how far each body was moved from its initial guess to the assembled q, where that is worth saying."""
+    """Describe how far assembly moved each body from its initial guess, where it is more than `WORTH_SAYING`."""
     change = np.asarray(q) - np.asarray(mechanism.q0)
     distance, angle = np.hypot(change[:, 0], change[:, 1]), np.abs(change[:, 2])
     if not np.any(change):
@@ -284,9 +302,9 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
 
 
 def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
-    """Return a warning where assembly moved a body of a mechanism of known numbers far, to the `Closure` at time t (s)."""
+    """Return a warning if assembly at time t (s) moved a body far; numbers are concrete."""
     if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:
-        return ""  # at a later time it is the drivers' business where the bodies are
+        return ""  # later the drivers decide where the bodies are
     moves = moves_of_assembly(mechanism, closure.state.q)
-    cure = "if that is not meant, a number of these bodies or of their joints is wrong; udk.check says more"
+    cure = "if you did not intend this, a number of these bodies or of their joints is wrong; see udk.check"
     return f"{'; '.join(moves)}: {cure}" if moves else ""

@@ -1,4 +1,4 @@
-"""All ways in which a mechanism can be put together for one value of its driver."""
+"""Assembly branches: all ways to assemble a mechanism for one value of its driver."""
 
 from collections.abc import Mapping
 
@@ -29,17 +29,20 @@ def branches(
 ) -> Float[Array, "k bodies 3"]:
     """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
 
-    They are those that random positions close to, each found once: none is wrong, but one may be missing. How many there can
-    be at most is known of four-bars (2) and six-bars (4 of Watt, 6 of Stephenson). The same seed gives the same result; angles
-    are within half a turn of zero, and branches in the order of the bodies' angles, the first body's first.
+    Random positions are closed, and equal results kept once: every branch returned is right, but one may be missing. Four-bars
+    have at most 2 branches, Watt's six-bars 4, Stephenson's 6. The same seed gives the same result; angles are within half a
+    turn of zero, and branches are sorted by the bodies' angles, the first body's first.
 
     Args:
-        mechanism: a mechanism without a degree of freedom once its driver holds; its numbers must be known.
+        mechanism: a mechanism of concrete numbers, without a degree of freedom once its driver is held.
         driver: a driver, or a coordinate by name or as a `Coordinate`, as for `kinematics`; None: all drivers.
-        value: of the driver (rad, m); of None the time (s).
+        value: value of the driver (rad, m); with None the time (s).
         starts: number of positions to search from.
-        seed: of these positions.
+        seed: seed of these positions.
         held: values that other drivers or coordinates hold, by name.
+
+    Returns:
+        The k positions found (k, bodies, 3): x, y in m and angle in rad.
 
     Raises:
         SceneError: no such driver or coordinate, or positions do not follow from it.
@@ -64,11 +67,11 @@ def _close(
     return jax.vmap(one)(guesses)
 
 
-SAME_POSITION = 1e-5  # of the characteristic length, or rad: positions nearer to each other are one
+SAME_POSITION = 1e-5  # relative to the characteristic length, or rad: closer positions are the same
 
 
 def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
-    """Return the given position, and others with random angles and places of all bodies, spread over the mechanism's size."""
+    """Return the given position, and others with random angles and places of all bodies within the mechanism's size."""
     rng = np.random.default_rng(seed)
     q = np.asarray(mechanism.q0 if state is None else state.q)
     found = np.tile(q, (count, 1, 1))
@@ -78,11 +81,11 @@ def random_positions(mechanism: Mechanism, count: int, seed: int, state: State |
     return jnp.asarray(found)
 
 
-def distinct_positions(q: Float[Array, "count bodies 3"], counts: Bool[Array, "count"], scales: Scales) -> list[int]:
-    """Return the indices of positions that count and differ from all before them; whole turns make no difference."""
+def distinct_positions(q: Float[Array, "count bodies 3"], valid: Bool[Array, "count"], scales: Scales) -> list[int]:
+    """Return the indices of the valid positions that differ from all valid ones before them, apart from whole turns."""
     points = np.asarray(q, float)
     length, different = float(scales.length), []
-    for k in np.flatnonzero(np.asarray(counts)):
+    for k in np.flatnonzero(np.asarray(valid)):
         d = points[k] - points[different]
         d[..., 2] = 2 * np.abs(np.sin(d[..., 2] / 2))
         d[..., :2] /= length

@@ -1,4 +1,4 @@
-"""Kinematics: positions, velocities and accelerations of a mechanism over the range of what drives it."""
+"""Kinematics: positions, velocities and accelerations of a mechanism over the values of a driver."""
 
 from collections.abc import Mapping, Sequence
 
@@ -29,24 +29,22 @@ from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
-UNLIMITED_TRAVEL = 500.0  # units of a length: a coordinate that moves farther without turning back has no limit
+UNLIMITED_TRAVEL = 500.0  # in units of length: a length that gets farther without a toggle has no limit
 FULL_TURN = 2.0 * np.pi  # rad
 
 
 class Kinematics(PrintsTable):
-    """Positions over the values of a driver, and velocities and accelerations there; not a number where it does not get.
+    """Positions, velocities and accelerations over the values of a driver; NaN at values that are not reached.
 
-    `status` is a `Reached` for each value; where velocities do not follow from the driver's (`not_determined`), they are not
-    numbers. `limit` is the value at the toggle that ended it, and `limit_q` the position there, which has no derivative; both are
-    infinite where none did.
+    Where velocities do not follow from the driver's (status `not_determined`), they are NaN. `limit_q` has no derivative.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body.
         v: their rates (m/s, rad/s).
         a: the rates of these (m/s^2, rad/s^2).
         status: the number of a `Reached` for each value.
-        limit: the value at the toggle that ended it; infinite where none did.
-        limit_q: the position at that toggle.
+        limit: the value at the toggle that ended the motion; infinite without one.
+        limit_q: the position at that toggle; infinite without one.
         bodies: the names of the bodies, in the order of q.
     """
 
@@ -85,7 +83,7 @@ class Kinematics(PrintsTable):
 
     @property
     def ts(self) -> Float[Array, "T"]:
-        """The values in the place of time: a kinematic motion may stand where a `Solution` does, if its values are times."""
+        """The values, as times: a kinematic motion over times can replace a `Solution`."""
         return self.values
 
     def frame(self, body: str) -> Frame:
@@ -93,21 +91,19 @@ class Kinematics(PrintsTable):
         return frame_over_time(self.bodies, self.q, self.v, body)
 
     def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
-        """Return the path (m) of a point given in the body's own frame (m): a coupler curve. `udkjax.path` knows pins, too."""
+        """Return the path (m) of a point given in the body's own frame (m): a coupler curve. `udkjax.path` takes pins, too."""
         return jnp.stack(self.frame(body).point(number(point)), -1)
 
 
 class Travel(PrintsTable):
-    """Values (rad, m) between which a coordinate can be driven; infinite where nothing ends it.
-
-    `lower_q` and `upper_q` are the positions at the toggles; infinite as well where there is none.
+    """Values (rad, m) between which a coordinate can be driven.
 
     Attributes:
-        lower: the lower end (rad, m); -inf where nothing ends it.
-        upper: the upper end (rad, m); inf where nothing ends it.
-        lower_q: the position at the lower toggle.
-        upper_q: the position at the upper toggle.
-        unit: of the coordinate.
+        lower: the lower end (rad, m); -inf without a toggle.
+        upper: the upper end (rad, m); inf without a toggle.
+        lower_q: the position at the lower toggle; infinite without one.
+        upper_q: the position at the upper toggle; infinite without one.
+        unit: unit of the coordinate.
     """
 
     lower: Float[Array, ""]
@@ -155,11 +151,12 @@ def kinematics(
 
     The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
     followed, the motion ends, with a `status` that says why. Branches closer than some 0.003 rad of transmission angle are taken
-    for branches that meet. Toggles, where the driver can get no farther, are found to rounding.
-    Redundant constraints do no harm. Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any
-    order by every number of the mechanism and by the values. Where branches meet (`Reached.singular`) they have first
-    derivatives, but none, not a number, by what parts the branches, as a length does that one of two equal cranks alone has;
-    where velocities do not follow (`not_determined`) they have none by what moves the position.
+    for branches that meet. Toggles, where the driver can get no farther, are found to rounding. Constraints may be redundant.
+
+    Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any order by every number of the mechanism
+    and by the values. Where branches meet (`Reached.singular`) they have first derivatives, but NaN by numbers that part the
+    branches, such as the length of one of two equal cranks; where velocities do not follow (`not_determined`), NaN by numbers
+    that move the position.
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.
@@ -176,6 +173,7 @@ def kinematics(
 
     Raises:
         SceneError: no such driver or coordinate, or positions do not follow from it.
+        ValueError: `values`, `rate` or `acceleration` has the wrong shape.
     """
     values, rate, acceleration = number(values), number(rate), number(acceleration)
     if values.ndim != 1 or not len(values):
@@ -194,11 +192,23 @@ def kinematics(
 def travel(
     mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, NumberLike] | None = None
 ) -> Travel:
-    """Return between which values a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
+    """Return the values between which a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
 
-    Args and errors are those of `kinematics`. An angle that makes a whole turn has no limits. Bodies that hang on a single other
-    one, as a free wheel or a pendulum, limit nothing: at the toggles they are as they were to it. `lower` and `upper` have exact
-    derivatives by every number of the mechanism.
+    An angle that makes a whole turn has no limits. Bodies attached to a single other one, such as a free wheel or a pendulum,
+    limit nothing: they keep their pose relative to it. `lower` and `upper` have exact derivatives by every number of the
+    mechanism.
+
+    Args:
+        mechanism: a mechanism of one degree of freedom once its drivers hold.
+        driver: a driver of the scene, or a coordinate by name or as a `Coordinate`, as for `kinematics`.
+        state: a position on the branch; by default the initial guess, assembled.
+        held: values that other drivers or coordinates hold, by name.
+
+    Returns:
+        A `Travel`: `lower` and `upper` (rad, m), infinite without a limit, and the positions at the toggles.
+
+    Raises:
+        SceneError: no such driver or coordinate, or positions do not follow from it.
     """
     if driver is None:
         raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
@@ -207,7 +217,7 @@ def travel(
         driven, q = _start(mechanism, driver, 0.0, state, held)
         return solve(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
     is_driver = isinstance(driver, str) and driver in mechanism.drivers
-    coordinate = driver if is_driver else element_of(mechanism, driver)  # a pin may be of what is left out
+    coordinate = driver if is_driver else element_of(mechanism, driver)  # a pin may be on a body that is left out
     start = assemble(mechanism, 0.0, state, throw=False).q
     rest = start[carried.kept(len(start))]
     found = travel(carried.without(mechanism), coordinate, State(rest, jnp.zeros_like(rest)), held)
@@ -247,7 +257,7 @@ def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFl
 def _start(
     mechanism: Mechanism, driver: Drive, start: NumberLike, state: State | None, held: Mapping[str, NumberLike] | None
 ) -> tuple[Driven, Float[Array, "n"]]:
-    """Return the mechanism driven, and the closed position that it starts from; at time `start`, if that drives it."""
+    """Return the driven mechanism and its closed first position; if time is the driver, at time `start`."""
     driven = drive(mechanism, driver, 0.0, held)
     if driver is None:
         return driven, _assemble(driven.mechanism, start, state, driven.analysis)
@@ -266,7 +276,7 @@ def _assemble(mechanism: Mechanism, t: NumberLike, state: State | None, analysis
 def _solve(
     driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], by: ControlFlow, fast: bool = True
 ) -> Points:
-    """Solve by machine code as far as its steps are to be relied on (if `fast`), and by continuation from there on."""
+    """Solve by machine code (if `fast`) as long as its steps are reliable, then by continuation."""
     xp, is_traced = by.xp, by is BY_JAX
     curve = (Curve if is_traced else NumpyCurve).of(driven)
     points, first = no_points(len(values), len(q), xp), xp.asarray(0)
@@ -282,7 +292,7 @@ def _solve(
         points = follow(curve, s, q, values, points, first)
         has_position = Reached.has_position(points.status)[:, None]
         return points._replace(**{name: np.where(has_position, getattr(points, name), np.nan) for name in ("q", "dq", "ddq")})
-    assert isinstance(curve, Curve)  # as it is of traced numbers
+    assert isinstance(curve, Curve)
     points = follow(*stop_gradients((curve, s, q, values)), points, first)
     return _with_derivatives(curve, q, values, points)
 
@@ -290,10 +300,10 @@ def _solve(
 def _count_on_branch(
     curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], found: MarchResult
 ) -> Int[Array, ""] | int:
-    """Return the number of trusted positions on the branch that they started on.
+    """Return the number of trusted positions on the first branch.
 
-    Where a branch meets another its side changes, and so it does where machine code went over to one that comes close. Which it
-    was, continuation tells, with shorter steps: of known numbers from the value before, of others from there on.
+    The side of a branch changes where it meets another, and where machine code jumps to a neighbouring one. Continuation with
+    shorter steps tells the two apart: from the value before for concrete numbers, from here on for traced ones.
     """
     if isinstance(curve, Curve):
         same = found.side == found.first_side

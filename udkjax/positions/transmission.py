@@ -23,11 +23,11 @@ from udkjax.scene.mechanism import Mechanism
 
 @prints_table
 class Workspace(NamedTuple):
-    """Places of a point, (S, T, 2) in m, over the values of a first driver (S,) and a second one (T,).
+    """Places of a point over the values of a first driver (S,) and a second one (T,).
 
     Attributes:
-        points: places that the point gets to (m).
-        reached: the number of a `Reached` for each.
+        points: places of the point (m); NaN where a pair of values is not reached.
+        reached: whether each pair of values is reached.
     """
 
     points: Float[Array, "S T 2"]
@@ -40,12 +40,15 @@ class Workspace(NamedTuple):
 def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -> Float[Array, "T"]:
     """Return the angle (rad, 0 to pi) at a pin between the two links that it joins: acos(u . w / (|u| |w|)).
 
-    u and w lead from the pin to the other pin of each link. At pi/2 force is passed on best, at 0 and pi not at all.
+    u and w point from the pin to the other pin of each link. Force is transmitted best at pi/2, and not at all at 0 and pi.
 
     Args:
         mechanism: the linkage.
         motion: anything with q (T, bodies, 3), a `Kinematics` or a `Solution`.
-        joint: a revolute of two moving links, each with exactly one pin besides.
+        joint: a revolute joint of two moving links, each with exactly one other pin.
+
+    Returns:
+        The angle (T,) in rad.
 
     Raises:
         SceneError: no such pin, or links with other numbers of pins.
@@ -57,7 +60,7 @@ def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -
     for body, here in zip(pins[joint].bodies, pins[joint].points, strict=True):
         others = [pin.points[pin.bodies.index(body)] for name, pin in pins.items() if name != joint and body in pin.bodies]
         if len(others) != 1 or body not in mechanism.body_names:
-            problem = f"{quote(body)} at {quote(joint)} has {len(others)} pins besides, not one"
+            problem = f"{quote(body)} at {quote(joint)} has {len(others)} other pins, not one"
             raise SceneError([f"{problem}: a transmission angle is that between two links of two pins each"], mechanism.name)
         angle = motion.q[..., mechanism.body_names.index(body), 2]
         frame = Frame(0.0, 0.0, angle, jnp.cos(angle), jnp.sin(angle))
@@ -70,8 +73,15 @@ def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -
 def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str | Coordinate) -> Float[Array, "T"]:
     """Return the effort of the output for one unit of effort at the driver: s_dot / o_dot, since power in is power out.
 
-    Efforts are torques (N m) along angles and forces (N) along lengths; losses and inertia aside. `output` is a coordinate o, by
-    its name or as a `Coordinate`. The sign tells whether both move the same way; at a toggle of the output it is infinite.
+    Efforts are torques (N m) for angles and forces (N) for lengths; losses and inertia are neglected.
+
+    Args:
+        mechanism: the mechanism.
+        motion: its `Kinematics` over the values s of the driver.
+        output: a coordinate o, by name or as a `Coordinate`.
+
+    Returns:
+        The ratio (T,): positive where both move the same way, infinite at a toggle of the output.
     """
     value = value_of(mechanism, output)
 
@@ -90,7 +100,22 @@ def coupler_curve(
     point: Numbers = (0.0, 0.0),
     **choices: Any,
 ) -> Float[Array, "T 2"]:
-    """Return the path (m) of a point of a body, given in its own frame (m), over the values of a driver: see `kinematics`."""
+    """Return the path of a point of a body over the values of a driver.
+
+    Args:
+        mechanism: a mechanism of one degree of freedom once its drivers hold.
+        driver: a driver or a coordinate, as for `kinematics`.
+        values: values of the driver (rad, m), in the order in which they are reached.
+        body: the name of the body.
+        point: the point in the body's own frame (m).
+        **choices: other arguments of `kinematics`: state, rate, acceleration, held.
+
+    Returns:
+        x and y (T, 2) in m; NaN at values that are not reached.
+
+    Raises:
+        SceneError: no such body, driver or coordinate, or positions do not follow from it.
+    """
     _require_body(mechanism, body)
     return kinematics(mechanism, driver, values, **choices).path(body, jnp.asarray(point))
 
@@ -107,14 +132,17 @@ def workspace(
 
     Args:
         mechanism: a mechanism of two degrees of freedom once its drivers hold.
-        drivers: the values (rad, m) of two drivers or coordinates, by name; the first are gone along with the second held at its
+        drivers: the values (rad, m) of two drivers or coordinates, by name; the first is followed with the second held at its
             first value.
         body: body of the point.
         point: a point in the body's own frame (m).
         state: a position on the branch; by default the initial guess, assembled.
 
+    Returns:
+        A `Workspace`: the places (S, T, 2) in m, NaN where the pair of values is not reached.
+
     Raises:
-        SceneError: no such driver or coordinate, or positions do not follow from them.
+        SceneError: no such body, driver or coordinate, or positions do not follow from them.
     """
     _require_body(mechanism, body)
     if len(drivers) != 2:

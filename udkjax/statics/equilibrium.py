@@ -1,4 +1,4 @@
-"""Static equilibria: positions where the loads and the constraints' forces balance, F = Psi_q^T lambda, stable or not."""
+"""Static equilibria, stable or not: positions where loads and constraint forces balance, F = Psi_q^T lambda."""
 
 import math
 from typing import Any, TypeAlias
@@ -27,19 +27,19 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.linearization import Linearization, linearize, with_unit_mass
 from udkjax.transforms.gradients import stop_gradients
 
-MOST_NEWTON_STEPS = 100  # of Newton's method, with limited steps: ten are usual, a hundred lead across any scene
-FORCE_TOL = 1e-9  # of the scale of forces: tolerance of the loads along free directions; rounding leaves 1e-15
-FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # of it: the rest is rounding, which no step reduces
-NEUTRAL_STIFFNESS = 1e-10  # of the largest stiffness: one below it resists nothing
-SMALLEST_STIFFNESS = 1e-12  # of the scale of stiffnesses: one below it is rounding; rounding leaves 1e-15
+MOST_NEWTON_STEPS = 100  # of limited length: ten are usual, a hundred cross any scene
+FORCE_TOL = 1e-9  # tolerance of the loads along free directions, relative to the scale of forces; rounding leaves 1e-15
+FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # relative to the scale of forces: rounding, which no step reduces
+NEUTRAL_STIFFNESS = 1e-10  # relative to the largest stiffness: a smaller one resists nothing
+SMALLEST_STIFFNESS = 1e-12  # relative to the scale of stiffnesses: a smaller one is rounding, which leaves 1e-15
 
-# The share of a step, how many were tried, whether it is better, q and the linearization there.
+# The fraction of a step, the number of trials, whether it is better, q and the linearization there.
 Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
 Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization there, steps, whether the last was better
 
 
 class Equilibrium(PrintsTable):
-    """A position of rest. `balanced` says whether it is one; `omega2` tells whether it is stable.
+    """A position of rest: `balanced` tells whether loads cancel, `omega2` whether it is stable.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body.
@@ -52,7 +52,7 @@ class Equilibrium(PrintsTable):
     omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
     residual: Float[Array, ""]  # remaining loads along free directions, relative to the scale of forces
     balanced: Bool[Array, ""]
-    neutral: Float[Array, ""]  # (rad/s)^2: an omega2 of no more is rounding
+    neutral: Float[Array, ""]  # (rad/s)^2: a smaller |omega2| is rounding
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
 
     _units = units(q="m, m, rad", multipliers="N or N m", omega2="(rad/s)²")
@@ -73,26 +73,26 @@ class Equilibrium(PrintsTable):
 
     @property
     def state(self) -> State:
-        """At rest there."""
+        """The `State` at rest in this position."""
         return State(self.q, np.zeros(np.shape(self.q)))
 
     @property
     def stable(self) -> Bool[Array, ""]:
-        """True if the potential energy has a minimum there, as all stiffnesses are positive."""
+        """True if all stiffnesses are positive: the potential energy has a minimum."""
         xp = library_for(self)
         neutral = xp.asarray(self.neutral)[..., None]
         return stored(xp.asarray(self.balanced) & xp.all(xp.asarray(self.omega2) > neutral, axis=-1))
 
     @property
     def indifferent(self) -> Bool[Array, ""]:
-        """True if nothing moves it away, though not all stiffnesses are positive: some vanish."""
+        """True if the lowest stiffness vanishes: nothing moves it away, nothing brings it back."""
         xp = library_for(self)
         least = xp.min(xp.asarray(self.omega2), axis=-1, initial=np.inf)
         return stored(xp.asarray(self.balanced) & (xp.abs(least) <= xp.asarray(self.neutral)))
 
     @property
     def kind(self) -> str:
-        """Kind of one position: "stable", "indifferent" or "unstable", or that it is none of rest."""
+        """Kind of one position: "stable", "indifferent", "unstable", or "not at rest: loads are not balanced"."""
         if not self.balanced:
             return "not at rest: loads are not balanced"
         return "stable" if self.stable else "indifferent" if self.indifferent else "unstable"
@@ -107,24 +107,24 @@ def _format_rate(omega2: float) -> str:
 def equilibrium(
     mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0, stable: bool = False, analysis: Analysis | None = None
 ) -> Equilibrium:
-    """Return a position of rest, N^T F = 0 on Psi = 0, near a given one: N spans the directions that constraints leave free.
+    """Return a position of rest near a given one: N^T F = 0 on Psi = 0, where N spans the directions that constraints leave free.
 
-    Newton's method with K = -F_q + (lambda^T Psi)_qq, its steps limited in length and halved until less is left of the loads.
-    Pure, jittable and batched by `vmap` (whether a member rests is in `balanced`); differentiable by every number of the
-    mechanism, where the stiffness is not singular.
+    Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
+    decrease. Pure, jittable and batched by `vmap` (`balanced` tells which members are at rest); differentiable by every number
+    of the mechanism, where the stiffness is not singular.
 
     Args:
         mechanism: its drivers hold the values of time t.
         state: state to search from; by default the initial guess.
         t: time (s) of drivers and loads.
-        stable: go downhill only, and so to a stable equilibrium; otherwise to any that is near.
+        stable: go downhill only, to a stable equilibrium; otherwise to any nearby.
         analysis: the mechanism's `Analysis`; needed where all numbers are traced.
 
     Returns:
         An `Equilibrium`.
 
     Raises:
-        ValueError: the number of degrees of freedom is not known, as all numbers are traced.
+        ValueError: all numbers are traced, so that the number of degrees of freedom is unknown.
     """
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
@@ -137,10 +137,19 @@ def equilibrium(
 def equilibria(
     mechanism: Mechanism, starts: int = 64, seed: int = 0, t: NumberLike = 0.0, state: State | None = None
 ) -> list[Equilibrium]:
-    """Return the different equilibria found from `starts` positions: the given one and random ones of the same mechanism.
+    """Return the different equilibria found from several positions: the given one and random ones.
 
-    Random positions turn every body by a random angle and close it again, so that all branches are tried. Not exhaustive; the
-    lowest stiffness last: the most stable first. Args as for `equilibrium`; numbers must be known.
+    Random positions turn every body by a random angle and are closed again, so that all branches are tried. Not exhaustive.
+
+    Args:
+        mechanism: a mechanism of concrete numbers; its drivers hold the values of time t.
+        starts: number of positions to search from.
+        seed: seed of the random positions.
+        t: time (s) of drivers and loads.
+        state: the first position; by default the initial guess.
+
+    Returns:
+        A list of `Equilibrium`, the most stable first: by their lowest omega^2, descending.
     """
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
@@ -150,20 +159,20 @@ def equilibria(
 
 
 def degrees_of_freedom(analysis: Analysis) -> int:
-    """Return the number of degrees of freedom; raise `SceneError` where it is not known."""
+    """Return the number of degrees of freedom; raise `SceneError` if it is unknown."""
     free = analysis.degrees_of_freedom
     if free is None:
         raise SceneError(
             [
-                "how many degrees of freedom there are is not known: the initial guess cannot be closed, or not moved as the "
-                "drivers ask (udkjax check tells); or all numbers are traced: give analysis=udkjax.analyse(mechanism)"
+                "the number of degrees of freedom is unknown: the initial guess cannot be closed, or not moved as the "
+                "drivers ask (see udkjax check); or all numbers are traced: give analysis=udkjax.analyse(mechanism)"
             ]
         )
     return free
 
 
 def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> AbstractCurve:
-    """Return the positions of the mechanism as a curve, with time in place of a driver's value."""
+    """Return the positions of the mechanism as a curve over time."""
     return (Curve if by is BY_JAX else NumpyCurve).of(Driven(mechanism, analysis, "", -1, number(1.0)))
 
 
@@ -202,7 +211,7 @@ def _settle(
     free: int,
     stable: bool,
 ) -> Float[Array, "n"]:
-    """Take Newton steps until nothing gets better."""
+    """Take Newton steps until none improves."""
     if not free:
         return q
     by, xp = curve.by, curve.by.xp
@@ -226,7 +235,7 @@ def _settle(
             X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
             trial = at(new)
-            # Work done on the way, by the trapezoidal rule, or what is left of the loads along free directions.
+            # Better: the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
             work = 0.5 * (here.loads + trial.loads) @ (new - q)
             better = (work > 0 if stable else False) | (xp.linalg.norm(trial.force) < size)
             return 0.5 * share, j + 1, closed & better, new, trial
@@ -244,7 +253,7 @@ def _settle(
 
 
 def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
-    """Return the step eta of the linearization; only downhill, where the equilibrium is to be stable."""
+    """Return the step eta of the linearization; only downhill if the equilibrium is to be stable."""
     xp, rounding = curve.by.xp, SMALLEST_STIFFNESS * scale.stiffness
     if not stable:
         resists = xp.max(xp.abs(here.stiffness)) > rounding

@@ -1,11 +1,11 @@
-"""A mechanism near a position of rest, in the directions that its constraints leave: masses, damping, stiffness.
+"""Linearization about a position of rest, in the directions that constraints leave free: mass, damping, stiffness.
 
-At rest F = Psi_q^T lambda. Near by, with q = q0 + N eta and Psi_q N = 0, the loads and the turning of the constraint forces give
+At rest F = Psi_q^T lambda. Nearby, with q = q0 + N eta and Psi_q N = 0, the loads and the turning constraint forces give
 
     N^T M N eta'' + N^T C N eta' + N^T K N eta = 0,      C = -F_v,      K = -F_q + (lambda^T Psi)_qq.
 
-The second part of K, the constraints' curvature under load, is what makes a pendulum's weight a stiffness. Among redundant
-constraints lambda is of least norm; N^T K N does not depend on that choice. No derivative is taken by differences.
+The second term of K, the constraints' curvature under load, turns a pendulum's weight into a stiffness. Among redundant
+constraints lambda has the least norm; N^T K N does not depend on that choice.
 """
 
 from collections.abc import Callable
@@ -26,10 +26,10 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class Linearization(NamedTuple):
-    """The reduced matrices at a position, and the directions N that they belong to."""
+    """The reduced matrices at a position, and their directions N."""
 
     directions: Float[Array, "n f"]  # N, orthonormal in the metric of M
-    mass: Float[Array, "f f"]  # the unit matrix, which it stays along derivatives only to first order
+    mass: Float[Array, "f f"]  # the unit matrix; its derivatives vanish only to first order
     damping: Float[Array, "f f"]
     stiffness: Float[Array, "f f"]
     force: Float[Array, "f"]  # N^T F: zero at rest
@@ -38,10 +38,10 @@ class Linearization(NamedTuple):
 
 
 def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike, q: Float[Array, "n"]) -> Linearization:
-    """Return the linearization at rest in a closed position q at time t (s), of `free` degrees of freedom.
+    """Return the linearization at rest, in a closed position q at time t (s), with `free` degrees of freedom.
 
-    N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D here: it spans that of D nearby, too, so that derivatives of
-    whatever does not depend on the basis are exact.
+    N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D at q: N spans the null space of D nearby, too, so that
+    derivatives of results independent of the basis are exact.
     """
     w, root, still = analysis.scales.weights, uk.inverse_sqrt_mass(mechanism), jnp.zeros_like(q)
     F = lambda q, v: loads.force(mechanism, t, q, v)  # noqa: E731
@@ -67,7 +67,7 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
 def _null_space(J: Float[Array, "m n"], free: int) -> Float[Array, "n free"]:
     """Return an orthonormal basis N of `free` directions with J N = 0: right singular vectors of the smallest singular values.
 
-    Without derivatives: those of what is made with it follow where it is projected by I - J^+ J.
+    It has no derivatives: its projection by I - J^+ J supplies them.
     """
     J = jax.lax.stop_gradient(J)
     n = J.shape[1]

@@ -29,7 +29,7 @@ class Modes(PrintsTable):
         bodies: the names of the bodies, in the order of q.
     """
 
-    omega2: Float[Array, "f"]  # (rad/s)^2 without damping, ascending; negative: it moves away as exp(sqrt(-omega2) t)
+    omega2: Float[Array, "f"]  # (rad/s)^2 without damping, ascending; negative: grows as exp(sqrt(-omega2) t)
     shapes: Float[Array, "f bodies 3"]  # of omega2, with shape^T M shape = 1 kg m^2
     s: Complex[Array, "2f"]  # 1/s, with damping, by imaginary part and then by real part
     damped_shapes: Complex[Array, "2f bodies 3"]  # of s, of unit length
@@ -53,14 +53,14 @@ class Modes(PrintsTable):
 
     @property
     def frequencies(self) -> Float[Array, "f"]:
-        """omega (rad/s) without damping; not a number where it moves away."""
+        """omega (rad/s) without damping; NaN where the mechanism moves away."""
         xp = library_for(self.omega2)
         with np.errstate(invalid="ignore"):
             return stored(xp.sqrt(xp.asarray(self.omega2)))
 
     @property
     def damping(self) -> Float[Array, "2f"]:
-        """-Re s / |s| of each s: 0 undamped, 1 without oscillation, negative where it grows."""
+        """-Re s / |s| for each s: 0 undamped, 1 without oscillation, negative if it grows."""
         xp = library_for(self.s)
         s = xp.asarray(self.s)
         size = xp.abs(s)
@@ -71,21 +71,21 @@ class Modes(PrintsTable):
 def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0, analysis: Analysis | None = None) -> Modes:
     """Return the modes about a position of rest: (s^2 N^T M N + s N^T C N + N^T K N) eta = 0, shape = N eta.
 
-    C = -F_v and K = -F_q + (lambda^T Psi)_qq: preload, gravity and the constraints' curvature are in it. K is symmetric where
-    loads have a potential. One that turns with a body has none: `s` and `damped_shapes` are of all of K, also where it flutters,
-    `omega2` and `shapes` of the symmetric part alone.
+    C = -F_v, and K = -F_q + (lambda^T Psi)_qq includes preload, gravity and the constraints' curvature. K is symmetric if the
+    loads have a potential, which a load that turns with a body lacks: `s` and `damped_shapes` use all of K, flutter included,
+    `omega2` and `shapes` its symmetric part.
 
     Pure, jittable and batched by `vmap`; eigenvalues and `shapes` have exact derivatives by every number of the mechanism, where
-    they are simple (those of `equilibrium` carry on how the position changes); `damped_shapes` have none.
+    they are simple (those of `equilibrium` include the change of position); `damped_shapes` have none.
 
     Args:
         mechanism: its drivers hold the values of time t.
-        state: state at rest; by default the equilibrium next to its initial guess.
+        state: state at rest; by default the equilibrium near the initial guess.
         t: time (s) of drivers and loads.
         analysis: the mechanism's `Analysis`; needed where all numbers are traced.
 
     Returns:
-        `Modes`, of the f degrees of freedom.
+        The `Modes` of the f degrees of freedom.
     """
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
@@ -98,11 +98,11 @@ def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, 
     if not free:
         none = xp.zeros((0, *rest.shape))
         return Modes(xp.zeros(0), none, xp.zeros(0, complex), none + 0j, rest, xp.zeros(()), mechanism.body_names)
-    N = solver_of_mass(at, by)(at.directions.T).T  # of which N^T M N is one
+    N = solver_of_mass(at, by)(at.directions.T).T  # N^T M N = 1
     C, K = with_unit_mass(at, by)
     omega2, eta = xp.linalg.eigh(0.5 * (K + K.T))
     shapes = (N @ eta).T.reshape(free, -1, 3)
-    # In units of the fastest: scales far from one cost an eigenvalue its digits.
+    # In units of the fastest mode: scales far from one cost the eigenvalues digits.
     unit = stop_gradients(xp.sqrt(xp.max(xp.abs(K), initial=0.0)))
     unit = xp.where(unit > 0, unit, 1.0)
     companion = xp.block([[xp.zeros_like(K), xp.eye(free)], [-K / unit**2, -C / unit]])

@@ -4,8 +4,8 @@ A peak between two outputs is that of the parabola through the largest of |F| an
 
     |F|_max = y_1 - (y_2 - y_0)^2 / (8 (y_2 - 2 y_1 + y_0)),
 
-which is right to the third order of the distance of the outputs, and whose derivative is that of the motion at the instant of
-the peak. All of it is pure: differentiated through `simulate`, and mapped over mechanisms and runs by `jax.vmap`.
+which is accurate to third order in the output step, and whose derivative is that of the motion at the instant of the peak. All
+of it is pure: differentiated through `simulate`, and mapped over mechanisms and runs by `jax.vmap`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +29,11 @@ UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_ti
 
 @prints_table
 class Peak(NamedTuple):
-    """Largest force and torque of one joint on one body over a run, their times, and the roots of mean squares."""
+    """Largest force and torque of one joint on one body over a run, their times, and the root mean squares."""
 
-    force: Float[Array, ""]  # N, of |(fx, fy)|
+    force: Float[Array, ""]  # |(fx, fy)| (N)
     force_time: Float[Array, ""]  # s
-    torque: Float[Array, ""]  # N m, of its absolute value
+    torque: Float[Array, ""]  # |torque| (N m)
     torque_time: Float[Array, ""]  # s
     rms_force: Float[Array, ""]  # N
     rms_torque: Float[Array, ""]  # N m
@@ -55,7 +55,7 @@ class Envelope(NamedTuple):
     _units = UNITS
 
 
-Peaks = dict[str, dict[str, Peak]]  # of a joint or driver, of a body
+Peaks = dict[str, dict[str, Peak]]  # by joint or driver, and body
 
 
 class RestingPositions(NamedTuple):
@@ -73,11 +73,14 @@ def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any)
     Args:
         mechanism: the mechanism.
         solution: ts (T,), q and v (T, bodies, 3), T of at least 3.
-        **choices: those of `reactions`: frame, about, compliances, method, stabilization. The torque of a peak is that about the
-            point which `about` chooses: here by default the "joint".
+        **choices: those of `reactions`: frame, about, compliances, method, stabilization. `about` is the point of the torque,
+            here "joint" by default.
 
     Returns:
-        A `Peak` for each joint and body, `reaction_peaks(mech, sol)["A"]["link1"].force`; of a run that failed, not a number.
+        A `Peak` for each joint and body, `reaction_peaks(mech, sol)["A"]["link1"].force`; NaN for a run that failed.
+
+    Raises:
+        ValueError: fewer than three output times.
     """
     ts = jnp.asarray(solution.ts)
     if len(ts) < 3:
@@ -90,7 +93,7 @@ def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any)
 def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load at each pin on each body that meets there, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
 
-    Where k bodies share a pin there are k - 1 joints, such as B, B-2: their loads on one body are added up.
+    Where k bodies share a pin, k - 1 joints, such as B, B-2, connect them: their loads on one body are added up.
 
     Args:
         mechanism: the mechanism.
@@ -111,14 +114,14 @@ def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) 
 
 
 def unique_pin_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, dict[str, bool]]:
-    """Decide, by pin and body, whether equilibrium alone determines the force at each time: see `unique_reactions`."""
+    """Tell, by pin and body, whether equilibrium alone determines the force at all times: see `unique_reactions`."""
     found: dict[str, dict[str, bool]] = {}
     unique, alive = unique_reactions(mechanism, solution), np.isfinite(np.asarray(solution.q)).all((1, 2))
     for name, joint in mechanism.joints.items():
         if has_point(joint):
             at = found.setdefault(_pin_of(mechanism, name), {})
-            for body, known in unique[name].items():
-                at[body] = at.get(body, True) and bool(np.asarray(known)[alive, :2].all())
+            for body, is_unique in unique[name].items():
+                at[body] = at.get(body, True) and bool(np.asarray(is_unique)[alive, :2].all())
     return found
 
 
@@ -146,7 +149,7 @@ def cam_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, Float[
 
 
 def _pin_of(mechanism: Mechanism, joint: str) -> str:
-    """Return the first joint at the pin of a revolute: that without the number behind it, which drawings add."""
+    """Return the first joint at the pin of a revolute: its name without the number that drawings append."""
     base, _, number = joint.rpartition("-")
     pair = [mechanism.joints.get(name) for name in (base, joint)]
     return base if number.isdigit() and all(isinstance(one, Revolute) for one in pair) else joint
@@ -154,9 +157,14 @@ def _pin_of(mechanism: Mechanism, joint: str) -> str:
 
 @checked
 def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
-    """Return the largest peaks over load cases; cases that failed are left out.
+    """Return the largest peaks over load cases, without cases that failed.
 
-    `cases` are the peaks of each, or of a batch, as `jax.vmap(reaction_peaks)` returns them, with the cases as the first axis.
+    Args:
+        cases: the peaks of each case as a sequence, or of a batch, as `jax.vmap(reaction_peaks)` returns them, with the cases as
+            the first axis.
+
+    Returns:
+        An `Envelope` for each joint and body: the largest force (N) and torque (N m), with their cases and times (s).
     """
     batch: Peaks = cases if isinstance(cases, Mapping) else jax.tree.map(lambda *xs: jnp.stack(xs), *cases)
     return {name: {body: _envelope(peak) for body, peak in loads.items()} for name, loads in batch.items()}
@@ -170,7 +178,7 @@ def _peak(ts: Array, load: Float[Array, "T 3"]) -> Peak:
 
 
 def _largest(ts: Array, y: Float[Array, "T"]) -> tuple[Array, Array]:
-    """Return the peak of the parabola through the largest sample and its neighbours, and when; at an end of a run, the sample."""
+    """Return the peak and its time, by the parabola through the largest sample and its neighbours; at an end, the sample."""
     top = jnp.argmax(y)
     middle = jnp.clip(top, 1, len(y) - 2)
     before, at, after = y[middle - 1], y[middle], y[middle + 1]
@@ -192,7 +200,10 @@ def _root_mean_square(ts: Array, square: Float[Array, "T"]) -> Array:
 def _envelope(peak: Peak) -> Envelope:
     def top(values: Array, times: Array) -> tuple[Array, Array, Array]:
         if np.ndim(values) != 1:
-            raise ValueError(f"an envelope is over cases, the one axis of each peak; the shape of this one is {np.shape(values)}")
+            shape = np.shape(values)
+            raise ValueError(
+                f"cases must be the first and only axis of each peak, as jax.vmap(reaction_peaks) returns them: {shape}"
+            )
         case = jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values))
         return values[case], case, times[case]
 

@@ -22,7 +22,7 @@ class RestingForces(NamedTuple):
 
 
 def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> RestingForces:
-    """Return the forces in a position of rest (bodies, 3), where drivers stand still as they are at time t (s)."""
+    """Return the forces in a position of rest (bodies, 3), with the drivers halted at time t (s)."""
     still, q = with_halted_drivers(mechanism, t), np.asarray(q)
     rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))
     at_pins = pin_reactions(still, rest)
@@ -32,7 +32,7 @@ def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> Resting
 
 
 def force_lines(mechanism: Mechanism, held: RestingForces) -> str:
-    """Describe the forces: a line for each driver, and one for each pin and body."""
+    """Describe the forces: one line for each driver, and for each pin and body."""
     loads = [load[:2] for on in held.forces.values() for load in on.values()]
     scale = float(np.max(np.abs(loads), initial=0.0))
     rows = [(f"{name} holds by", format_number(x, mechanism.drivers[name].effort_unit)) for name, x in held.efforts.items()]

@@ -166,7 +166,8 @@ def inverse_dynamics(
         An `InverseDynamics`: efforts and powers (T,) by driver, and what neither joints nor drivers can exert.
 
     Raises:
-        SceneError: nothing drives, or a name is unknown.
+        SceneError: there is no driver, or a name is unknown.
+        ValueError: `motion` has another number of states than `ts` has times.
     """
     ts = number(ts)
     found = None
@@ -197,13 +198,24 @@ def inverse_dynamics(
 def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     """Return the mechanism whose drivers exert these efforts, each a natural cubic spline through the times, and hold nothing.
 
-    A spline misses an effort by some h^4, h the time between its knots, and by h^2 near its ends: let the times begin a dozen
-    knots before the run, and end as many after it. Simulated from a state of the prescribed motion it follows it.
+    A spline misses an effort by about h^4, where h is the time between its knots, and by h^2 near its ends: let the times begin
+    a dozen knots before the run and end as many after it. Simulated from a state of the prescribed motion, the mechanism
+    follows that motion.
+
+    Args:
+        mechanism: the mechanism that `found` is of.
+        found: the result of `inverse_dynamics`, determined at all times.
+
+    Returns:
+        The mechanism without drivers, with one force element for each effort.
+
+    Raises:
+        ValueError: an effort is not determined at some time.
     """
     if not isinstance(found.ts, Tracer) and not np.all(found.determined):
         t = float(found.ts[int(np.argmin(found.determined))])
         raise ValueError(
-            f"what the drivers exert is not determined at {t:g} s: leave out the times where `found.determined` is not true"
+            f"the efforts of the drivers are not determined at {t:g} s: leave out the times where `found.determined` is False"
         )
     elements = {name: element_of(mechanism, name) for name in found.efforts}
     forces = dict(mechanism.forces)

@@ -240,8 +240,11 @@ def animate_modes(
         labels: labels; by default "mode 1", "mode 2", ...
         title: title; by default the mechanism's name.
 
+    Returns:
+        An `Animation` of all modes.
+
     Raises:
-        ValueError: shapes of another shape, or one that does not move anything.
+        ValueError: shapes have the wrong shape, or one is zero.
     """
     shapes = np.asarray(shapes, float)
     if shapes.shape[1:] != (len(mechanism.bodies), 3) or not len(shapes):

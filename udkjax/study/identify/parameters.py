@@ -23,7 +23,12 @@ from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
 def length(*bodies: str, as_rod: bool = False) -> Length:
     """Name the length of a link as a parameter, or the common length of several: attachments and centre of mass move together.
 
-    With `as_rod` mass and inertia follow, as those of a rod of the same mass per metre do. See `udkjax.with_length`.
+    Args:
+        *bodies: the names of the links.
+        as_rod: whether mass and inertia change with the length as those of a uniform rod; see `udkjax.with_length`.
+
+    Returns:
+        A `Length`, to be given to `identify` as a parameter.
     """
     return Length(bodies, as_rod)
 
