@@ -61,6 +61,28 @@ def test_a_driver_beyond_the_reach_of_its_linkage(scale, choices, ts):
     assert "Projection" not in solution.cause
 
 
+def test_a_dead_point_without_pins_in_line(scale=1e-6):
+    """The coupler's far pin is the middle of a rod whose ends slide on two lines at right angles: a circle, as the rocker's."""
+    plain = four_bar(scale)
+    joints = {name: plain.joints[name] for name in "AB"}
+    bodies = {name: plain.bodies[name] for name in ("crank", "coupler")}
+    middle, corner = np.array(plain.joints["C"].points[0]), scale * np.array([GROUND, 0.0])
+    x, y, angle = udk.assemble(plain).q[1]
+    c, s = np.cos(angle), np.sin(angle)
+    C = np.array([x, y]) + np.array([[c, -s], [s, c]]) @ middle
+    across, up = C - corner
+    bodies["rod"] = udk.Body(scale, scale**3, C, np.arctan2(-up, across))
+    bodies["block"] = udk.Body(scale, scale**3, corner + [2 * across, 0.0])
+    joints["C"] = udk.Revolute(["coupler", "rod"], [middle, [0.0, 0.0]])
+    joints["E"] = udk.Revolute(["rod", "block"], [[scale * ROCKER, 0.0], [0.0, 0.0]])
+    joints["line"] = udk.Prismatic(["ground", "block"], [corner, [0.0, 0.0]], axis=0.0)
+    joints["other line"] = udk.Slot(["ground", "rod"], [corner, [-scale * ROCKER, 0.0]], axis=np.pi / 2)
+    motor = udk.Driver(["ground", "crank"], "angle", udk.Polynomial([START, 2.0]))
+    cause = failed(udk.Mechanism(bodies, joints, {"motor": motor}, gravity=plain.gravity)).cause
+    assert f"the linkage reaches {TOGGLE:.5g}" in cause.replace(f"{TOGGLE:.6g}", f"{TOGGLE:.5g}")
+    assert "in line" not in cause and "a dead point of A, B, C, E, line, other line" in cause, cause
+
+
 def test_a_run_does_not_go_on_beyond_the_reach_of_its_linkage():
     """A full turn leads back into reach, but no motion leads there."""
     solution = failed(four_bar(motor=[START, 3.0]), np.array([0.0, 2 * np.pi / 3]), rtol=1e-6, atol=1e-6)

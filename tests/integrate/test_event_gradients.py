@@ -85,15 +85,13 @@ class Table(eqx.Module):
         return at["ball"].y - self.amplitude * jnp.sin(15.0 * t)
 
 
-@pytest.mark.slow
 def test_gradients_of_a_contact_that_lets_go():
     """A shaking table throws the ball where its own acceleration is -g; the time of that, and the end, by its amplitude."""
     ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})
 
     def run(a):
-        sol = udk.simulate(
-            ball, np.linspace(0.0, 0.2, 3), events=udk.Event(Table(a), udk.Impact(0.0), name="table"), max_events=4
-        )
+        table = udk.Event(Table(a), udk.Impact(0.0), name="table")
+        sol = udk.simulate(ball, np.linspace(0.0, 0.2, 3), events=table, max_events=2)
         return jnp.stack([sol.events.time[1], sol.q[-1, 0, 1]])
 
     def exact(a):
@@ -101,9 +99,9 @@ def test_gradients_of_a_contact_that_lets_go():
         later = 0.2 - t
         return jnp.stack([t, a * jnp.sin(15 * t) + a * 15 * jnp.cos(15 * t) * later - G / 2 * later**2])
 
-    found, expected = (jax.jit(jax.jacfwd(lambda a, f=f: (f(a),) * 2, has_aux=True))(0.1) for f in (run, exact))
-    assert np.abs(found[1] - expected[1]).max() < 1e-8
-    assert np.abs(found[0] - expected[0]).max() < 1e-6 * np.abs(expected[0]).max()
+    (found, slope), (expected, exact_slope) = (jax.jvp(f, (0.1,), (1.0,)) for f in (run, exact))
+    assert np.abs(found - expected).max() < 1e-8
+    assert np.abs(slope - exact_slope).max() < 1e-6 * np.abs(exact_slope).max()
 
 
 def test_conditions_do_not_close_over_traced_numbers():

@@ -116,6 +116,20 @@ def test_two_flat_directions_are_told_apart():
     assert first.names == names[:2] and second.names == ("d", "e")
 
 
+def test_priors_alone_show_a_direction_in_the_residuals_and_in_the_errors():
+    """Measured 1e12 times better than by priors: b = -a in z, and so a common factor by two priors of it, 2 and 1."""
+    J, r = problem()
+    J[:, 1] = -J[:, 0]
+    priors = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    known = estimate_uncertainty(np.vstack([1e12 * J, priors]), np.append(r, [0.0, 0.0]), positive(*"abc"), priors=2)
+    assert known.flat == () and known.degrees_of_freedom == 62 - 3
+    assert_allclose(known.standard_errors[:2], 1 / np.sqrt(2**2 + 1**2))
+    U = known.projection  # orthonormal columns: U U^T projects onto the residuals that a change of unknowns can make
+    assert_allclose(U.T @ U, np.eye(3), atol=1e-12)
+    assert_allclose((U @ U.T)[:60, :60], J @ np.linalg.pinv(J), atol=1e-12)
+    assert_allclose((U @ U.T)[60:, 60:], np.outer([2, 1], [2, 1]) / 5, atol=1e-12)
+
+
 def test_directions_in_words():
     values = UnknownValues(
         ["m", "x", "k", "b"], ["kg", "m", "", "s"], np.array([2.0, 0.3, 5.0, 4.0]), np.array([2.0, 0.5, 5.0, 1.0]), []

@@ -1,5 +1,6 @@
 """Certificates: exact roots are held, and what is no root, a double root, or too near to one is not proven."""
 
+import operator
 from fractions import Fraction
 
 import numpy as np
@@ -62,6 +63,18 @@ def test_balls_hold_exact_results():
         cases += [((a * c + b * d) / (c * c + d * d), quotient.re), ((b * c - a * d) / (c * c + d * d), quotient.im)]
         for exact, ball in cases:
             assert abs(Fraction(float(ball.mid[0])) - exact) <= ball.rad[0] + Fraction(float(np.spacing(abs(float(ball.mid[0])))))
+
+
+@pytest.mark.parametrize("operate", [operator.mul, operator.add, operator.sub, operator.truediv])
+def test_balls_of_exact_numbers_hold_results_that_are_rounded(operate):
+    """Radii of exact inputs are zero: what the result's radius holds is the rounding of this operation."""
+    numbers = [(0.1, 0.1), (0.1, 0.3e-7), (1 / 3, 0.7), (1e5, 0.1)]
+    off = []
+    for a, b in numbers:
+        ball, exact = operate(Ball.of([a]), Ball.of([b])), operate(Fraction(a), Fraction(b))
+        off.append(abs(Ball.fractions(ball.mid).mid[0] - exact))
+        assert off[-1] <= Fraction(ball.rad[0])
+    assert any(off)  # some results are no floating-point numbers
 
 
 def test_dividing_by_what_may_be_zero_says_nothing():
