@@ -1,0 +1,96 @@
+"""The parts of `.ci/slow`: they hold every slow test once, and a part that has passed is not run again."""
+
+import subprocess
+import sys
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SCRIPT = ROOT / ".ci" / "slow"
+pytestmark = pytest.mark.skipif(not SCRIPT.exists(), reason="the script is no part of a source distribution")
+
+
+@pytest.fixture
+def slow(monkeypatch):
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    spec = spec_from_loader("slow", SourceFileLoader("slow", str(SCRIPT)))
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def project(slow, tmp_path, monkeypatch):
+    """A repository with a part of two tests, and another test that is skipped."""
+    (tmp_path / "tests" / "a").mkdir(parents=True)
+    (tmp_path / "tests" / "a" / "test_it.py").write_text(
+        "from pathlib import Path\nimport pytest\npytestmark = pytest.mark.slow\n\ndef test_it():\n    pass\n\n"
+        "def test_what_may_fail():\n    assert not Path('a.fails').exists()\n"
+    )
+    (tmp_path / "tests" / "test_other.py").write_text(
+        "import pytest\n\n@pytest.mark.slow\ndef test_other():\n    pytest.skip('no browser')\n\ndef test_fast():\n    pass\n"
+    )
+    settings = "markers = slow\naddopts = -m 'not slow' --import-mode=importlib -p no:cacheprovider -p xdist\n"
+    (tmp_path / "pytest.ini").write_text(f"[pytest]\n{settings}")
+    (tmp_path / ".gitignore").write_text("*.fails\n*.stops\n.pytest_cache/\n__pycache__/\n")
+    for words in (["init", "-q"], ["add", "."], ["-c", "user.name=x", "-c", "user.email=x@x", "commit", "-qm", "All"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    for name, value in {"ROOT": tmp_path, "PARTS": {"a": ("tests/a",)}, "ONLY_SLOW": {}}.items():
+        monkeypatch.setattr(slow, name, value)
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # they import JAX
+    return tmp_path
+
+
+def test_results_of_parts_are_those_of_pytest(slow, project):
+    parts = slow.collect(sys.executable)
+    assert {name: len(tests) for name, tests in parts.items()} == {"a": 2, "rest": 1}
+    (project / "a.fails").touch()
+    one, rest = (slow.run_part(sys.executable, tests, []) for tests in parts.values())
+    assert (one["result"], one["passed"], one["failed"], one["skipped"]) == ("failed", 1, 1, 0)
+    assert (rest["result"], rest["skipped"], rest["words"]) == ("skipped", 1, "no browser")
+
+
+def test_a_part_that_has_passed_for_a_commit_is_not_run_again(slow, project, monkeypatch):
+    ran = []
+
+    def run_part(python, tests, more):
+        if (project / f"{tests[0]}.stops").exists():
+            raise KeyboardInterrupt
+        ran.append(tests[0])
+        failed = (project / f"{tests[0]}.fails").exists()
+        return {"result": "failed" if failed else "passed", **dict.fromkeys(slow.COUNTED, 0), "words": "", "when": "now"}
+
+    def call(*words):
+        ran.clear()
+        monkeypatch.setattr(sys, "argv", ["slow", "--venv", sys.prefix, *words])
+        return slow.main(), ran
+
+    monkeypatch.setattr(slow, "run_part", run_part)
+    monkeypatch.setattr(slow, "collect", lambda python: {"a": ["a"], "b": ["b"], "c": ["c"]})
+    (project / "a.fails").touch()
+    assert call() == (1, ["a", "b", "c"])
+    assert call("b") == (0, ["b"])
+    (project / "a.fails").unlink()
+    assert call("--list") == (1, [])
+    assert call() == (0, ["a"])
+    assert call("--list") == (0, [])
+    (project / "pytest.ini").write_text("[pytest]\n")  # not committed: that is something else
+    (project / "b.stops").touch()
+    with pytest.raises(KeyboardInterrupt):
+        call()
+    (project / "b.stops").unlink()
+    assert call() == (0, ["b", "c"])
+
+
+def test_each_slow_test_is_in_one_part_and_what_is_named_exists(slow):
+    paths = [path for own in slow.PARTS.values() for path in own]
+    assert len(paths) == len(set(paths)) and all((ROOT / path).exists() for path in paths)
+    for file, own in slow.ONLY_SLOW.items():
+        text = (ROOT / file).read_text()
+        assert all(f"def {name}(" in text for name in own if name) and "pytest.mark.slow" in text
+    assert slow.part_of("tests/native/test_ir.py") == "native"
+    assert slow.part_of("tests/native/wasm/test_engine.py") == "webassembly"
+    assert slow.part_of("tests/test_cli.py") == "rest"
