@@ -34,6 +34,7 @@ from udkjax.expressions.selection import absolute as absolute
 from udkjax.expressions.selection import greater as greater
 from udkjax.expressions.selection import maximum as maximum
 from udkjax.expressions.selection import where as where
+from udkjax.expressions.unroll import ArrayPlace as ArrayPlace
 from udkjax.expressions.unroll import Arrays as Arrays
 from udkjax.expressions.unroll import unroll as unroll
 
