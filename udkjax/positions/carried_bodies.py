@@ -1,7 +1,7 @@
-"""Bodies that hang on a single other one: a wheel on its axle, a pendulum on a link.
+"""Bodies connected to a single other one: a wheel on its axle, a pendulum on a link.
 
-However that one moves, such bodies may be carried along by it as they are: what joins them to it stays closed. So they limit no
-coordinate of the others, and where they are free to move besides, it follows from the others as if they were not there.
+The other body, the carrier, can move them rigidly with itself without opening their joints. They thus limit no coordinate of the
+other bodies, and positions of the others follow as if they were absent.
 """
 
 from collections.abc import Mapping
@@ -20,16 +20,16 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import library_for
 from udkjax.scene.mechanism import Mechanism, Origin
 
-ANY_MOTION = (0.3, -0.2, 0.7)  # characteristic lengths and rad: whatever is invariant under it is so in general
+ANY_MOTION = (0.3, -0.2, 0.7)  # characteristic lengths and rad: generic, so that an invariance under it is general
 
 
 class CarriedBodies(NamedTuple):
-    """Bodies to leave out, each with the one that carries it, by their places; -1: the ground."""
+    """Bodies to leave out, each with its carrier, by index; -1: the ground."""
 
     carrier: dict[int, int]
 
     def without(self, mechanism: Mechanism) -> Mechanism:
-        """Return the mechanism without these bodies, and without forces, on which positions do not depend."""
+        """Return the mechanism without these bodies, and without forces, which positions do not depend on."""
         names = [mechanism.body_names[k] for k in self.carrier]
         keeps = lambda element: not set(names) & set(mechanism.frames_of(element))  # noqa: E731
         joints = {name: x for name, x in mechanism.joints.items() if keeps(x)}
@@ -40,11 +40,11 @@ class CarriedBodies(NamedTuple):
         return Mechanism(bodies, joints, drivers, {}, mechanism.gravity, mechanism.name, origin)
 
     def kept(self, count: int) -> np.ndarray:
-        """Return the places of the other bodies, of so many in all."""
+        """Return the indices of the other bodies among `count`."""
         return np.array([k for k in range(count) if k not in self.carrier], int)
 
     def carry(self, start: Float[Array, "bodies 3"], others: Float[Array, "kept 3"]) -> Float[Array, "bodies 3"]:
-        """Return the position of all bodies where the others are: these as they were to their carriers at the start."""
+        """Return the positions of all bodies: carried ones keep their pose relative to their carriers at the start."""
         xp, kept = library_for((start, others)), self.kept(len(start))
         is_reached = xp.all(xp.isfinite(others))
         placed = dict(zip(kept.tolist(), xp.where(is_reached, others, 0.0), strict=True))
@@ -60,9 +60,9 @@ class CarriedBodies(NamedTuple):
 
 
 def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping[str, NumberLike] | None) -> CarriedBodies:
-    """Return the bodies that hang on a single other one, where something is free to move while a coordinate is driven.
+    """Return the bodies connected to a single other one, if degrees of freedom remain while a coordinate is driven.
 
-    Where all numbers of a mechanism are traced it is not known what is free: none.
+    With all numbers traced, the degrees of freedom are unknown and no bodies are returned.
     """
     concrete = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     element, taken = element_of(mechanism, driver), [element_of(mechanism, name) for name in held or {}]
@@ -86,7 +86,7 @@ def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping
 
 
 def _parts_without(body: int, groups: list[set[int]], count: int) -> list[set[int]]:
-    """Return the sets of bodies that are connected with each other without one; the ground is -1."""
+    """Return the sets of bodies that remain connected once one body is removed; the ground is -1."""
     parts = [{k} for k in range(-1, count) if k != body]
     for group in groups:
         joined = [part for part in parts if part & group]
@@ -96,7 +96,7 @@ def _parts_without(body: int, groups: list[set[int]], count: int) -> list[set[in
 
 
 def _is_carried(mechanism: Mechanism, part: set[int], carrier: int) -> bool:
-    """Return True if what joins a part to its carrier does not change where both move as one."""
+    """Return True if the constraints of a part stay closed when it moves rigidly with its carrier."""
     rows, names = KinematicRows(mechanism), mechanism.body_names
     moving = {names[k] for k in part}
     of_part = [name for name, x in mechanism.constraints.items() if moving & set(mechanism.frames_of(x))]

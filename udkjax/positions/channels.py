@@ -1,12 +1,12 @@
-"""Channels: what can be measured of a motion, each under a name in the dialect of the parameters' names.
+"""Channels: measurable quantities of a motion, named like parameters.
 
     body.NAME.x  y  angle  vx  vy  omega  ax  ay  alpha       centre of mass and angle, their rates and accelerations
     body.NAME(px, py).x  y  vx  vy  ax  ay                    a point given in the body's own frame (m)
     pin.NAME.x  y  vx  vy  ax  ay                             the point of a joint; joint.NAME.x is the same
     joint.NAME.angle  omega  alpha                            theta_2 - theta_1 of the joint's two bodies: an encoder at the pin
-    joint.NAME.fx  fy  torque                                 what the joint does to its second body, as in `reactions`
-    joint.NAME.BODY.fx  fy  torque                            what it does to one that is named
-    driver.NAME.load                                          what the driver exerts on its second body along its coordinate
+    joint.NAME.fx  fy  torque                                 load of the joint on its second body, as in `reactions`
+    joint.NAME.BODY.fx  fy  torque                            load of the joint on the named body
+    driver.NAME.load                                          load of the driver on its second body along its coordinate
     distance.BODY(px, py).BODY2(px, py)                       between two points; a body may be "ground"
 
 Torques are about the centre of mass, those on the ground about the origin. SI units throughout.
@@ -52,25 +52,25 @@ class StateHistory(Protocol):
 
 @dataclass(frozen=True)
 class Channel:
-    """One measured quantity: plain data, equal where the canonical names are, and so fit to be static in a compiled program."""
+    """One measured quantity: plain data, equal if the canonical names are, and thus static in a compiled program."""
 
     name: str
     units: str
     needs: Needs
     section: str  # body, joint, pin, driver or distance
     owner: str  # the joint or driver; else empty
-    bodies: tuple[str, ...]  # the bodies that it belongs to: two for an angle at a joint, or a distance
+    bodies: tuple[str, ...]  # its bodies: two for an angle at a joint or a distance
     points: tuple[LocalPoint, ...] = ()  # of each body
     quantity: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """A channel of the user's own, equal only to itself: made once and used again, it compiles once.
+    """A user-defined channel, equal only to itself: created once and reused, it compiles once.
 
     Attributes:
         name: name in tables and messages.
-        function: of the mechanism and its solution, written in jax.numpy; returns (T,) in `units`.
+        function: function of the mechanism and its solution, written in jax.numpy; returns (T,) in `units`.
         units: SI units, as text.
     """
 
@@ -90,21 +90,20 @@ class Quantity:
 
 
 def has_point(joint: Joint) -> bool:
-    """Return whether a joint is at a point."""
     return getattr(joint, "points", None) is not None
 
 
 def pins_of(mechanism: Mechanism) -> list[str]:
-    """Return the names of all points that a mechanism names: joints, and pins of its drawing where no two links meet."""
+    """Return the names of all named points: joints, and pins of the drawing at which no two links meet."""
     drawn = () if mechanism.drawing is None else mechanism.drawing.groups["pin"]
     joints = [name for name, joint in mechanism.joints.items() if has_point(joint)]
     return [*joints, *(name for name in drawn if name not in mechanism.joints)]
 
 
 def point_of_pin(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"]]:
-    """Return a body, or "ground", and the point (m) in its frame where a joint is, or a pin of the drawing.
+    """Return a body, or "ground", and the point (m) in its frame of a joint, or of a pin of the drawing.
 
-    Where a joint holds two points, such as a slot, a distance or a cam, it is the one of its second body.
+    Joints with two points, such as a slot, a distance or a cam, have the point of their second body.
     """
     if name in mechanism.joints:
         joint = mechanism.joints[name]
@@ -117,10 +116,10 @@ def point_of_pin(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"
 
 
 def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple[str, Float[Array, "2"]]:
-    """Return the body, or "ground", and the point (m) in its frame that are meant by a name and, of a body, a point.
+    """Return the body, or "ground", and the point (m) in its frame for a name and, if it is a body, a point.
 
     Raises:
-        ValueError: no body or joint of this name, or a joint without a point; the message says what was probably meant.
+        ValueError: no body or joint of this name, or a joint without a point; the message suggests another name.
     """
     section, _, name = of.partition(".")
     known = {"body": (*mechanism.body_names, GROUND), "pin": pins_of(mechanism)}
@@ -158,7 +157,7 @@ def channel_of(mechanism: Mechanism, text: str) -> Channel:
     """Return the channel of a name; names of bodies and joints may contain dots.
 
     Raises:
-        ValueError: no such channel; the message says what is wrong and what was probably meant.
+        ValueError: no such channel; the message suggests another name.
     """
     text = text.strip()
     section, _, rest = text.partition(".")
@@ -242,7 +241,7 @@ _PARSERS: dict[str, Callable[[Mechanism, str], Channel]] = {
 
 
 def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
-    """Split a text into one of these names, the longest that fits, and what follows it."""
+    """Split a text into the longest of these names that it begins with, and the rest."""
     fitting = [name for name in names if text.startswith(name) and text[len(name) :].startswith((".", "("))]
     if fitting or text in names:
         name = max(fitting, key=len, default=text)
@@ -255,7 +254,7 @@ def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
 
 
 def _split_point(text: str, default: LocalPoint | None = None) -> tuple[LocalPoint, str]:
-    """Split a text into the point that it begins with and what follows it."""
+    """Split a text into the point that it begins with, and the rest."""
     if not text.startswith("("):
         if default is None:
             raise ValueError("must be distance.BODY(px, py).BODY2(px, py): each body needs a point, in its own frame (m)")

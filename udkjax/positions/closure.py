@@ -1,4 +1,4 @@
-"""The closure of a mechanism as a function of its numbers: by machine code or by JAX, with derivatives of any order."""
+"""Closure of a mechanism as a function of its numbers: by machine code or JAX, with derivatives of any order."""
 
 import operator
 
@@ -24,7 +24,7 @@ NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales
 
 
 class MotionFrom(Motion):
-    """A motion law whose time zero is a time of another one (s): of its numbers one, it has derivatives by machine code."""
+    """A motion law shifted in time: machine code has derivatives by its `start` (s), as by any number of the mechanism."""
 
     motion: Motion
     start: Number
@@ -34,7 +34,7 @@ class MotionFrom(Motion):
 
 
 def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
-    """Return a mechanism whose drivers are at time zero where they are at time t."""
+    """Return a mechanism whose drivers have at time zero their values of time t."""
     if not mechanism.drivers:
         return mechanism
     motions = lambda x: [driver.motion for driver in x.drivers.values()]  # noqa: E731
@@ -65,7 +65,7 @@ class AssemblyFunction(DifferentiableFunction):
 
     @property
     def _has_second(self) -> bool:
-        """True where machine code has second derivatives: where no rows contradict each other beside the manifold."""
+        """True if machine code has second derivatives: if no rows contradict each other off the manifold."""
         return self.guess.rest[1].redundant_rows == ()
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
@@ -103,7 +103,7 @@ class AssemblyFunction(DifferentiableFunction):
         return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
 
     def _native(self, inputs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
-        """Return the arguments of machine code and the inputs with tangents; None where it has no such derivatives."""
+        """Return the arguments of machine code and the inputs with tangents; None if it lacks these derivatives."""
         which = self.guess.marks(has_tangent)
         mechanism, analysis, t, q, v = self.guess(inputs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
@@ -139,10 +139,10 @@ def _close_position(rows: TracedRows, t: Array, q: Array) -> Array:
 
 
 def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
-    """Take the same steps as `_close_position`, in a loop of fixed length that reverse mode can follow.
+    """Take the steps of `_close_position` in a loop of fixed length, for reverse mode.
 
-    A step that no longer lowers the residual is taken in the derivative all the same: at a closed state it changes nothing but
-    the tangent, which it projects to the manifold.
+    A step that no longer lowers the residual is taken nevertheless: at a closed state it only projects the tangent to the
+    manifold.
     """
 
     def body(q, _):

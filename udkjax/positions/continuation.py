@@ -6,14 +6,14 @@ simple root of a smooth function. With X = (q, s), each measured by its scale, a
     tangent    tau = (I - E^+ E) tau_before, of unit length: it keeps its direction, so that the curve is never turned around;
     predictor  X + h tau;        corrector  X <- X - E^+ Psi(X), the smallest change that removes the residual.
 
-A step counts if the corrector converges near the prediction and the tangent has turned little; else it is halved. So the branch
-stays the same, or the curve is lost and says so. E^+ is truncated: redundant constraints do no harm, and where branches meet,
-which costs E rank, the old tangent leads across.
+A step is accepted if the corrector converges near the prediction and the tangent has turned little; otherwise it is halved. So
+the branch stays the same, or the status says that the curve is lost. E^+ is truncated: constraints may be redundant, and where
+branches meet and E loses rank, the old tangent leads across.
 
-The sign of det [E; tau] changes where a branch meets another, and so it does where a step went over to one that only comes close:
-such a step counts if it is short. Branches that come closer to each other than that are taken for branches that meet.
+The sign of det [E; tau] changes where a branch meets another, and also where a step jumps to a neighbouring branch: such a step
+is accepted only if it is short. Branches closer than that are taken for branches that meet.
 
-A value so near to a meeting of branches that its own E is of no use is found across it (crossing.py).
+At values so close to a meeting of branches that E is useless, positions are interpolated across it (crossing.py).
 
 Source: Allgower, Georg, Introduction to Numerical Continuation Methods (2003), chapters 2 and 9.
 """
@@ -34,12 +34,12 @@ from udkjax.positions.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Cros
 from udkjax.positions.curve import AbstractCurve
 from udkjax.printing import PrintsWords
 
-FIRST_STEP, LONGEST_ARC, SHORTEST_ARC = 0.1, 0.3, 1e-9  # steps along the arc; one is a characteristic length, or a radian
-LARGEST_BEND = 0.95  # cosine of the angle by which the tangent may turn in a step: 18 degrees; branches that cross differ by more
-PREDICTION_TOL = 0.3  # of a step: how far its end may lie from the prediction
-MAX_SECANTS = 60  # until a root is rounding; ten are usual
-MAX_TRIALS = 2000  # steps besides those to the values asked for: some hundred turns
-AT_TOGGLE = 8.0  # units of rounding within which a value is that of a toggle
+FIRST_STEP, LONGEST_ARC, SHORTEST_ARC = 0.1, 0.3, 1e-9  # steps along the arc, in characteristic lengths or radians
+LARGEST_BEND = 0.95  # cosine of the largest turn of the tangent in a step, 18 degrees; crossing branches differ by more
+PREDICTION_TOL = 0.3  # largest distance of a step's end from the prediction, relative to the step
+MAX_SECANTS = 60  # of a root; ten are usual
+MAX_TRIALS = 2000  # extra steps between requested values: some hundred turns
+AT_TOGGLE = 8.0  # units of rounding within which a value equals that of a toggle
 
 T = TypeVar("T")
 
@@ -48,35 +48,35 @@ class Reached(PrintsWords):
     """Outcome for one value of a driver."""
 
     closed = 0
-    singular = 1  # closed; branches meet here, and velocities are those of the one that is followed, from both of its sides
-    beyond_limit = 2  # a toggle, the limit of travel, lies before it
+    singular = 1  # closed; branches meet, and velocities are those of the followed one, interpolated from both sides
+    beyond_limit = 2  # a toggle, the limit of travel, comes first
     lost = 3  # no step, however short, follows the branch
-    open = 4  # the mechanism cannot be closed where it starts
-    not_determined = 5  # closed; but velocities do not follow from the driver's: a toggle, or branches too close to distinguish
+    open = 4  # the mechanism cannot be closed at the start
+    not_determined = 5  # closed, but velocities do not follow from the driver's: a toggle, or branches too close to tell apart
 
     @classmethod
     def has_position(cls, status: Int[Array, "..."]) -> Bool[Array, "..."]:
-        """Tell of which values the position is known."""
+        """Return a mask of the values with a position."""
         return (status == cls.closed) | (status == cls.singular) | (status == cls.not_determined)
 
 
 class Points(NamedTuple):
-    """Positions along the values, their derivatives by the value, and what became of each; and the toggle, if one was met."""
+    """Positions over the values, their derivatives by the value and statuses, and the toggle, if one was met."""
 
     q: Float[Array, "T n"]
     dq: Float[Array, "T n"]
     ddq: Float[Array, "T n"]
     status: Int[Array, "T"]
     dddq: Float[Array, "T n"]  # where branches meet
-    spacing: Float[Array, "T"]  # of the points of the branch beside it, likewise: h in crossing.py
-    limit: Float[Array, ""]  # the value at the toggle; infinite where none was met
+    spacing: Float[Array, "T"]  # spacing h of neighbouring points on the branch (crossing.py), where branches meet
+    limit: Float[Array, ""]  # the value at the toggle; infinite if none was met
     limit_q: Float[Array, "n"]
 
 
 class _Search(NamedTuple):
-    """A root along the arc that is being bracketed by the rule of Illinois: secants, of which a side that stays counts half."""
+    """A bracketed root along the arc, searched by the Illinois method (regula falsi that halves a retained end)."""
 
-    sigma: Float[Array, ""]  # where the function was looked at last
+    sigma: Float[Array, ""]  # last place of evaluation
     value: Float[Array, ""]
     other: Float[Array, ""]  # the other side of the bracket
     other_value: Float[Array, ""]
@@ -90,13 +90,13 @@ class _State(NamedTuple):
     h: Float[Array, ""]
     k: Int[Array, ""]  # the next value
     trials: Int[Array, ""]
-    event: Int[Array, ""]  # a `Reached`, or what else is to be done
+    event: Int[Array, ""]  # a `Reached`, or one of the events below
     search: _Search
     points: Points
 
 
-# Events beside the outcomes of `Reached`: the start is to be closed; X is the next value's; a toggle lies within the next step,
-# or the next value before that toggle, and is searched for.
+# Events in addition to the outcomes of `Reached`: close the start; X belongs to the next value; search for a toggle within the
+# next step, or for the next value before that toggle.
 _START, _LANDS, _TOGGLE, _VALUE = -1, -2, -3, -4
 
 
@@ -108,12 +108,12 @@ def follow(
     points: Points,
     first: int | Int[Array, ""],
 ) -> Points:
-    """Find positions at values[first:], one after another, from a position q at the value s; those before are in `points`.
+    """Find positions at values[first:], in sequence from a position q at the value s; `points` has the earlier ones.
 
-    Of a batch one member follows another: side by side all would take as many steps as the slowest. Without derivatives.
+    Batch members run sequentially, since in lockstep all would take the steps of the slowest. There are no derivatives.
     """
     if curve.by.xp is np:
-        with np.errstate(all="ignore"):  # positions that are not finite are not closed
+        with np.errstate(all="ignore"):  # non-finite positions are not closed
             return _follow(curve, s, q, values, points, first) if first < len(values) else points
     return sequential(_follow, curve, s, q, values, points, first)
 
@@ -158,9 +158,9 @@ def _follow(
 
 
 def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _State) -> _State:
-    """Look at one more point: the start, the end of a step towards the next value or right at it, or one of a search.
+    """Correct one more point: the start, the end of a step towards the next value or exactly at it, or a point of a search.
 
-    There is one corrector for all, since what is traced more often takes as many times as long to compile.
+    One corrector serves all of them, since compile time grows with every traced copy.
     """
     xp = curve.by.xp
     X, h, target, starts, searches = state.X, state.h, targets[state.k], state.event == _START, state.event <= _TOGGLE
@@ -176,7 +176,7 @@ def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _St
     at, closed = curve.correct(ahead, fixed=lands | starts)
     turned, side, clearance = curve.tangent(at, tau)
 
-    def begin() -> _State:  # where branches meet, one of them is taken
+    def begin() -> _State:  # at a meeting of branches one of them is taken
         return state._replace(X=at, tau=turned, side=side, event=xp.where(closed, _LANDS, Reached.open))
 
     def narrow() -> _State:
@@ -222,17 +222,17 @@ def _advance(
     clearance: Float[Array, ""],
     most: int,
 ) -> _State:
-    """Return the state after a step to `at`, of the length eta, if that step counts."""
+    """Return the state after a step of length eta to `at`, if the step is accepted."""
     xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
     rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
     near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding
-    # A residual along what E^+ truncates stays; it is of second order in the step, and a step further is corrected again.
+    # A residual along directions that E^+ truncates remains; it is of second order in the step, and corrected in the next.
     closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(at) <= CLOSED_TOL))
     good = near & (turned @ tau >= LARGEST_BEND) & closed
-    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # only a close tangent leads across
-    good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # else on a branch that comes close
+    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # only a nearby tangent leads across
+    good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # otherwise on a neighbouring branch
     folds = good & (turned[-1] * tau[-1] < 0) & (eta > 0)
-    passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next one is shorter
+    passed = good & ~lands & ~folds & ((target - at[-1]) * way < 0)  # too far: the next step is shorter
     counts = good & ~folds & ~passed
     shorter = xp.where(passed, 0.5 * eta, xp.where(good, h, 0.5 * eta))
     longer = xp.where(turned @ tau > 1 - 0.25 * (1 - LARGEST_BEND), xp.minimum(1.5 * h, LONGEST_ARC), h)
@@ -251,7 +251,6 @@ def _advance(
 
 
 def _secant(search: _Search, xp: ArrayLibrary) -> Float[Array, ""]:
-    """Return the zero of the secant of a bracket."""
     a, fa, b, fb = search.other, search.other_value, search.sigma, search.value
     slope = fb - fa
     return xp.clip(b - fb * (b - a) / xp.where(slope != 0, slope, 1.0), xp.minimum(a, b), xp.maximum(a, b))
@@ -267,7 +266,7 @@ def _narrow(
     tangent: Float[Array, "n+1"],
     clearance: Float[Array, ""],
 ) -> _State:
-    """Return the state of a search after it looked at sigma: for the toggle first, and then for the value if it lies before."""
+    """Return the state of a search after an evaluation at sigma: first for the toggle, then for a value before it."""
     xp, last, end = curve.by.xp, state.search, state.h
     for_value = state.event == _VALUE
     value = way * xp.where(for_value, target - at[-1], tangent[-1])
@@ -277,12 +276,12 @@ def _narrow(
     ended = ended | (last.tries + 1 >= MAX_SECANTS)
     narrowed = state._replace(search=_Search(sigma, value, *other, last.tries + 1))
 
-    def beside() -> Array:
+    def across() -> Array:
         toggle, is_found = _at_seldom(curve, find_toggle, at, state.tau)
         return xp.where(is_found, toggle, at)
 
-    at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), beside, lambda: at)
-    # At the toggle: the value lies behind it, at it to rounding, or before.
+    at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), across, lambda: at)
+    # At the toggle: the value lies beyond it, at it to rounding, or before it.
     room = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
     ahead = (target - at[-1]) * way
     x, points = at * curve.units, state.points
@@ -299,14 +298,14 @@ def _narrow(
 
 
 def _at_seldom(curve: AbstractCurve, function: Callable[..., T], *given: Array) -> T:
-    """Return function(curve, *given), which a program hardly ever reaches."""
+    """Return function(curve, *given), which a program seldom needs."""
     return function(curve, *given) if curve.by.xp is np else call_seldom(function, curve, *given)
 
 
 def _record(curve: AbstractCurve, state: _State) -> _State:
-    """Store the point of the curve that is the next value's, where it is one, unless it is that of the start.
+    """Store the point of the curve if it is that of the next value, and not the start.
 
-    Near where branches meet, it and its derivatives are those of the branch's points on both sides.
+    Near a meeting of branches, it and its derivatives are interpolated from points of the branch on both sides.
     """
     by, xp = curve.by, curve.by.xp
     X, tau, k, points, lands = state.X, state.tau, state.k, state.points, state.event == _LANDS
@@ -315,11 +314,11 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
     dq, ddq, rank = curve.derivatives(X[-1] * curve.units[-1], X[:-1] * curve.units[:-1])
     current = Crossing(X, tau, dq, ddq, xp.zeros_like(dq), xp.zeros((), X.dtype))
 
-    def beside() -> tuple[Crossing, Array]:
+    def across() -> tuple[Crossing, Array]:
         other, is_found = _at_seldom(curve, find_crossing, X, tau)
         return jax.tree.map(lambda x, y: xp.where(is_found, x, y), other, current), is_found
 
-    found, is_found = by.cond(lands & (clearance < NEAR_LOSS), beside, lambda: (current, xp.asarray(False)))
+    found, is_found = by.cond(lands & (clearance < NEAR_LOSS), across, lambda: (current, xp.asarray(False)))
     X, tau, dq, ddq, dddq, spacing = found
     deficient = rank < len(X) - 1
     doubtful = ~is_found & (deficient | (clearance < LOST_RANK))
@@ -333,7 +332,7 @@ def _record(curve: AbstractCurve, state: _State) -> _State:
 
 
 def no_points(count: int, n: int, xp: ArrayLibrary) -> Points:
-    """Return points of which none is known yet."""
+    """Return points for `count` values, all without a position yet."""
     q, dq, ddq, dddq = (xp.zeros((count, n)) for _ in range(4))
     status = xp.full(count, int(Reached.lost))
     return Points(q, dq, ddq, status, dddq, xp.zeros(count), xp.asarray(np.inf), xp.full(n, np.inf))

@@ -1,10 +1,11 @@
-"""A point of a curve where branches meet, or close to it, from points of the same branch on both sides.
+"""A point of a curve at or near a meeting of branches, from points of the same branch on both sides.
 
-There E has a second null vector: Newton's method leaves the root of rounding in q, and divides it by the distance in q', by the
-square of that in q''. A branch is smooth all the same. So it is followed to twelve values around the point, two to seven steps h
-away on either side, where E is of use, and q, q' and q'' are those of the polynomials through these, whose errors are as h^12.
-The difference from ten values bounds them; of several h the one where it is least counts, if it is small, and only if the
-position closes to rounding. Where branches merely come close to each other, the curve turns between them, and it does not.
+At a meeting E has a second null vector: Newton's method leaves the root of rounding in q, over the distance in q', over its
+square in q''. The branch itself is smooth. It is therefore followed to twelve values around the point, two to seven steps h away
+on either side, where E is well conditioned, and q, q' and q'' are taken from the polynomials through these, with errors of order
+h^12. The difference from the polynomials through ten values bounds the errors; the h with the smallest bound is taken, and
+accepted if the bound is small and the position closes to rounding. It does not close where branches merely come close to each
+other, since the curve turns between them.
 """
 
 from typing import NamedTuple
@@ -17,9 +18,9 @@ from udkjax.positions.curve import AbstractCurve
 # Singular values of E, relative to the largest. Rounding errors of q, 1e-16 over sigma, are over sigma once more in q' and over
 # its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK all.
 NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
-CLOSE_DISTANCE = 0.02  # scaled: how far the point before may lie, whose tangent leads across; it turns by a degree or so
-# h, scaled values. Where the next singularity of q(s) is one unit away, the polynomials err by 3e-10, 3e-15 and less; rounding
-# leaves 2e-13, 2e-12 and 1e-11 in q'' if sigma grows by one in a unit, and with the smallest h the nearest point is at NEAR_LOSS.
+CLOSE_DISTANCE = 0.02  # scaled: largest distance of the previous point, whose tangent leads across; it turns by about a degree
+# h, scaled values. If the next singularity of q(s) is one unit away, the polynomials err by 3e-10, 3e-15 and less; rounding
+# leaves 2e-13, 2e-12 and 1e-11 in q'' if sigma grows by one per unit, and with the smallest h the nearest point is at NEAR_LOSS.
 SPACINGS = (0.04, 0.015, 0.005)
 # Steps h from the point to the nearest and to the farthest of the others, twelve in all: they multiply errors by 13. With fewer
 # the polynomials err more, with more or nearer ones rounding does.
@@ -48,7 +49,7 @@ def nodes(last: int) -> np.ndarray:
 
 
 class Crossing(NamedTuple):
-    """A point of a branch where branches meet, as its points on both sides say."""
+    """A point of a branch where branches meet, interpolated from both sides."""
 
     at: Float[Array, "n+1"]
     slope: Float[Array, "n+1"]  # the tangent
@@ -59,15 +60,15 @@ class Crossing(NamedTuple):
 
 
 def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
-    """Find a point, q', q'' and q''' from both sides of it.
+    """Return a point with q', q'' and q''', interpolated from both sides.
 
     Args:
         curve: the curve.
-        X: the point as it is known so far, of the value that counts.
-        tau: the direction of the branch there, roughly.
+        X: an approximation of the point, exact in the value.
+        tau: the approximate direction of the branch.
 
     Returns:
-        The crossing that was found, and whether it is to be relied on.
+        The crossing, and whether it is accepted.
     """
 
     def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
@@ -83,17 +84,17 @@ def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array
 
 
 def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Bool[Array, ""]]:
-    """Find a toggle where branches meet: where the value along the branch has an extremum, from points on both sides.
+    """Return a toggle where branches meet: the extremum of the value along the branch, from points on both sides.
 
-    They lie at known distances along tau, of which q and the value are polynomials, as of the value elsewhere.
+    q and the value are polynomials of the distance along tau.
 
     Args:
         curve: the curve.
         X: a point close to the toggle.
-        tau: the direction of the branch there, roughly.
+        tau: the approximate direction of the branch.
 
     Returns:
-        The toggle, and whether it is to be relied on.
+        The toggle, and whether it is accepted.
     """
     by, xp = curve.by, curve.by.xp
     found, doubt = by.map(lambda h: _extremum(curve, X, tau, h), xp.asarray(SPACINGS, X.dtype))
@@ -102,7 +103,7 @@ def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, 
 
 
 def _extremum(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array]:
-    """Return the extremum of the value by points h apart, and how far it is from being accepted: below one it is."""
+    """Return the extremum of the value by points h apart, and its error bound; below one it is accepted."""
     by, xp = curve.by, curve.by.xp
     along = NEAREST_NODE * h * xp.array([-1.0, 1.0])[:, None] * tau
 
@@ -144,7 +145,7 @@ def _evaluate_at(x: Array, coefficients: list[Array], places: Array) -> tuple[Ar
 
 
 def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the point, q', q'' and q''' by values h apart, and how far they are from being accepted: below one they are."""
+    """Return the point, q', q'' and q''' by values h apart, and their error bound; below one they are accepted."""
     by, xp = curve.by, curve.by.xp
     slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)
     ways = xp.array([-1.0, 1.0])

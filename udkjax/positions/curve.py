@@ -1,4 +1,4 @@
-"""The positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value: X = (q, s)."""
+"""Positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value, X = (q, s)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -19,17 +19,17 @@ from udkjax.positions.drive import Driven
 from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
 
-NEWTON_STEPS = 8  # corrections; three are usual
+NEWTON_STEPS = 8  # three are usual
 _Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
 
 
 class AbstractCurve(ABC):
-    """The positions of a driven mechanism, as a curve in scaled coordinates and value."""
+    """Positions of a driven mechanism as a curve in scaled coordinates and value."""
 
     weights: Any  # of the rows
     units: Any  # of coordinates and value
     rows: Any  # the scales of the rows
-    independent: tuple[int, ...]  # the rows that depend on no others
+    independent: tuple[int, ...]  # indices of the independent rows
 
     by: ClassVar[ControlFlow]
 
@@ -43,30 +43,30 @@ class AbstractCurve(ABC):
 
     @abstractmethod
     def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Any:
-        """Return E^+, truncated where singular values are below `tol` of the largest."""
+        """Return E^+, truncated where singular values are below `tol` times the largest."""
 
     @abstractmethod
     def inverse_singular_values(self, plus: Any) -> Float[Array, "k"]:
-        """Return 1/sigma of E^+ in the order of descending sigma, zero for what is truncated."""
+        """Return 1/sigma of E^+ in the order of descending sigma, zero where truncated."""
 
     @abstractmethod
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
         """Return gamma: Psi_q a = gamma holds Psi_dot at zero."""
 
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
-        """Return True if the residual is what rounding leaves of it."""
+        """Return True if the residual is rounding."""
         xp = self.by.xp
         return self.violation(X) <= ROUNDING_UNITS * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
 
     def violation(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
-        """Return the largest row of Psi in units of its scale."""
+        """Return the largest row of |Psi|, each relative to its scale."""
         xp = self.by.xp
         return xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
 
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
-        """Return the nearest point of the curve; `fixed`: of the same value. And whether there is one."""
+        """Return the nearest point of the curve, with the same value if `fixed`, and whether one was found."""
         xp = self.by.xp
-        if not len(self.rows):  # nothing binds the coordinates
+        if not len(self.rows):  # no constraints
             return X, xp.asarray(True)
 
         def body(state: _Correction) -> _Correction:
@@ -75,7 +75,7 @@ class AbstractCurve(ABC):
             E = xp.where(fixed & (np.arange(len(X)) == len(X) - 1), 0.0, E)
             return X - self.plus(E) @ self.residual(X), k + 1, self.is_closed(X)
 
-        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last correction is that of a closed point, to rounding
+        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last step corrects a point that is closed already
             _, k, closed = state
             return (k < NEWTON_STEPS) & ~closed
 
@@ -83,7 +83,7 @@ class AbstractCurve(ABC):
         return X, closed
 
     def clearance(self, X: Float[Array, "n+1"]) -> Any:
-        """Return the distance of E from losing rank, as where branches meet: its n-th singular value over the largest."""
+        """Return how far E is from losing rank, as where branches meet: its n-th singular value over the largest."""
         xp, E = self.by.xp, self.slopes(X)
         if min(E.shape) < len(X) - 1:
             return xp.zeros(())
@@ -93,11 +93,11 @@ class AbstractCurve(ABC):
         return sigma[len(X) - 2] / xp.where(sigma[0] > 0, sigma[0], 1.0)
 
     def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> tuple[Array, Array, Array]:
-        """Return the tangent that keeps the direction of one before, on which side of a meeting of branches it is, and clearance.
+        """Return the tangent in the direction of the previous one, its side of a meeting of branches, and the clearance.
 
-        The side is the sign of det [E; tau] of independent rows, +-1: along a branch it changes where that meets another alone,
-        and not at toggles. It is 1 where it is not known which rows are independent. The clearance is `clearance(X)`, of the
-        same decomposition, or zero where E^+ is truncated.
+        The side is the sign of det [E; tau] of independent rows, +-1: along a branch it changes only where the branch meets
+        another, not at toggles. It is 1 if the independent rows are unknown. The clearance is `clearance(X)` by the same
+        decomposition, or zero where E^+ is truncated.
         """
         xp, E = self.by.xp, self.slopes(X)
         plus = self.plus(E)
@@ -122,7 +122,7 @@ class AbstractCurve(ABC):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Curve(AbstractCurve):
-    """The positions of a mechanism whose numbers may be traced."""
+    """Positions of a mechanism whose numbers may be traced."""
 
     mechanism: Mechanism
     weights: Float[Array, "m"]
@@ -161,7 +161,7 @@ class Curve(AbstractCurve):
 
 @dataclass(frozen=True)
 class NumpyCurve(AbstractCurve):
-    """The positions of a mechanism of known numbers, by NumPy on the scene's programs: nothing is compiled for them."""
+    """Positions of a mechanism of concrete numbers, by NumPy on the scene's programs; nothing is compiled."""
 
     terms: DenseTerms
     weights: Float[np.ndarray, "m"]

@@ -1,7 +1,7 @@
-"""Coordinate that drives a mechanism through its positions: its value takes the place of time.
+"""Coordinate that drives a mechanism through its positions: its value s replaces time.
 
-A mechanism whose driver prescribes `coordinate = t` has the coordinate's value s for its time: Psi(s, q) = 0 are its positions,
-Psi_dot = 0 gives dq/ds, and Psi_q a = gamma gives d2q/ds2, by the equations that serve every other mechanism.
+With a driver that prescribes `coordinate = t`, Psi(s, q) = 0 are the positions, Psi_dot = 0 gives dq/ds, and Psi_q a = gamma
+gives d2q/ds2, by the equations of every other mechanism.
 """
 
 from collections.abc import Callable, Container, Mapping
@@ -33,11 +33,11 @@ from udkjax.scene.wording import join_names
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
-MOVES = 1e-6  # of the longest direction that is free, in the metric of the links' arms and radians: less is rounding
+MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians: less is rounding
 
 
 class Coordinate(PrintsLine):
-    """A coordinate of body 2 relative to body 1 that may be driven, as those of a `Driver`.
+    """A coordinate of body 2 relative to body 1 that can be driven, like that of a `Driver`.
 
     `angle`: theta2 - theta1 (rad), which counts turns; `x`, `y`: point 2 from point 1 in body 1's frame (m); `distance` (m).
 
@@ -64,15 +64,15 @@ class Coordinate(PrintsLine):
 
     @property
     def effort_unit(self) -> str:
-        """The unit of what acts along it."""
+        """The unit of the effort along it."""
         return self.driver(_constant(0.0)).effort_unit
 
 
-Drive = str | Coordinate | None  # a driver's name, the name of a coordinate, a coordinate; or all drivers along time
+Drive = str | Coordinate | None  # the name of a driver or coordinate, a coordinate; None: all drivers along time
 
 
 class ValueMotion(Motion):
-    """The value of a coordinate, in place of time, from an `origin` on (rad, m)."""
+    """The motion law origin + t: time is the value of a coordinate, counted from `origin` (rad, m)."""
 
     origin: Float[Array, ""] = eqx.field(converter=number_called("origin"), default=0.0)
 
@@ -81,7 +81,7 @@ class ValueMotion(Motion):
 
 
 class Driven(NamedTuple):
-    """A mechanism that is driven by a value s in place of time."""
+    """A mechanism driven by a value s in place of time."""
 
     mechanism: Mechanism
     analysis: Analysis
@@ -100,7 +100,7 @@ class Driven(NamedTuple):
         return "rad" if self.is_angle else "m" if self.name else "s"
 
     def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        """Return the value of the coordinate (rad, m) in a position: of NumPy, where all is known."""
+        """Return the value of the coordinate (rad, m) in a position, by NumPy if all numbers are concrete."""
         if is_traced((self.mechanism, q)):
             return constraints.psi(self.mechanism, 0.0, q)[self.row]
         return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
@@ -109,8 +109,8 @@ class Driven(NamedTuple):
 def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mapping[str, NumberLike] | None = None) -> Driven:
     """Return the mechanism driven by one coordinate; other drivers hold the value that they have at time t (s).
 
-    `held` gives other values, of drivers or of further coordinates, by their names. Raises `SceneError` where there is no such
-    driver or coordinate, or where positions do not follow from its value.
+    `held` gives other values, of drivers or of further coordinates, by name. Raises `SceneError` if there is no such driver or
+    coordinate, or positions do not follow from its value.
     """
     given = mechanism, driver, t, held
     with _at_once(given):
@@ -120,16 +120,16 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
 def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str, NumberLike] | None) -> Driven:
     if driver is None:
         if held:
-            problem = "held is given with driver=None, where all drivers go along time: name the one that drives"
+            problem = "held is given with driver=None, which moves all drivers along time: name the one that drives"
             raise SceneError([problem], mechanism.name)
         analysis = analyse(mechanism)
-        if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # nor where that is not known, of traced numbers
+        if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # nor if it is unknown, as numbers are traced
             problem = "driver is None, and the scene has no driver: name a coordinate that drives it, such as"
             raise SceneError([f"{problem} {suggested_coordinate(mechanism)}"], mechanism.name)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
-    names: dict[str, str] = {}  # of what is held, by the drivers that hold it
+    names: dict[str, str] = {}  # names of held coordinates, by the drivers that hold them
     for key, value in (held or {}).items():
         try:
             holder, element = _element(mechanism, key)
@@ -153,25 +153,25 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
 
 
 def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
-    """Return the function that gives the value (rad, m) of a driver's coordinate, or of another, of q (bodies, 3)."""
+    """Return the function of q (bodies, 3) that gives the value (rad, m) of a coordinate."""
     element = element_of(mechanism, coordinate)
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
     def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # of which JAX would compile a program to take a row
+        rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # JAX would compile a program to take a row
         return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
 
     return value
 
 
 def constant_speed(mechanism: Mechanism, driver: str) -> float:
-    """Return the speed (rad/s, m/s) of a driver that moves at a constant one; 0 of all other coordinates."""
+    """Return the speed (rad/s, m/s) of a driver with a constant one; 0 for every other coordinate."""
     motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
     return float(np.asarray(motion.coefficients)[1]) if isinstance(motion, Polynomial) and len(motion.coefficients) == 2 else 0.0
 
 
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
-    """Return the mechanism that its drivers no longer hold, with these forces instead of its own if any are given."""
+    """Return the mechanism without its drivers, with these forces instead of its own if any are given."""
     with jax.ensure_compile_time_eval():
         origin = mechanism.origin and Origin(with_drivers(mechanism.origin.mechanism, {}))
     return with_drivers(mechanism, {}, forces, origin)
@@ -191,9 +191,9 @@ def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
 
 
 def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
-    """Return the coordinate of a name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
+    """Return the coordinate of a channel's name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
 
-    These are names of channels, as measurements have them. Raises `SceneError`.
+    Raises `SceneError`.
     """
     try:
         channel = channel_of(mechanism, text)
@@ -221,14 +221,13 @@ def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coord
 
 
 def choose_name(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken."""
     while name in taken:
         name += "'"
     return name
 
 
 def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberLike) -> Mechanism:
-    """Return the mechanism with a driver of this name that goes along its own value; all others hold theirs."""
+    """Return the mechanism with a driver of this name that follows its own value; all others hold theirs."""
     concrete = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
         origin = concrete and Origin(_add_driver(concrete, name, _concrete_element(concrete, name, element), _value_or(t, 0.0)))
@@ -236,7 +235,7 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberL
 
 
 def with_halted_drivers(mechanism: Mechanism, t: NumberLike) -> Mechanism:
-    """Return the mechanism whose drivers stand still where they are at time t (s)."""
+    """Return the mechanism with its drivers halted at time t (s)."""
     return with_drivers(mechanism, _halted(mechanism, t))
 
 
@@ -245,7 +244,7 @@ def _halted(mechanism: Mechanism, t: NumberLike) -> dict[str, Driver]:
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
-    """Return the mechanism with one more driver, or with another motion of one that is there."""
+    """Return the mechanism with one more driver, or with another motion of an existing one."""
     drivers = {**mechanism.drivers, name: element.driver(motion)}
     concrete = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     found = with_drivers(mechanism, drivers)
@@ -253,7 +252,7 @@ def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: P
         return found
     with jax.ensure_compile_time_eval():
         element = _concrete_element(concrete, name, element)
-        motion = _constant(value_of(concrete, element)(concrete.q0))  # rows are counted as if the guess's value were held
+        motion = _constant(value_of(concrete, element)(concrete.q0))  # rows are counted as if the value of the guess were held
         of_origin = {**concrete.drivers, name: element.driver(motion)}
         return with_drivers(mechanism, drivers, origin=Origin(with_drivers(concrete, of_origin)))
 
@@ -271,14 +270,14 @@ def with_drivers(
 
 
 def _concrete_element(concrete: Mechanism, name: str, element: Coordinate) -> Coordinate:
-    """Return the same coordinate, with points and an axis that are not traced."""
+    """Return the same coordinate with a concrete axis and concrete points."""
     if name in concrete.drivers:
         return Coordinate.of(concrete.drivers[name])
     return jax.tree.map(lambda x: jnp.zeros(x.shape) if isinstance(x, Tracer) else x, element)
 
 
 def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
-    """Return the mechanism whose driver starts from its value in the initial guess: an analysis closes it at time zero."""
+    """Return the mechanism whose driver starts from its value in the initial guess, since an analysis closes it at time zero."""
     mechanism = mechanism if mechanism.origin is None else mechanism.origin.mechanism
     with _at_once(mechanism):
         value = jax.lax.stop_gradient(value_of(mechanism, name)(mechanism.q0))
@@ -286,7 +285,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
 
 
 def _at_once(given: PyTree) -> AbstractContextManager:
-    """Compute with known numbers at once, also while something else is traced."""
+    """Compute with concrete numbers at once, also while something else is traced."""
     traced = is_traced(given)
     return nullcontext() if traced else jax.ensure_compile_time_eval()
 
@@ -309,7 +308,7 @@ def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) 
 
 
 def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
-    """Return which coordinates x, y, angle of each body may move at the initial guess of known numbers."""
+    """Return which coordinates x, y, angle of each body can move at the initial guess."""
     rows = KinematicRows(mechanism)
     free = null_space(rows.at(0.0, np.ravel(mechanism.q0))[2], MOVES)
     moves = np.linalg.norm(free, axis=0).reshape(-1, 3) > MOVES
@@ -317,26 +316,26 @@ def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
 
 
 def suggested_coordinate(mechanism: Mechanism) -> str:
-    """Return the name of a coordinate that moves and may drive: an angle if there is one; any, of numbers that are not known."""
+    """Return the name of a coordinate that moves and can be driven, preferably an angle; any if numbers are traced."""
     moves = free_motion(mechanism) if mechanism.is_concrete else {}
     free = [f"body.{body}.{name}" for k, name in ((2, "angle"), (0, "x"), (1, "y")) for body in moves if moves[body][k]]
     return (free or [f"body.{mechanism.body_names[0]}.angle"])[0]
 
 
 def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:
-    """Refuse a driver whose coordinate the joints and the other drivers hold; numbers are known.
+    """Refuse a driver whose coordinate the joints and the other drivers hold.
 
-    It is held where its row of Psi_q depends on theirs in an ordinary position.
+    It is held if its row of Psi_q depends on theirs in a generic configuration.
 
     Args:
-        driven: the mechanism with the driver.
+        driven: the mechanism with the driver; its numbers are concrete.
         bare: the same without any driver.
-        name: of the driver in the mechanism.
+        name: name of the driver in the mechanism.
         driver: its name in the message.
         names: names of other drivers in the message, if not their own.
 
     Raises:
-        SceneError: it names the drivers that hold the coordinate.
+        SceneError: the coordinate is held; the message names the drivers that hold it.
     """
     q = generic_position(bare)
     involved = None if q is None else owners_of_row(kinematic_rows(driven), 0.0, q, name)

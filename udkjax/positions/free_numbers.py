@@ -1,4 +1,4 @@
-"""Numbers of a mechanism that are free, as one vector: batches of mechanisms differ in them, design searches over them."""
+"""Free numbers of a mechanism as one vector: those in which batches differ, and over which a design searches."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -18,11 +18,11 @@ class FreeNumbers:
     """Some numbers of a mechanism by name (`pin.A`, `pin.C[0]`, `link.crank.width`), and all of their entries as one vector.
 
     Args:
-        mechanism: mechanism that has the numbers.
-        names: names of those that are free.
+        mechanism: the mechanism.
+        names: names of the free numbers.
 
     Raises:
-        SceneError: a name is not that of a number, or named twice.
+        SceneError: a name is not that of a number, or is given twice.
     """
 
     def __init__(self, mechanism: Mechanism, names: Sequence[str]):
@@ -45,7 +45,7 @@ class FreeNumbers:
 
     @property
     def vector(self) -> Float[np.ndarray, "P"]:
-        """The numbers as they are."""
+        """The numbers of the mechanism."""
         return np.concatenate([np.zeros(0), *(np.ravel(x) for x in self.values)])
 
     def entries(self) -> list[str]:
@@ -56,12 +56,12 @@ class FreeNumbers:
         return found
 
     def split(self, x: Array | np.ndarray) -> dict[str, Array | np.ndarray]:
-        """Return the numbers by name, of a vector (..., P)."""
+        """Return the numbers of a vector (..., P) by name."""
         parts = zip(self.names, self.values, self.starts, self.starts[1:], strict=False)
         return {name: x[..., a:b].reshape((*x.shape[:-1], *np.shape(value))) for name, value, a, b in parts}
 
     def join(self, values: Mapping[str, object]) -> Float[np.ndarray, "M P"]:
-        """Return vectors, of batches (M, ...) by name; raise `SceneError` where one is missing or of another shape."""
+        """Return vectors of numbers given by name, each (M, ...); raise `SceneError` if one is missing or has another shape."""
         problems, arrays = [], []
         sizes = {len(x) for x in map(np.asarray, values.values()) if x.ndim}
         for name, value in zip(self.names, self.values, strict=True):
@@ -91,14 +91,14 @@ def position_model(
     origin: Callable[[Mechanism], Array] | None = None,
     shifted: bool = False,
 ) -> Callable[..., dict[str, jax.Array]]:
-    """Return the model of which position programs are made (equations/position_programs.py).
+    """Return the model that position programs are traced from (equations/position_programs.py).
 
     Args:
-        free: its numbers x.
-        driver: driver of the mechanism.
-        measures: of the mechanism, x, q (bodies, 3) and data.
-        origin: value of the driver that s counts from; by default from zero.
-        shifted: whether x has one more number, which s counts from.
+        free: the numbers x.
+        driver: the driver of the mechanism.
+        measures: function of the mechanism, x, q (bodies, 3) and data.
+        origin: the driver's value at s = 0, as a function of the mechanism; by default zero.
+        shifted: whether x has one more entry, which is added to s.
     """
 
     def model(x: Array, s: Array, q: Array, data: Array) -> dict[str, jax.Array]:

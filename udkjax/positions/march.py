@@ -1,4 +1,4 @@
-"""Positions of a driven mechanism by machine code (native/closing/marching.py), and how many of them are right."""
+"""Positions of a driven mechanism by machine code (native/closing/marching.py), and the number of correct ones."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -18,16 +18,16 @@ from udkjax.native.primitive import call_concrete, native_p, unsupported
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
-APPROACH = 16  # steps from where the mechanism is to the first value
-MOST_KNOTS = 100  # of motions by splines: their programs are whole, and take 10 ms to compile for each
-DEPENDENT = 1e-10  # of a row's square: the rest of a row that depends on others; march ends long before
+APPROACH = 16  # steps from the initial position to the first value
+MOST_KNOTS = 100  # of spline motions: their programs are whole, and compile for 10 ms per knot
+DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; march ends long before
 
 
 class MarchResult(NamedTuple):
-    """Positions and their derivatives by the value; the first `trusted` of them are closed, and on the course they began.
+    """Positions and their derivatives by the value; the first `trusted` of them are closed, and on one smooth course.
 
-    `side` is the sign of det Psi_q, or 1 where Psi_q is not square or nobody knows which rows are independent, and
-    `first_side` that of the start.
+    `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown; `first_side` is that of the
+    start.
     """
 
     q: Float[Array, "T n"]
@@ -39,7 +39,6 @@ class MarchResult(NamedTuple):
 
 
 def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
-    """Tell whether machine code can follow a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")
@@ -49,9 +48,9 @@ def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
 def march(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow the positions over the values, from the closed position q at the value s. Without derivatives.
+    """Follow the positions over the values, from the closed position q at the value s, without derivatives.
 
-    The mechanism's driver has the value for its time; `unit` is what values are measured by.
+    Time is the value of the mechanism's driver; `unit` is the unit of the values.
     """
     inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
@@ -60,7 +59,7 @@ def march(
 def march_at_once(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow the positions with known numbers, by NumPy: nothing is traced or compiled for it."""
+    """Follow the positions of concrete numbers by NumPy; nothing is traced or compiled."""
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
@@ -94,13 +93,13 @@ def _inputs(
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:
-    """Return a mechanism whose loads with samples are zero: positions do not depend on them."""
+    """Return the mechanism with all sampled loads zero: positions do not depend on them."""
     loads = {place: x for place, x in mechanism.samples.items() if place[0] == "_forces"}
     return mechanism.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in loads.items()})
 
 
 def _of_unit_masses(mechanism: Mechanism, length: NumberLike, xp: ModuleType) -> Mechanism:
-    """Return bodies of 1 kg and the characteristic length for radius of gyration: positions do not depend on masses."""
+    """Return the mechanism with bodies of 1 kg and the characteristic length as radius of gyration."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
     one = xp.ones_like(length)
     return eqx.tree_at(bodies, mechanism, [one, length**2] * len(mechanism.body_names))

@@ -14,16 +14,16 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Prismatic, Revolute
 from udkjax.scene.mechanism import Mechanism
 
-FULL_TURN = 2 * np.pi * (1 - 1e-9)  # rad: a link that swings by more turns all the way round; the rest is rounding
+FULL_TURN = 2 * np.pi * (1 - 1e-9)  # rad: a link with a larger swing turns all the way round; the margin is for rounding
 
 
 class MotionRanges(PrintsTable):
-    """The ranges of a motion, over the positions that it consists of: between these, links may go a little farther.
+    """The ranges of a motion over its positions; between them links may go a little farther.
 
     Attributes:
-        swings: by body, the angle (rad) between the ends of its motion, of those that a revolute holds on the ground.
-        strokes: by body, the same length (m), of those that a prismatic joint holds on the ground.
-        transmission_angles: by joint, the least and the largest angle (rad, 0 to pi) between the two links that a pin joins.
+        swings: the swing angle (rad) of each body that a revolute joint connects to the ground.
+        strokes: the stroke (m) of each body that a prismatic joint connects to the ground.
+        transmission_angles: by joint, the least and the largest angle (rad, 0 to pi) between the two links of a pin.
     """
 
     swings: dict[str, Float[Array, ""]]
@@ -40,16 +40,16 @@ class MotionRanges(PrintsTable):
 def motion_ranges(mechanism: Mechanism, motion: StateHistory, driver: Drive = None) -> MotionRanges:
     """Return the swing angles and strokes of the links on the ground along a motion, and the ranges of its transmission angles.
 
-    Positions that the motion does not get to, which are not numbers, do not count.
+    Positions that are not reached (NaN) are ignored.
 
     Args:
         mechanism: the linkage.
         motion: anything with q (T, bodies, 3), a `Kinematics` or a `Solution`.
         driver: the driver or coordinate, as for `kinematics`: pins of the links that it drives have no transmission angle. None:
-            every pin counts that joins two moving links with one pin besides each.
+            every pin of two moving links, each with one other pin, has one.
 
     Returns:
-        A `MotionRanges`; not a number where the motion has no position.
+        A `MotionRanges`; NaN where the motion has no position.
 
     Raises:
         SceneError: no such driver or coordinate.
@@ -70,18 +70,18 @@ def motion_ranges(mechanism: Mechanism, motion: StateHistory, driver: Drive = No
         elif isinstance(joint, Revolute) and not set(moving) & set(driven):
             try:
                 found.transmission_angles[name] = _ends(transmission_angle(mechanism, motion, name))
-            except SceneError:  # between links of more pins than two each there is none
+            except SceneError:  # links with more than two pins have none
                 continue
     return found
 
 
 def _ends(x: Float[Array, "T *k"]) -> Float[Array, "2 *k"]:
-    """Return the least and the largest of the values that are numbers."""
+    """Return the least and the largest value, ignoring NaN."""
     return jnp.stack([jnp.nanmin(x, 0), jnp.nanmax(x, 0)])
 
 
 def range_lines(found: MotionRanges) -> dict[str, str]:
-    """Return ranges in words, by body or joint."""
+    """Return ranges as texts by body or joint."""
     swings, strokes, angles = (
         {name: np.asarray(x) for name, x in ranges.items() if np.all(np.isfinite(x))}
         for ranges in (found.swings, found.strokes, found.transmission_angles)
@@ -91,6 +91,6 @@ def range_lines(found: MotionRanges) -> dict[str, str]:
     }
     lines |= {name: f"slides by {x:.4g} m" for name, x in strokes.items()}
     for name, (least, largest) in angles.items():
-        if largest > 0:  # else all pins of a link are in one place
+        if largest > 0:  # otherwise all pins of a link coincide
             lines[f"angle at {name}"] = f"{np.degrees(least):.4g} to {np.degrees(largest):.4g} deg between its links"
     return lines

@@ -1,4 +1,4 @@
-"""Machine code that closes mechanisms (native/closing/closing.py): which it serves, and how their numbers go in and come out."""
+"""Mechanisms closed by machine code (native/closing/closing.py): support, inputs, outputs and derivatives."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -22,19 +22,18 @@ Closed = tuple[Array, Array, Array, Array, Array]
 
 
 def can_close(mechanism: Mechanism) -> bool:
-    """Return whether machine code can close a mechanism."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     return not unsupported(_close(mechanism).code)
 
 
 def close(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
-    """Return q closed, v as the constraints allow it, what is left of Psi and Psi_dot, and the rank of D, at time t."""
+    """Return q and v that satisfy the constraints at time t, the residuals Psi and Psi_dot, and the rank of D."""
     return _unpack(native_p.bind(*_inputs(mechanism, scales, t, q, v), operation=_close(mechanism), times=2), len(q))
 
 
 def close_concrete(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
-    """Close with known numbers, without tracing anything."""
+    """Close a mechanism of concrete numbers without tracing anything."""
     return _unpack(call_concrete(_close(mechanism), _inputs(mechanism, scales, t, q, v, np), 2), len(q))
 
 
@@ -45,13 +44,13 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 
 
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
-    """Return the changes of q and v along a `change` of what is active of (mechanism, scales, t, q, v)."""
+    """Return the changes of q and v along a `change` of the active leaves of (mechanism, scales, t, q, v)."""
     operation = CloseTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
     return _close_along(guess, operation, (active, change))
 
 
 def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
-    """Return the second derivatives of q and v along two changes, each of what is active in it."""
+    """Return the second derivatives of q and v along two changes, each with its active leaves."""
     operation = CloseSecondTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
     return _close_along(guess, operation, *changes)
 
@@ -66,7 +65,7 @@ def _close_along(guess: Any, operation: CloseTangents, *changes: tuple[Any, Any]
 
 
 def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
-    """Return the cotangents of what is active, from those of q and v."""
+    """Return the cotangents of the active leaves from those of q and v."""
     mechanism = guess[0]
     operation = CloseCotangents(_close(mechanism).code, active_numbers(mechanism, active[0]))
     bars = jnp.concatenate([qbar, vbar])[None]

@@ -1,4 +1,4 @@
-"""Machine code of positions of batches (native/closing/positions.py) for models of mechanisms; errors name the scene."""
+"""Position programs of batches and their machine code (native/closing/positions.py), with errors that name the scene."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from udkjax.scene.mechanism import Mechanism
 def compile_programs(
     mechanism: Mechanism, model: TracedModel, parameters: int, coordinates: int, **choices: Any
 ) -> PositionPrograms:
-    """Return the programs of a model; raise `SceneError` where positions do not follow."""
+    """Return the programs of a model; raise `SceneError` if positions do not follow from the driver."""
     try:
         return PositionPrograms(model, parameters, coordinates, **choices)
     except ValueError as problem:
@@ -20,7 +20,7 @@ def compile_programs(
 
 
 def position_code(mechanism: Mechanism, programs: PositionPrograms) -> PositionCode:
-    """Return the machine code of programs; raise `SceneError` where there is no instruction for something."""
+    """Return the machine code of programs; raise `SceneError` if an operation has no instruction."""
     try:
         return PositionCode(programs)
     except UnsupportedError as problem:

@@ -1,4 +1,4 @@
-"""Constraints that are open in a state, and the cause that keeps a mechanism from being closed."""
+"""Open constraints of a state, and the reason why a mechanism cannot be closed."""
 
 from collections.abc import Sequence
 
@@ -9,14 +9,14 @@ from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 
-MOST_NAMED = 8  # names in one sentence
+MOST_NAMED = 8  # in one sentence
 
 
 def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarray, tol: float) -> str:
     """Name the constraints whose residuals exceed `tol` of their scales, the widest first, with the residual."""
-    worst: dict[str, tuple[float, float]] = {}  # over the row's scale, and as it is
+    worst: dict[str, tuple[float, float]] = {}  # residual over the row's scale, and residual
     for name, r, unit in zip(names, np.abs(residual), scales, strict=True):
-        if not r / unit <= tol:  # also what is not a number
+        if not r / unit <= tol:  # also NaN
             worst[name] = max(worst.get(name, (0.0, 0.0)), (float(np.nan_to_num(r / unit, nan=np.inf)), float(r)))
     listed = sorted(worst, key=lambda name: -worst[name][0])
     text = ", ".join(f'"{name}" ({worst[name][1]:.2g})' for name in listed[:MOST_NAMED])
@@ -24,7 +24,7 @@ def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarra
 
 
 def name_not_finite(mechanism: Mechanism, x: np.ndarray, labels: Sequence[str] = COORDINATES) -> str:
-    """Name the entries of q or v (n,) that are not finite; an empty text where all are."""
+    """Name the entries of q or v (n,) that are not finite, as one text."""
     bad = [(body, label) for body in mechanism.body_names for label in labels]
     named = [f'{label} of "{body}"' for (body, label), value in zip(bad, x, strict=True) if not np.isfinite(value)]
     return ", ".join(named[:MOST_NAMED]) + (", ..." if len(named) > MOST_NAMED else "")
@@ -39,12 +39,12 @@ def explain_open(
     psi_dot: np.ndarray,
     scales: np.ndarray,
 ) -> str:
-    """Say why an assembly at time t (s) has failed: what is open, and whether drivers, joints or the guess are the reason.
+    """Explain why an assembly at time t (s) failed: the open joints, and whether drivers, joints or the guess are the cause.
 
     Args:
-        mechanism: the mechanism, of known numbers.
-        t: the time (s).
-        guess: the positions (n,) that it was closed from.
+        mechanism: the mechanism.
+        t: time (s).
+        guess: the initial positions (n,).
         names: the constraint of each row.
         psi: residual Psi (m,), in m or rad.
         psi_dot: residual Psi_dot (m,), in m/s or rad/s.
@@ -58,8 +58,8 @@ def explain_open(
         drivers = [name for name in dict.fromkeys(names) if name in mechanism.drivers and f'"{name}"' in text]
         who = f"driver{'s' * (len(drivers) > 1)} {' and '.join(map(_quote, drivers))} ask{'s' * (len(drivers) < 2)} for"
         return (
-            f"no velocities satisfy all constraints in this position; left over (m/s, rad/s): {text}. "
-            f"{who if drivers else 'They ask for'} a motion that the others forbid here: start elsewhere, or change it."
+            f"no velocities satisfy all constraints in this position; open (m/s, rad/s): {text}. "
+            f"{who if drivers else 'They ask for'} a motion that the others forbid here: change it, or start in another position."
         )
     wrong = name_not_finite(mechanism, guess)
     if wrong:
@@ -70,7 +70,7 @@ def explain_open(
         return cause + (
             "Check the points and lengths of these joints, or bring the initial positions and angles closer to a closed state."
         )
-    left = np.asarray(kinematic_rows(mechanism).at(t, closed)[0])  # where the joints are closed, only drivers are open
+    left = np.asarray(kinematic_rows(mechanism).at(t, closed)[0])  # with the joints closed, only drivers are open
     demands = []
     for name, driver in mechanism.drivers.items():
         off = float(left[list(names).index(name)])

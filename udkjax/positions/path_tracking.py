@@ -1,9 +1,9 @@
-"""Solutions of polynomial systems followed along paths of their parameters: many side by side, each with steps of its own.
+"""Path tracking of solutions of polynomial systems over their parameters: many paths in lanes, each with its own steps.
 
 H(z, p) = 0 has the solutions z(s) for p = p0 + s (p1 - p0). Each is predicted by the cubic through its last two points and
-their rates, and corrected by Newton's method; a step is taken where that converges as fast as it does near a solution. s goes
-from 0 to 1 on a curve of the complex plane, s = t + i c t (1 - t), so that another c is another way around the parameters at
-which solutions meet.
+their rates, and corrected by Newton's method; a step is accepted if Newton converges as fast as it does near a solution. s goes
+from 0 to 1 on a curve in the complex plane, s = t + i c t (1 - t), so that another c bypasses the parameters at which solutions
+meet on another side.
 """
 
 from typing import NamedTuple
@@ -13,24 +13,24 @@ import numpy as np
 from udkjax.expressions import ScalarProgram
 from udkjax.native.closing.batch_program import BatchProgram
 
-FIRST_STEP = 0.02  # of the way; predicted along the rate, and shortened where that is too far
-SHORTEST_STEP = 1e-10  # of the way: a path that takes shorter ones does not go on
-LEAST_SIZE = 1e-2  # units: least scale of an unknown
-LARGEST = 1e12  # units: an unknown beyond that has gone to infinity; generic solutions may be as far away as 1e8
-END_TOL = 1e-12  # a Newton step at the end, beside the unknowns, that rounding alone explains where F' is well conditioned
-END_CORRECTIONS = 12  # of Newton, which doubles the digits: far more than a regular solution takes
-GROWTH = 2.0  # of a step, at most
-# Towards the end of a path to infinity an unknown goes like a power of the way that is left, of a whole number or a fraction like
-# 1/3; none does on the way to a finite point. Within these bounds a power is one; the way is then at most NEAR_END.
+FIRST_STEP = 0.02  # of t, predicted along the tangent; shortened if too long
+SHORTEST_STEP = 1e-10  # of t: a path that needs shorter steps ends
+LEAST_SIZE = 1e-2  # least scale of an unknown
+LARGEST = 1e12  # a larger unknown has gone to infinity; generic solutions reach 1e8
+END_TOL = 1e-12  # last Newton step, relative to the unknowns; rounding alone explains it where F' is well conditioned
+END_CORRECTIONS = 12  # Newton steps at the end: far more than a regular solution takes
+GROWTH = 2.0  # largest growth of a step
+# Near the end of a path to infinity an unknown varies as a power of 1 - t, an integer or a fraction such as 1/3; on a path to a
+# finite point it does not. A power within these bounds, at 1 - t below NEAR_END, tells a path to infinity.
 POWERS = (0.1, 3.0)
 NEAR_END = 0.05
 ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3  # codes of the ends of paths
 
 
 class Precision(NamedTuple):
-    """Bounds to which paths are followed: of a prediction, and of the first and second correction, beside the unknowns.
+    """Bounds of the aimed-at prediction error and of the first and second correction, relative to the unknowns.
 
-    The closer, the less likely does one path go over to another.
+    The smaller they are, the less likely is a jump from one path to another.
     """
 
     aim: float = 1e-3
@@ -43,10 +43,10 @@ class TrackedPaths(NamedTuple):
 
     Attributes:
         z: unknowns (N, M).
-        status: of each path (M,): ACCEPTED at a regular solution; INFINITE where an unknown goes to infinity or to zero; SINGULAR
+        status: status of each path (M,): ACCEPTED at a regular solution; INFINITE if an unknown goes to infinity or 0; SINGULAR
             near a point where Newton's method does not converge to rounding; LOST short of the end.
-        t: end that each path reached (M,), up to 1.
-        steps: number of steps of each (M,).
+        t: last t of each path (M,), up to 1.
+        steps: number of steps of each path (M,).
     """
 
     z: np.ndarray
@@ -56,7 +56,7 @@ class TrackedPaths(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Paths under way: point, rate and t now, the same one step before, the next step, its number, and which path it is."""
+    """Active paths: point, rate and t, the same one step before, the next step, its number, and the index of the path."""
 
     z: np.ndarray
     rate: np.ndarray
@@ -76,8 +76,8 @@ class PathTracker:
     """Follow solutions of a system along lines of its parameters.
 
     Args:
-        program: from real and imaginary parts of z (N) and s, and of p0 and p1 - p0, to those of the Newton step and of dz/ds.
-        unknowns: N.
+        program: maps real and imaginary parts of z (N) and s, and of p0 and p1 - p0, to those of the Newton step and of dz/ds.
+        unknowns: the number N of unknowns.
     """
 
     def __init__(self, program: ScalarProgram, unknowns: int):
@@ -100,8 +100,8 @@ class PathTracker:
             start: parameters p0, complex.
             end: parameters p1.
             precision: precision of the tracking.
-            bend: c, of the way that s takes.
-            most: steps of a path.
+            bend: the bend c of the curve of s.
+            most: largest number of steps of a path.
         """
         precision = precision or Precision()
         moved = end - start
@@ -130,7 +130,7 @@ class PathTracker:
         return TrackedPaths(out, status, reached, taken)
 
     def polish(self, z: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return solutions (N, M) by Newton's method at some parameters, and whether it converged to rounding."""
+        """Return solutions (N, M) at some parameters by Newton's method, and whether each converged to rounding."""
         shared = np.concatenate([np.real(parameters), np.imag(parameters), np.zeros(2 * len(parameters))])
         zeros, best = np.zeros(z.shape[1]), np.full(z.shape[1], np.inf)
         for _ in range(END_CORRECTIONS):
@@ -169,7 +169,7 @@ class PathTracker:
 
 
 def _ends(p: _Points) -> np.ndarray:
-    """Return the ends of paths that do not go on, by the power with which their fastest unknown changes."""
+    """Return the statuses of ended paths, by the power of 1 - t of their fastest unknown."""
     left = 1.0 - p.t
     with np.errstate(invalid="ignore", divide="ignore"):
         power = np.max(np.abs(p.rate) / np.abs(p.z), axis=0) * left
@@ -179,17 +179,17 @@ def _ends(p: _Points) -> np.ndarray:
 
 
 def _predict(p: _Points, step: np.ndarray) -> np.ndarray:
-    """Extrapolate the cubic through the last two points; of a first step, the tangent."""
-    known = p.last > 0
-    before = np.where(known, p.last, 1.0)
+    """Extrapolate the cubic through the last two points; the first step, the tangent."""
+    has_two = p.last > 0
+    before = np.where(has_two, p.last, 1.0)
     u = 1.0 + step / before
     u2, u3 = u * u, u * u * u
     cubic = (2 * u3 - 3 * u2 + 1) * p.z_before + (u3 - 2 * u2 + u) * before * p.rate_before
     cubic += (3 * u2 - 2 * u3) * p.z + (u3 - u2) * before * p.rate
-    return np.where(known, cubic, p.z + step * p.rate)
+    return np.where(has_two, cubic, p.z + step * p.rate)
 
 
 def _relative(step: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return the largest of the unknowns' steps beside themselves (M,); infinite where one is not a number."""
+    """Return the largest step of an unknown relative to it (M,); infinite for NaN."""
     size = np.max(np.abs(step) / np.maximum(np.abs(z), LEAST_SIZE), axis=0)
     return np.where(np.isfinite(size), size, np.inf)

@@ -1,4 +1,4 @@
-"""Positions of batches of mechanisms that differ in some numbers, with exact derivatives by these, as machine code in lanes."""
+"""Positions of batches of mechanisms that differ in some numbers, with exact derivatives by these, by machine code in lanes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,15 +19,15 @@ from udkjax.scene.requirements import require_finite
 
 
 class BatchPositions(PrintsTable):
-    """Positions of M members at T values; not a number where a member does not get there on its branch.
+    """Positions of M members at T values; NaN where a member does not reach a value on its branch.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body, (M, T, bodies, 3).
-        dq: their derivatives by the value, (M, T, bodies, 3); None where none were asked for.
+        dq: their derivatives by the value, (M, T, bodies, 3); None if not requested.
         by_parameters: their derivatives by the free numbers, (M, T, bodies, 3, P), in the order of `entries`; or None.
-        reached: whether a member got there.
-        transmission: (M, T): how far a position is from where branches meet, from 0 to 1, with the sign of the branch. Of a
-            four-bar it is the sine of the transmission angle.
+        reached: whether a member reached a value (M, T).
+        transmission: distance of a position from a meeting of branches (M, T), from 0 to 1, with the sign of the branch; for a
+            four-bar the sine of the transmission angle.
         entries: the names of the P numbers.
         bodies: the names of the bodies.
     """
@@ -50,21 +50,21 @@ class BatchPositions(PrintsTable):
 
 @prints_table
 class PositionBatch:
-    """Positions of a driven mechanism for whole batches of its numbers: compiled once, then called as often as wanted.
+    """Positions of a driven mechanism for batches of its numbers, compiled once.
 
-    Each member goes from its own initial guess, closed, along its branch, as far as that leads; members lie side by side in
-    vector registers, and on all cores. Psi(s, q) = 0 is solved to rounding; with E = Psi_q, dq/ds = -E^+ Psi_s and
-    dq/dx = -E^+ Psi_x, by one elimination. Redundant constraints do no harm.
+    Each member follows its branch from its own closed initial guess, as far as the branch leads; members run in vector lanes and
+    on all cores. Psi(s, q) = 0 is solved to rounding; with E = Psi_q, dq/ds = -E^+ Psi_s and dq/dx = -E^+ Psi_x, by one
+    elimination. Constraints may be redundant.
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.
         driver: a driver or coordinate, as for `kinematics`.
         free: names of the numbers in which members differ: `pin.A`, `pin.C[0]`, `joint.B.points`.
-        derivatives: whether there are derivatives by the value and the free numbers.
+        derivatives: whether to compute derivatives by the value and the free numbers.
 
     Raises:
-        SceneError: no such driver or number, positions do not follow from the driver, or something in the mechanism for which
-            machine code has no instruction.
+        SceneError: no such driver or number, positions do not follow from the driver, or machine code cannot evaluate an
+            element of the mechanism.
     """
 
     @checked
@@ -90,18 +90,18 @@ class PositionBatch:
 
         Args:
             parameters: the free numbers of each member by name, (M, ...).
-            values: of the driver (rad, m; s where all drivers go along time), of all members or of each, in the order in which
-                they are reached.
-            threads: number of threads; by default that of the cores.
+            values: values of the driver (rad, m; s if all drivers follow time), shared by all members or one row for each, in the
+                order in which they are reached.
+            threads: number of threads; by default the number of cores.
 
         Raises:
-            SceneError: a free number is missing or of another shape.
-            ValueError: values that are not finite, or not (T,) or (M, T).
+            SceneError: a free number is missing or has another shape.
+            ValueError: values are not finite, or not of shape (T,) or (M, T).
         """
         x, s = self.free.join(parameters), np.asarray(values, float)
         require_finite("values", s)
         if s.ndim not in (1, 2) or (s.ndim == 2 and len(s) != len(x)):
-            raise ValueError(f"values must have the shape (T,), or ({len(x)}, T) for as many members; it is {s.shape}")
+            raise ValueError(f"values must have the shape (T,), or ({len(x)}, T) for {len(x)} members, not {s.shape}")
         found = self._code(x, s, self._unit, longest=LONGEST_STEP * float(self._driven.unit), threads=threads)
         return self._arrange(*found)
 
@@ -109,7 +109,7 @@ class PositionBatch:
         rows = [("bodies", ", ".join(self.free.mechanism.body_names)), ("free", ", ".join(self.free.entries()))]
         return PrintedTable("positions in batches", rows)
 
-    _shapes = _table  # its numbers are in compiled code
+    _shapes = _table  # the numbers are in compiled code
 
     def _arrange(self, q: np.ndarray, out: np.ndarray, end: np.ndarray) -> BatchPositions:
         M, T, n = q.shape

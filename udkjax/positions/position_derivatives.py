@@ -1,14 +1,14 @@
 """Derivatives of the positions of a driven mechanism, q(s), q' and q'', by the values and by all numbers of the mechanism.
 
-At an ordinary position they are those of one step of Newton's method. Where branches meet, Psi_q has lost rank, and a change
-p of a number that moves the constraints changes q(s) near the value s* there by
+In a generic configuration they are those of one step of Newton's method. Where branches meet, Psi_q loses rank, and a change
+p of a number of the constraints changes q(s) near the value s* of the meeting by
 
-    dq/dp = R / (s - s*) + what is smooth.
+    dq/dp = R / (s - s*) + a smooth part.
 
-If the residue R is zero, the branch goes on, moved by the smooth part; if not, the branches part, by the root of the change, and
-no derivative exists. Both are found as the position is, from points of the branch on both sides (crossing.py). R is linear in the
-change: of numbers that part the branches one by one, some change together may not, such as two cranks of one length. In forward
-mode such a change has its derivative; in reverse mode, which asks for each number by itself, what has none is not a number.
+If the residue R is zero, the branch is moved by the smooth part; otherwise the branches part, by the root of the change, and no
+derivative exists. Both parts are interpolated from points of the branch on both sides (crossing.py). R is linear in the change:
+numbers that part the branches one by one may not part them if changed together, such as the lengths of two equal cranks. Forward
+mode has the derivative of such a change; reverse mode, which treats each number alone, returns NaN.
 """
 
 from typing import Any
@@ -31,9 +31,9 @@ from udkjax.positions.curve import Curve
 from udkjax.programs.varying_axes import result_type
 from udkjax.transforms.gradients import stop_gradients
 
-# Of the largest (s - s*) dq/dp beside it: a residue below that is of rounding, which E^+ multiplies by a hundred at most there.
+# Relative to the largest (s - s*) dq/dp: a smaller residue is rounding, which E^+ multiplies by a hundred at most.
 RESIDUE = 1e-6
-MOST_MEETINGS = 8  # values of a call where branches meet: at others, derivatives by what moves the constraints are not numbers
+MOST_MEETINGS = 8  # of branches, in one call: at further ones, derivatives by numbers of the constraints are NaN
 
 Three = tuple[TimeSeries, TimeSeries, TimeSeries]  # of q, q' and q''
 
@@ -41,7 +41,7 @@ Three = tuple[TimeSeries, TimeSeries, TimeSeries]  # of q, q' and q''
 def with_derivatives(curve: Curve, values: Float[Array, "T"], points: Points, regular: Bool[Array, "T"]) -> Three:
     """Return closed positions, q' and q'', with their derivatives by the values and by the numbers of the mechanism.
 
-    Where branches meet (not `regular`), those of second order are not numbers.
+    Where branches meet (not `regular`), second derivatives are NaN.
     """
     return _with_derivatives(curve, values, *points[:3], points.dddq, points.spacing, regular)
 
@@ -61,19 +61,19 @@ def _(primals, tangents):
     def positions(curve: Curve, values: Float[Array, "T"]) -> Three:
         return jax.vmap(lambda s, q: _newton(curve, s, q))(values, found[0])
 
-    ordinary = eqx.filter_jvp(positions, (curve, values), moving)[1]
-    beside = _by_numbers(curve, values, found, spacing, regular, moved)
+    at_regular = eqx.filter_jvp(positions, (curve, values), moving)[1]
+    at_meetings = _by_numbers(curve, values, found, spacing, regular, moved)
     if ds is not None:
         third = jnp.where(regular[:, None] | (spacing[:, None] > 0), dddq, jnp.nan)
         along = found[1], found[2], third + _ends_here(jnp.where(regular, 0.0, jnp.nan), curve, values)[:, None]
-        beside = tuple(x + y * ds[:, None] for x, y in zip(beside, along, strict=True))
-    return found, tuple(jnp.where(regular[:, None], x, y) for x, y in zip(ordinary, beside, strict=True))
+        at_meetings = tuple(x + y * ds[:, None] for x, y in zip(at_meetings, along, strict=True))
+    return found, tuple(jnp.where(regular[:, None], x, y) for x, y in zip(at_regular, at_meetings, strict=True))
 
 
 def _by_numbers(
     curve: Curve, values: Float[Array, "T"], found: Three, spacing: Float[Array, "T"], regular: Bool[Array, "T"], moved: Any
 ) -> Three:
-    """Return the changes of q, q' and q'' where branches meet, with numbers of the constraints; others move no position."""
+    """Return the changes of q, q' and q'' by numbers of the constraints where branches meet."""
     changes = jax.tree.leaves(_constraints(moved.mechanism))
     zero = jnp.zeros_like(found[0])
     if not changes:
@@ -96,13 +96,13 @@ def _constraints(mechanism: Any) -> list[Any]:
 def _matrices(
     curve: Curve, values: Array, found: Three, spacing: Array, counts: Array, active: PyTree
 ) -> tuple[Float[Array, "K 3 n P"], Float[Array, "K P n"]]:
-    """Return the changes of q, q' and q'' by P numbers where branches meet, and their residues, those of rounding as zero.
+    """Return the changes of q, q' and q'' by P numbers where branches meet, and their residues, zero if rounding.
 
     Args:
         curve: the positions.
-        values: K of them where branches meet.
-        found: q, q' and q'' there.
-        spacing: of points of the branch beside them; zero where there are none.
+        values: K values at which branches meet.
+        found: q, q' and q'' at these.
+        spacing: spacing of the neighbouring points of the branch; zero without any.
         counts: mask of the values of interest.
         active: mask of the leaves of joints and drivers that are the P numbers.
     """
@@ -110,12 +110,12 @@ def _matrices(
     K, n, P = len(values), curve.units.size - 1, sum(x.size for x in chosen)
     nothing = jnp.zeros((K, 3, n, P)), jnp.zeros((K, P, n))
     given = curve, values, found, spacing, active
-    matrix, residue = jax.lax.cond(jnp.any(counts), lambda: call_seldom(_beside_meetings, *given), lambda: nothing)
+    matrix, residue = jax.lax.cond(jnp.any(counts), lambda: call_seldom(_at_meetings, *given), lambda: nothing)
     return jnp.where(counts[:, None, None, None], matrix, 0.0), jnp.where(counts[:, None, None], residue, 0.0)
 
 
-def _beside_meetings(curve: Curve, values: Array, found: Three, spacing: Array, active: PyTree) -> tuple[Array, Array]:
-    """Return `_matrices` of values that all count; not a number where nothing beside them is known."""
+def _at_meetings(curve: Curve, values: Array, found: Three, spacing: Array, active: PyTree) -> tuple[Array, Array]:
+    """Return `_matrices` for values that are all of interest; NaN without neighbouring points."""
     W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
     chosen, rest = eqx.partition(_constraints(curve.mechanism), active)
     numbers, unravel = ravel_pytree(chosen)
@@ -139,12 +139,12 @@ def _beside_meetings(curve: Curve, values: Array, found: Three, spacing: Array, 
     size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(FARTHEST_NODE), ends)
     residue = jnp.where(jnp.abs(residue) > RESIDUE * size[..., None], residue, 0.0)
     smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(FARTHEST_NODE), x) / unit**k for k, x in enumerate(changes)], 1)
-    known = jnp.all(is_closed, 1) & (spacing > 0)
-    return jnp.where(known[:, None, None, None], smooth * W[:, None], jnp.nan), residue
+    usable = jnp.all(is_closed, 1) & (spacing > 0)
+    return jnp.where(usable[:, None, None, None], smooth * W[:, None], jnp.nan), residue
 
 
 class _Operator(eqx.Module):
-    """The effect of the numbers, as a linear map with its transpose."""
+    """The changes by the numbers as a linear map with its transpose."""
 
     matrix: Float[Array, "K 3 n P"]
     residue: Float[Array, "K P n"]
@@ -194,7 +194,7 @@ def _bind(operator: _Operator, vector: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _ends_here(factor: Float[Array, "T"], curve: Curve, values: Float[Array, "T"]) -> Float[Array, "T"]:
-    """Return zeros, whose derivatives by the positions are the factor: zero, or not a number."""
+    """Return zeros whose derivatives by the positions are the factor: zero or NaN."""
     return jnp.zeros_like(factor)
 
 
@@ -214,7 +214,7 @@ def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Ar
 
 @eqx.filter_custom_jvp
 def with_derivative(curve: Curve, x: Float[Array, "n+1"]) -> Float[Array, ""]:
-    """Return the value at a toggle x = (q, s), which changes by as much as that of the nearest point of the curve."""
+    """Return the value at a toggle x = (q, s), with the derivative of the nearest point of the curve."""
     return x[-1]
 
 
