@@ -21,10 +21,12 @@ CLEAN = [  # folders with all below them, or files
     "udkjax/extras.py",
     "udkjax/lazy_names.py",
     "udkjax/pinv",
+    "udkjax/positions",
     "udkjax/printing.py",
     "udkjax/programs",
     "udkjax/progress.py",
     "udkjax/scene",
+    "udkjax/statics",
     "udkjax/transforms",
 ]
 

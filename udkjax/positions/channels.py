@@ -90,6 +90,7 @@ class Quantity:
 
 
 def has_point(joint: Joint) -> bool:
+    """Return True if a joint has a point: it then has a pin."""
     return getattr(joint, "points", None) is not None
 
 

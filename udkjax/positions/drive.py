@@ -221,6 +221,7 @@ def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coord
 
 
 def choose_name(name: str, taken: Container[str]) -> str:
+    """Return a free name: `name` with as many primes as needed."""
     while name in taken:
         name += "'"
     return name

@@ -39,6 +39,7 @@ class MarchResult(NamedTuple):
 
 
 def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
+    """Return True if machine code supports the mechanism on this device."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")

@@ -22,6 +22,7 @@ Closed = tuple[Array, Array, Array, Array, Array]
 
 
 def can_close(mechanism: Mechanism) -> bool:
+    """Return True if machine code supports the mechanism on this device."""
     if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return False
     return not unsupported(_close(mechanism).code)
