@@ -2,7 +2,7 @@ const mount = (() => {
 "use strict";
 const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const floats = text => new Float32Array(bytesOf(text).buffer);
-/** A packed table (udkjax/show/player/packing.py), row by row. Sums stay below 2^53: no bit operations, which have 32 bits. */
+/** A packed table (udkjax/show/player/packing.py), row by row. Bit operations have only 32 bits; sums stay below 2^53. */
 function unpack({rows, steps, bytes}) {
   const table = new Float64Array(rows * steps.length), source = bytesOf(bytes);
   let at = 0;
@@ -22,14 +22,14 @@ function unpack({rows, steps, bytes}) {
   }
   return table;
 }
-/** 1, 2 or 5 times a power of ten, at least x. */
+/** The smallest 1, 2 or 5 times a power of ten that is at least x. */
 function nice(x) {
   const power = 10 ** Math.floor(Math.log10(x));
   return power * [1, 2, 5, 10].find(k => k * power >= x * (1 - 1e-9));
 }
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
-/** The interval of times that holds t: its ends, its length, and where in it t is, from 0 to 1. */
+/** The interval of times that contains t: the indices of its ends, its length, and the position of t in it from 0 to 1. */
 function interval(ts, t, count = ts.length) {
   let low = 0, high = count - 1;
   while (high - low > 1) {
@@ -39,7 +39,7 @@ function interval(ts, t, count = ts.length) {
   const h = ts[high] - ts[low];
   return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
 }
-/** The state {t, q, v} of a run of n coordinates at a time: cubic between its instants, whose rates are known. */
+/** The state {t, q, v} of a run of n coordinates at a time, by cubic Hermite interpolation. */
 function stateAt({ts, q, v, count, frame = 1}, t, n) {
   const [i, j, h, s] = interval(ts, t, count), r = 1 - s, found = {t, q: new Float64Array(n), v: new Float64Array(n)};
   for (let k = 0; k < n; k++) {
@@ -49,7 +49,7 @@ function stateAt({ts, q, v, count, frame = 1}, t, n) {
   }
   return found;
 }
-/** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
+/** The positions of the bodies of a run at any time, by cubic Hermite interpolation; a mode is a sine. */
 class Run {
   constructor(record) {
     Object.assign(this, record);
@@ -62,7 +62,7 @@ class Run {
     this.measures = record.measures.map(m => ({...m, values: floats(m.values)}));
     this.forces = record.reactions && unpack(record.reactions.force);
     this.paths = null;
-    this.fine = 4;  // points of a path for each instant
+    this.fine = 4;  // points of a path per instant
     this.now = new Float64Array(this.size);
   }
   /** Another motion of the same bodies, with its events {t, name}. */
@@ -72,7 +72,7 @@ class Run {
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
   find(t) { return interval(this.ts, t); }
-  /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
+  /** The coordinates x, y, angle of each body in turn; the next call reuses the array. */
   pose(t, amplitude = 1) {
     const out = this.now;
     if (this.mode) {
@@ -88,12 +88,12 @@ class Run {
     }
     return out;
   }
-  /** Forces x, y of each anchor of reactions. */
+  /** The forces x, y at each anchor of reactions. */
   force(t) {
     const [i, j, , s] = this.find(t), n = 2 * this.reactions.anchors.length;
     return Array.from({length: n}, (_, k) => this.forces[i * n + k] * (1 - s) + this.forces[j * n + k] * s);
   }
-  /** The paths of its traces: for each, its points at times that are evenly spaced. */
+  /** The paths of the traced points, through points at equal intervals of time. */
   trace() {
     if (!this.paths) {
       const first = this.ts[0], last = this.ts[this.ts.length - 1];
@@ -107,15 +107,15 @@ class Run {
     return this.paths;
   }
 }
-/** Where the anchor [body, x, y] is; body -1 is the ground. */
+/** The place of an anchor [body, x, y]; body -1 is the ground. */
 function place(pose, [body, x, y]) {
   if (body < 0) return [x, y];
   const cos = Math.cos(pose[3 * body + 2]), sin = Math.sin(pose[3 * body + 2]);
   return [pose[3 * body] + cos * x - sin * y, pose[3 * body + 1] + sin * x + cos * y];
 }
 const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
-const FITTED = 300;  // instants that bounds are of
-/** Left, bottom, right, top (m) of all that is drawn of a run, at least `least` to each side of its middle. */
+const FITTED = 300;  // instants from which bounds are computed
+/** Left, bottom, right, top (m) of everything drawn of a run, at least `least` to each side of the middle. */
 function boundsOf(run, least) {
   const anchors = run.marks.flatMap(m => {
     const [x0, y0] = m.at ?? [0, 0];
@@ -132,10 +132,10 @@ function boundsOf(run, least) {
   return [...low.map((x, k) => x - grow[k]), ...high.map((x, k) => x + grow[k])];
 }
 const SIZE = 12, HIGH = 14;  // px
-const PIN = 7;  // px around the middle of a pin, where no name stands
+const PIN = 7;  // px around the centre of a pin that names keep clear
 const BESIDE = 14;  // px from a bar to its name
 const ROUNDING = 1e-6;  // px2
-const BOLD = 700;  // the weight of signs, and of the names of what is selected
+const BOLD = 700;  // font weight of signs, and of names of selected elements
 const PLACES = [[9, -12, "left"], [9, 14, "left"], [-9, -12, "right"], [-9, 14, "right"], [0, -20, "center"], [0, 22, "center"]];  // around a pin (px)
 class Labels {
   constructor() { this.last = new Map(); }
@@ -147,8 +147,8 @@ class Labels {
     this.unit = Math.max(1, painter.pt);
     this.boxes = Array.from(places, ([x, y]) => [x - PIN, y - PIN, x + PIN, y + PIN]);
   }
-  /** Write words at the first free one of some places [x, y, align], or where they cover least of others; `key` names them. A sign
-   *  is never covered: a name that would have to is left out, unless it is bold. */
+  /** Write words at the first free one of several places [x, y, align], or else where they cover least; `key` identifies them. A
+   *  sign is never covered: a name without another place is left out, unless it is bold. */
   put(key, words, places, colour, weight, isSign = false) {
     const {painter, last, boxes, unit, whole} = this, high = HIGH * unit;
     painter.context.font = `${weight} ${SIZE * unit}px system-ui`;
@@ -171,7 +171,7 @@ class Labels {
   }
 }
 const aroundPin = ([x, y], unit = 1) => PLACES.map(([dx, dy, align]) => [x + unit * dx, y + unit * dy, align]);
-/** Beside a bar between two places (px), at its middle or nearer to an end, below it first; or farther from it. */
+/** Places beside a bar between two pixels: at its middle or nearer to an end, below it first, then farther away. */
 function besideBar([ax, ay], [bx, by]) {
   const length = Math.hypot(bx - ax, by - ay) || 1, turn = Math.sign(bx - ax) || 1;
   const [nx, ny] = [-turn * (by - ay) / length, turn * (bx - ax) / length], found = [];
@@ -185,9 +185,9 @@ function besideBar([ax, ay], [bx, by]) {
   }
   return found;
 }
-/** Within a plate or a disc, at its middle (px) or lines below or above. */
+/** Places within a plate or a disc: at its middle (px), or some lines below or above. */
 const within = ([x, y], isDisc) => (isDisc ? [17, -17, 31] : [0, 17, -17]).map(dy => [x, y + dy, "center"]);
-/** At a place (px) of a body, or around it. */
+/** Places at and around a pixel of a body. */
 function around([x, y], unit) {
   return [[0, 0], [0, 17], [0, -17], [34, 0], [-34, 0], [0, 34], [0, -34], [44, 17], [-44, 17], [44, -17], [-44, -17], [0, 51], [0, -51]]
     .map(([dx, dy]) => [x + unit * dx, y + unit * dy, "center"]);
@@ -205,27 +205,27 @@ const THEMES = {
   },
 };
 const FORCES = [[1e6, "MN"], [1e3, "kN"], [1, "N"], [1e-3, "mN"]];
-const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
-const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
+const NOT_UNIQUE = [1.2, 4.2];  // pt: dashes of the arrow of a force that is not unique, shared by redundant constraints
+const READABLE = 4.5;  // the contrast of small text that WCAG 2 requires at level AA
 const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
-/** The contrast of two colours, 1 to 21, as WCAG 2 defines it. */
+/** The contrast ratio of two colours, from 1 to 21, as defined by WCAG 2. */
 function contrast(one, two) {
   const linear = x => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
   const light = hex => [0.2126, 0.7152, 0.0722].reduce((sum, share, k) => sum + share * linear(part(hex, k) / 255), 0.05);
   const [a, b] = [light(one), light(two)];
   return Math.max(a, b) / Math.min(a, b);
 }
-/** A colour in which texts can be read on all grounds of a theme: nearer to that of its ink, where need be. */
+/** A colour for text that is readable on all backgrounds of a theme: if needed, closer to its ink. */
 function readable(colour, {back, panel, ink}) {
   let found = colour;
   for (let t = 0; Math.min(contrast(found, back), contrast(found, panel)) < READABLE && t < 1; t += 0.05) found = mix(colour, ink, t);
   return found;
 }
-/** A colour on the way to another one: t from 0 to 1. */
+/** The mixture of two colours, with t from 0 to 1. */
 function mix(one, two, t) {
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
-/** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
+/** The cleared context of a canvas, in CSS pixels, at the resolution of the screen. */
 function contextOf(canvas) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   const wide = Math.round(width * ratio), high = Math.round(height * ratio);
@@ -236,12 +236,12 @@ function contextOf(canvas) {
   context.lineCap = context.lineJoin = "round";
   return {context, width, height};
 }
-/** Draws at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
+/** Draws at a pose. Sizes of symbols are in the unit `pt`, which grows with the panel. */
 class Painter {
   constructor(context, view, theme, pt, pose) {
     Object.assign(this, {context, view, theme, pt, pose});
   }
-  /** Pixels of a place in metres. */
+  /** The pixel of a place in metres. */
   px([x, y]) {
     return [this.view.x + this.view.scale * x, this.view.y - this.view.scale * y];
   }
@@ -318,7 +318,7 @@ class Painter {
     c.stroke();
     return step;
   }
-  /** How long one step of the grid is. */
+  /** Draw a scale bar as long as one step of the grid. */
   bar(step, height) {
     const {soft} = this.theme, length = step * this.view.scale, x = 14, y = height - 14;
     this.line([[x, y - 3], [x, y + 3], [x, y], [x + length, y], [x + length, y - 3], [x + length, y + 3]], 1.2 / this.pt, soft);
@@ -347,7 +347,7 @@ class Painter {
       stroke(Math.max(0, Math.ceil(now - tail)), Math.floor(now), 2.4, 0.8);
     });
   }
-  /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
+  /** Draw arrows of forces, at most three times as long as the usual one, and a reference arrow with its force. */
   reactions(run, t, width, height) {
     const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
     anchors.forEach((anchor, k) => {
@@ -355,11 +355,11 @@ class Painter {
       const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
       if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
     });
-    const told = nice(usual / 2), [unit, name] = FORCES.find(([unit]) => told >= unit) ?? FORCES.at(-1);
-    const y = height - 14, words = `${short(told / unit)} ${name}${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
+    const reference = nice(usual / 2), [unit, name] = FORCES.find(([unit]) => reference >= unit) ?? FORCES.at(-1);
+    const y = height - 14, words = `${short(reference / unit)} ${name}${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
     this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
     const end = width - 14 - this.context.measureText(words).width - 7;
-    this.arrow([end - length * told / usual, y], [end, y], colour);
+    this.arrow([end - length * reference / usual, y], [end, y], colour);
   }
   names(run) {
     const labels = run.labels ??= new Labels(), pins = run.marks.filter(mark => mark.kind === "pin"), unit = Math.max(1, this.pt);
@@ -368,7 +368,7 @@ class Painter {
     run.bodies.forEach((name, body) => labels.put(name, name, around(this.anchor([body, 0, 0]), unit), this.textColour(body), 600));
   }
 }
-/** Tell whether a point is within a closed line, or nearer to a line than `reach`. */
+/** True if a point is inside a closed line, or closer to a line than `reach`. */
 function isNear([x, y], corners, closed, reach) {
   const ends = closed ? [...corners, corners[0]] : corners;
   let inside = false;
@@ -389,7 +389,7 @@ class SymbolPainter extends Painter {
       else this.line(corners, symbol.width, stroke, {closed: symbol.closed, fill});
     }
   }
-  /** Where a symbol is (px): the centre and the radius of a circle, or the corners of a line. */
+  /** The outline of a symbol (px): the centre and the radius of a circle, or the corners of a line. */
   outline({frame, radius, points}) {
     const [[x0, y0], cos, sin, scale] = this.axes(frame), {pt} = this;
     if (radius) {
@@ -402,13 +402,13 @@ class SymbolPainter extends Painter {
     });
     return {corners};
   }
-  /** Whether a symbol is at a place (px), or nearer than `reach`. */
+  /** True if a symbol is at a pixel, or closer to it than `reach`. */
   holds(symbol, x, y, reach) {
     const {centre, size, corners} = this.outline(symbol);
     if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
     return isNear([x, y], corners, symbol.closed, symbol.width * this.pt / 2 + reach);
   }
-  /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */
+  /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and its unit of length (px). */
   axes(frame) {
     if (frame.length === 2) {
       const [[x0, y0], [x1, y1]] = frame.map(anchor => this.anchor(anchor)), length = Math.hypot(x1 - x0, y1 - y0);
@@ -425,10 +425,10 @@ class SymbolPainter extends Painter {
     return {edge, tint, spoke: mix(edge, tint, 0.25)}[kind];
   }
 }
-const LEFT = 12, RIGHT = 68;  // px beside the curves; at the right stand the least and the largest value
-/** The part of the timeline at x (px) in a strip of some width, from 0 to 1. */
+const LEFT = 12, RIGHT = 68;  // px at the sides of the curves; the smallest and the largest value are at the right
+/** The position on the timeline, from 0 to 1, of x (px) in a strip with a width. */
 const stripPart = (x, width) => clamp((x - LEFT) / (width - LEFT - RIGHT), 0, 1);
-/** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
+/** Draw one measure of all runs over the timeline, and a line at the time shown. */
 function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
   const left = LEFT, right = width - RIGHT, top = 40, bottom = height - 10;
   const found = runs.map(run => run.measures.find(m => m.name === name));
@@ -439,7 +439,7 @@ function drawStrip(context, width, height, runs, name, start, end, t, theme, tak
     if (Number.isFinite(y)) { low = Math.min(low, scaled(y)); high = Math.max(high, scaled(y)); }
   }
   const painter = new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null);
-  if (!(high >= low)) return painter.text("no values of this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
+  if (!(high >= low)) return painter.text("no values for this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   const least = log ? 3 : 1e-12 * Math.max(Math.abs(low), Math.abs(high)) || 1;
   if (high - low < least) { low -= least / 2; high += least / 2; }
   const x = time => left + (right - left) * (time - start) / (end - start || 1);
@@ -541,12 +541,12 @@ const ICONS = {
   theme: "M12 3a9 9 0 1 0 0 18zM12 3a9 9 0 0 1 0 18v-2a7 7 0 0 0 0-14z",
 };
 const HELP = [
-  ["Space", "play, pause"], ["← →", "one frame back, ahead"], ["Shift ← →", "a twentieth back, ahead"], ["Home End", "start, end"],
+  ["Space", "play, pause"], ["← →", "one frame back, forward"], ["Shift ← →", "5 % back, forward"], ["Home End", "start, end"],
   ["+ −", "faster, slower"], ["T", "traces"], ["N", "names"], ["R", "reactions"], ["L", "repeat"], ["D", "dark or light"],
-  ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
+  ["0", "fit the view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
 ];
-const LIVE_HELP = [["Drag a body", "pull at it"], ["G", "first motion"], ["Backspace", "reset the numbers"]];
-/** An element with properties and children; texts are texts. */
+const LIVE_HELP = [["Drag a body", "pull it"], ["G", "show the first motion"], ["Backspace", "reset the numbers"]];
+/** An element with properties and children; strings become text, never markup. */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(properties)) {
@@ -561,7 +561,7 @@ function button(content, title, action, kind = "") {
   return make("button", {type: "button", class: kind, title, "aria-label": title, onclick: action}, content);
 }
 const icon = name => svgIcon(ICONS[name]);
-/** An icon of a path that is filled, or drawn as a line. */
+/** An icon from an SVG path, filled or stroked. */
 function svgIcon(shape, isLine = false) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(svg.namespaceURI, "path");
   svg.setAttribute("viewBox", "0 0 24 24");
@@ -572,7 +572,7 @@ function svgIcon(shape, isLine = false) {
   svg.append(path);
   return svg;
 }
-/** Let a click on a button leave the keys to what is shown: else the space bar would press the button again. */
+/** Move the keyboard focus from clicked buttons to `focused`: otherwise the space bar would press the button again. */
 function keepKeys(root, focused) {
   root.addEventListener("mousedown", event => {
     if (!event.target.closest("button") || event.target.closest("dialog")) return;
@@ -580,8 +580,8 @@ function keepKeys(root, focused) {
     focused.focus({preventScroll: true, focusVisible: false});
   });
 }
-const THUMB = 8, TICK = 7;  // px: half of the slider's thumb, which is at the ends at the first and the last time; a tick's height
-const SAID = 0.04;  // of the timeline: how long one reads which event has happened
+const THUMB = 8, TICK = 7;  // px: half the width of the slider's thumb, by which the timeline is inset; height of a tick
+const NAME_SHOWN = 0.04;  // fraction of the timeline during which the name of an event is shown
 class EventMarks {
   constructor(player) {
     this.player = player;
@@ -600,17 +600,17 @@ class EventMarks {
       context.lineWidth = 2;
       context.strokeStyle = runs.length > 1 ? theme.bodies[k % theme.bodies.length] : theme.force;
       context.stroke();
-      const last = run.events.findLast(event => event.t <= t && event.t >= t - SAID * (end - start));
+      const last = run.events.findLast(event => event.t <= t && event.t >= t - NAME_SHOWN * (end - start));
       const words = last ? `${last.name}, ${+last.t.toPrecision(5)} s` : "";
       if (panels[k].happened.textContent !== words) panels[k].happened.textContent = words;
     });
   }
 }
-/** Drag moves the view, or pulls at the body that is there, where the canvas shows the run of a live page;
- *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+/** Dragging moves the view or, in a live page, pulls the body under the pointer; two fingers and the wheel zoom, a tap plays or
+ *  pauses, a double tap fits the view. */
 function followPointers(player, canvas, liveRun) {
   const down = new Map();
-  let moved = 0, hand = null;  // the pointer that pulls
+  let moved = 0, hand = null;  // distance moved, and the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   canvas.addEventListener("pointerdown", event => {
     if (event.button > 1) return;
@@ -657,9 +657,9 @@ function followPointers(player, canvas, liveRun) {
     player.draw();
   }, {passive: false});
 }
-/** The conditions at a state, with their rates, what impulses along them do, and their scales: what a displacement of a length or
- *  a turn of a radian changes in each, which never becomes smaller than `before`. */
-function look(engine, numbers, settings, state, before) {
+/** The conditions at a state, with their rates, the effect of impulses along them, and their scales: the change of each by a
+ *  displacement of one length or a turn of one radian, which never becomes smaller than in `before`. */
+function evaluate(engine, numbers, settings, state, before) {
   const {tolerances: {zero}} = engine.data.events, found = engine.conditions(numbers, settings, state), rate = settings.omega;
   const largest = (slopes, size) => slopes.reduce((most, slope, i) => Math.max(most, Math.abs(slope * size(i)) || 0), 0);
   found.scales = Array.from(found.g, (_, k) => Math.max(Math.abs(found.byT[k]) * Math.max(1 / rate, Math.abs(state.t)),
@@ -668,17 +668,17 @@ function look(engine, numbers, settings, state, before) {
   found.sides = Array.from(found.g, (g, k) => (Number.isFinite(g) ? (Math.abs(g) > zero * found.scales[k] ? Math.sign(g) : 0) : NaN));
   return found;
 }
-/** The velocities behind an impact of contact k by Newton's law, g_dot+ = -e g_dot-, and whether it is over with its rebounds; or
- *  `words` where more happens than that: several contacts that are hit at once are no program of a page. `held` is at rest. */
+/** The velocities after an impact of contact k by Newton's law, g_dot+ = -e g_dot-, whether it `hits`, and whether it then `rests`;
+ *  or, in `words`, why a page cannot compute it, as for several contacts hit at once. The contact `held` is at rest. */
 function hit(engine, numbers, settings, at, watch, k, held) {
   const {events} = engine.data, {tolerances: tol} = events, {omega} = settings, {g, rate, rate2, scales, byQ, directions} = watch;
   const W = along(watch, k, k), unit = j => scales[j] * omega;
   const isHit = j => j !== k && j !== held && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j]
     && rate[j] <= tol.zero_rate * unit(j) && Math.abs(along(watch, j, k)) > tol.coupled * Math.sqrt(along(watch, j, j) * W);
   const other = events.names.findIndex((_, j) => isHit(j)), name = events.names[k];
-  if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which is no program of a page yet`};
+  if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which a live page cannot compute yet`};
   const inverse = engine.inverseMasses(numbers);
-  if (!(W > tol.blocked * byQ[k].reduce((sum, x, i) => sum + x * x * inverse[i], 0))) return {words: `the joints leave ${name} no motion`};
+  if (!(W > tol.blocked * byQ[k].reduce((sum, x, i) => sum + x * x * inverse[i], 0))) return {words: `the joints allow no motion at the contact ${name}`};
   const floor = tol.zero_rate * unit(k), isPressed = acceleration => acceleration < -tol.zero_rate_2 * unit(k) * omega;
   const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
   const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
@@ -687,10 +687,10 @@ function hit(engine, numbers, settings, at, watch, k, held) {
   const rests = stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k]);
   return {v: rests ? moved(-rate[k] / W) : v, hits, rests};
 }
-/** How much a unit impulse along contact j changes the rate of contact i. */
+/** The change of the rate of contact i by a unit impulse along contact j. */
 const along = ({byQ, directions}, i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0);
-/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. While a
- *  contact is at rest, the engine that holds it runs; `numbersOf` an engine are its numbers. */
+/** `Engine.run` for an engine with events; these stop the motion only if `stops`. While a contact is at rest, the engine that holds
+ *  it runs; `numbersOf` returns the numbers of an engine. */
 function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, limit) {
   const {data: {events, scales, drift_tol: driftTol}, size: n} = free, T = ts.length, end = ts[T - 1], E = events.names.length;
   const {zero, zero_rate: zeroRate, zero_rate_2: zeroRate2} = events.tolerances, isImpact = k => events.restitution[k] !== null;
@@ -707,28 +707,28 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
   const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.held[row] = held + 1; };
   const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch, held}, marks: held < 0 ? at.marks : null, ...more});
   const note = index => found.events.push({t: at.t, index, q: at.q, v: at.v});
-  const stop = words => {  // with the state there as the last output
+  const stop = words => {  // with the current state as the last output
     if (first < T && !(first && ts[first - 1] === at.t)) {
       ts[first] = at.t;
       put(first++, at.q, at.v, violation);
     }
     return finish(words, {stop: stops ? words : null, count: first});
   };
-  /** Goes on with a contact at rest, or with none. */
+  /** Continue with a contact at rest, or with none. */
   const rest = (k, v = at.v) => {
     use(k);
     at = {t: at.t, q: at.q, v};
     const {sides} = watch;
-    watch = Object.assign(look(engine, numbers, settings, at, watch), {sides});
+    watch = Object.assign(evaluate(engine, numbers, settings, at, watch), {sides});
   };
   use(state.held ?? -1);
   if (!watch) {
-    watch = look(engine, numbers, settings, at, null);
+    watch = evaluate(engine, numbers, settings, at, null);
     const beyond = watch.sides.findIndex((side, k) => isImpact(k) && side < 0);
-    if (beyond >= 0) return finish(`it begins beyond ${events.names[beyond]}`);
+    if (beyond >= 0) return finish(`it begins beyond the contact ${events.names[beyond]}`);
     const {rate, rate2, scales: unit, sides} = watch, small = k => zeroRate * unit[k] * omega;
     const falls = k => rate[k] < -small(k) || (Math.abs(rate[k]) <= small(k) && rate2[k] < -zeroRate2 * unit[k] * omega ** 2);
-    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // what is closed, and closes further
+    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // a closed contact that closes further
     watch.sides = sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
   }
   for (;;) {
@@ -760,7 +760,7 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
       violation = worst;
       if (!(worst <= driftTol)) return finish("the loops do not stay closed");
       event = crossed;
-      watch = look(engine, numbers, settings, at, watch);
+      watch = evaluate(engine, numbers, settings, at, watch);
     }
     if (event === E) {  // the contact would have to pull
       before[held] = 1;
@@ -769,9 +769,9 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
       rest(-1);
       continue;
     }
-    let lifted = -1;  // by the impact of another
+    let lifted = -1;  // contact lifted by the impact of another
     if (event >= 0 && isImpact(event) && held >= 0) {
-      const bare = look(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
+      const bare = evaluate(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
       if (along(bare, held, event) > events.tolerances.coupled * Math.sqrt(along(bare, held, held) * along(bare, event, event))) {
         lifted = held;
         before[held] = 1;
@@ -788,14 +788,14 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
         note(2 * E + event);
         const words = `${events.names[event]} has come to rest`;
         if (events.ends_at_rest[event]) return stop(words);
-        if (!free.held[event]) return finish(`${words}, and how it is held is no program of a page`);
-        if (held >= 0) return finish(`${words} beside ${events.names[held]}, and how both are held is no program of a page yet`);
+        if (!free.held[event]) return finish(`${words}, where a live page cannot hold it`);
+        if (held >= 0) return finish(`${words} as well as ${events.names[held]}; a live page cannot hold two contacts at rest yet`);
         before[event] = 1;
         watch.sides = before;
         rest(event);
         continue;
       }
-      watch = look(engine, numbers, settings, at, watch);
+      watch = evaluate(engine, numbers, settings, at, watch);
     }
     watch.sides = watch.sides.map((side, k) => {
       if (k === event) return jump ? 1 : -before[k];
@@ -806,11 +806,11 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
       if (part.done) continue;
       return finish(part.words, {limited: part.limited});
     }
-    if (events.stops[event] && stops) return stop(`${events.names[event]} stops it`);
+    if (events.stops[event] && stops) return stop(`stopped by ${events.names[event]}`);
     if (found.events.length >= events.most) return finish(`more than ${events.most} events`);
   }
 }
-const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
+const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes: more than any stack needs, the unit in which memory grows, alignment
 const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed",
   7: "the condition of an event varies too quickly"};
 const EPS = 2 ** -52;
@@ -820,7 +820,7 @@ async function inflate(text) {
   const stream = new Blob([bytesOf(text)]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Response(stream).arrayBuffer();
 }
-/** One module with a memory of its own: constants, stack, and behind them what a call takes, which the next call overwrites. */
+/** A module with its own memory: constants, stack, and then the data of a call, which the next call overwrites. */
 class Instance {
   static async load(module) {
     const found = new Instance();
@@ -834,7 +834,7 @@ class Instance {
     return found;
   }
   begin() { this.end = this.start; }
-  /** The address of so many bytes. */
+  /** Reserve bytes of memory and return their address. */
   reserve(size) {
     const place = this.end;
     this.end = Math.ceil((place + size) / LINE) * LINE;
@@ -848,7 +848,7 @@ class Instance {
     return place;
   }
   view(place, count) { return new Float64Array(this.memory.buffer, place, count); }
-  /** Call `run` for one member: its inputs are arrays by name, and so are the results, by how many numbers they have. */
+  /** Call `run` for one member: `inputs` are arrays by name, `results` the sizes of the arrays to return. */
   run(inputs, results, counts) {
     this.begin();
     const fields = {members: 1, directions: 0, next: this.put([0]), ...counts}, given = {};
@@ -874,7 +874,7 @@ class Engine {
     this.size = 3 * data.bodies.length;
     this.row = data.sampled.length;
   }
-  /** All numbers of the scene; behind them the times where the motion is not smooth. */
+  /** All numbers of the scene, followed by the times at which the motion is not smooth. */
   numbers(parameters) {
     if (!parameters || !this.parameters.length) return this.base.slice();
     const module = this.instances.evaluate;
@@ -887,15 +887,15 @@ class Engine {
     const {count, knots, conditions} = this.data;
     return numbers.subarray(count + knots, count + knots + conditions);
   }
-  /** All numbers of the scene with a hand's spring. */
+  /** All numbers of the scene, with the spring that pulls a body. */
   pulled(parameters, pull) {
     const numbers = this.numbers(parameters);
     if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[this.data.pulls[pull.body][k]] = x; });
     return numbers;
   }
   breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
-  /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
-   *  that hold at a time. */
+  /** The numbers of the equations in the form that a module takes: with marks of rows (optional), two thresholds, and the samples
+   *  that are valid at a time. */
   dressed(numbers, thresholds, t, marks = null) {
     const {count} = this.data, found = new Float64Array(count + (marks?.length ?? 0) + 2);
     found.set(numbers.subarray(0, count));
@@ -910,10 +910,10 @@ class Engine {
     return {t: 0, q: Float64Array.from(q, k => numbers[k]), v: Float64Array.from(v, k => numbers[k])};
   }
   unit = k => (k % 3 === 2 ? 1 : this.data.scales.length);
-  /** Close the loops from a guess {t, q, v}, which by default is the scene's: the nearest closed state.
+  /** Find the closed state nearest to a guess {t, q, v}, by default that of the scene.
    *
    *  Returns t, q and v; `violation` of Psi and `rate` of Psi_dot, the largest of their rows in units of the scene; the `rank` of
-   *  Psi_q there; and whether the state is `closed`: if not, it is the best that was found.
+   *  Psi_q; and `closed`, which is false if only an approximately closed state was found.
    */
   close(parameters = null, guess = null) {
     const {data} = this, numbers = this.numbers(parameters), start = {...this.guess(numbers), ...guess}, m = data.rows.length;
@@ -927,7 +927,7 @@ class Engine {
     const closed = violation <= tol && rate <= tol * Math.max(data.scales.rate, largest(v, this.unit));
     return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
   }
-  /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
+  /** The independent rows of Psi near a closed state {t, q, v}: 1 for each of them, 0 for others; null if all are. */
   mark(parameters, state) { return this.markRows(this.numbers(parameters), state); }
   markRows(numbers, {t, q, v}) {
     const {data} = this;
@@ -937,16 +937,16 @@ class Engine {
     const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
   }
-  /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
+  /** Integrate the motion from a closed state {q, v} at times[0]; missing `marks` of the state are computed.
    *
-   *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
-   *  that of the ground (m), stiffness (N/m) and damping (N s/m). While it pulls no event stops the motion.
-   *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
-   *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
-   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
-   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index, of one that
-   *  lets go with their number. Where one ends it as it should, `stop` says so, and the last time is that of the event. `held` are
-   *  one more than the event whose contact is at rest at each time, 0 where none is.
+   *  `pull` is a spring {body, point, target, stiffness, damping} that pulls a body (its index): point in its frame and target in
+   *  the ground frame (m), stiffness (N/m) and damping (N s/m). During a pull no event stops the motion.
+   *  `limit` is the largest number of attempted steps, by default 20,000; a run that reaches it can continue from its `last` state.
+   *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene), of which the first `count` are valid;
+   *  `done`, and if it is false the reason in `words`; the number of `steps`; the `last` state; its `marks`; and `events`, a list of
+   *  {t, index, q, v}, where the number of events is added to the index of a contact that lets go, and twice this number if it comes
+   *  to rest. If an event stops the motion, `stop` is the reason, and the last time is that of the event. `held` is, at each time,
+   *  the index of the event whose contact is at rest plus one, or 0.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data} = this, T = times.length;
@@ -956,7 +956,7 @@ class Engine {
     if (data.events) return runWithEvents(this, engine => engine.pulled(parameters, pull), {smallest, omega}, state, Float64Array.from(times), !pull, limit);
     return {...this.piece(this.pulled(parameters, pull), {...data.settings, smallest, omega}, state, Float64Array.from(times), limit), events: []};
   }
-  /** Integrate from a state over times; with conditions to `watch`, up to the first that crosses zero, which is in `crossing`. */
+  /** Integrate from a state over times, up to the first zero `crossing` of the conditions in `watch`. */
   piece(numbers, settings, state, ts, limit, watch = []) {
     const {data, size} = this, T = ts.length, breaks = this.breaks(numbers), marks = state.marks ?? this.markRows(numbers, {t: ts[0], ...state});
     const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
@@ -971,8 +971,8 @@ class Engine {
     return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t, code: ended.code,
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
-  /** The conditions of events at a state: g, their first and second rates, derivatives by t, q and v, and for each impact the
-   *  velocities that a unit impulse along it gives. */
+  /** The conditions of events at a state: g, its first and second rates, derivatives by t, q and v, and for each impact the
+   *  velocities due to a unit impulse along it. */
   conditions(numbers, settings, state) {
     const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
     const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
@@ -988,9 +988,8 @@ class Engine {
   }
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
-  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
-   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
-   *  whose shares would be a choice. */
+  /** Energies (J) at the states of a run and, if asked for, the force or torque of each driver (N or N m) and the forces x, y (N)
+   *  of the joints of `data.forces`, for all joints time by time; these are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false) {
     if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, marks = null} = run;
@@ -1004,7 +1003,7 @@ class Engine {
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
       efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
       forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
-    let next = -Infinity;  // until then the constants hold: samples change them
+    let next = -Infinity;  // time of the next sample, which changes the constants
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
         module.view(given, data.count + data.marks + 2).set(this.dressed(numbers, data.thresholds, ts[i], marks));
@@ -1023,7 +1022,7 @@ class Engine {
     }
     return found;
   }
-  /** What `measure` returns of a run in which contacts come to rest: of each part by the engine that holds its contact. */
+  /** `measure` for a run in which contacts come to rest: each part by the engine that holds its contact. */
   measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
     const n = this.size, parts = [];
     for (let from = 0, to = 0; from < count; from = to) {
@@ -1038,7 +1037,7 @@ class Engine {
       efforts: Object.fromEntries(Object.keys(parts[0].efforts).map(name => [name, joined(p => p.efforts[name])])),
       forces: joined(p => (parts.every(({forces}) => forces.length) ? p.forces : []))};
   }
-  /** Forces x, y of each joint at the state that was evaluated last. */
+  /** Forces x, y of each joint at the last evaluated state. */
   forces(work, {x0, psi_q}) {
     const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
     return this.data.forces.flatMap(({x, y}) => [sum(x), sum(y)]);
@@ -1052,8 +1051,8 @@ async function loadEngine(data) {
   engine.held = Object.fromEntries(await Promise.all(Object.entries(data.held).map(async ([k, of]) => [k, await loadEngine(of)])));
   return engine;
 }
-/** Moves the places of a run's symbols, marks and traces to where the numbers say. */
-class Follower {
+/** Updates the symbols, marks and traces of a run from the numbers of the scene. */
+class SymbolUpdater {
   constructor(run, rows) {
     this.run = run;
     this.rows = rows;
@@ -1063,7 +1062,7 @@ class Follower {
     run.arrows = structuredClone(run.reactions);
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
-  follow(numbers) {
+  update(numbers) {
     const {run, rows} = this, put = (anchor, start, x, y) => { anchor[start] = numbers[x]; anchor[start + 1] = numbers[y]; };
     for (const [k, which, x, y] of rows.frames) put(which < 0 ? run.symbols[k].frame : run.symbols[k].frame[which], 1, x, y);
     for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
@@ -1079,10 +1078,10 @@ class Follower {
     run.paths = null;
   }
 }
-const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second of the screen, with half of all masses on it
-const DAMPING = 0.7;  // of the critical one
-const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
-/** Pulls while it is held; `live` is the run, which has the engine and shows what comes of it. */
+const SWING = 2 * Math.PI * 1.5;  // rad per second of real time: natural frequency of the spring with half of all masses
+const DAMPING = 0.7;  // damping ratio
+const LONGEST_FRAME = 0.05;  // s of real time: in longer frames the motion lags
+/** Pulls until it is released; `live` is the run, which has the engine and shows the motion. */
 class Hand {
   constructor(live, held, target) {
     const {engine, values} = live, numbers = engine.numbers(values), {speed} = live.player;
@@ -1106,9 +1105,9 @@ class Hand {
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
     if (!run.done) {
       this.isBlocked = true;
-      return live.live.say(`the pull is too much: ${run.words}`, true);
+      return live.live.say(`The pull is too strong: ${run.words}.`, true);
     }
-    if (this.isBlocked) live.live.greet();  // what was said is over
+    if (this.isBlocked) live.live.greet();  // replaces the message
     this.isBlocked = false;
     this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, held: run.last.held};
     live.append(this.state, run.violation[1], run.events);
@@ -1120,7 +1119,7 @@ class Hand {
     this.live.letGo(this.state);
   }
 }
-/** The body that is drawn at a place of the screen, the uppermost first, and the point in its frame; null where there is none. */
+/** The topmost body at a pixel, with the point in its frame; null if there is none. */
 function bodyAt(painter, symbols, [x, y], reach) {
   for (const symbol of [...symbols].reverse()) {
     const {frame} = symbol;
@@ -1131,9 +1130,9 @@ function bodyAt(painter, symbols, [x, y], reach) {
   }
   return null;
 }
-const STEPS = 500;  // of a slider by keys
-const DIGITS = 5;  // of a number beside it
-/** Builds the panel of some sliders; `changed(k, value)` is called while one moves, and actions by their names. */
+const STEPS = 500;  // key presses over the range of a slider
+const DIGITS = 5;  // significant digits of a number
+/** The panel of sliders and buttons; `changed(k, value)` is called while slider k moves, and an action when its button is pressed. */
 class SliderPanel {
   constructor(sliders, changed, actions) {
     this.sliders = sliders;
@@ -1162,7 +1161,7 @@ class SliderPanel {
       range.setAttribute("aria-valuetext", `${number.value} ${unit}`);
     };
     range.addEventListener("input", () => { set(+range.value); changed(+range.value); });
-    let taken = null;  // what was typed last
+    let taken = null;  // the last text that was taken
     const take = () => {
       if (!Number.isFinite(number.valueAsNumber)) return set(+range.value);
       if (number.value === taken) return undefined;
@@ -1173,7 +1172,7 @@ class SliderPanel {
     };
     number.addEventListener("focus", () => { taken = number.value; });
     number.addEventListener("change", take);
-    number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // which a notebook keeps to itself
+    number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // a notebook keeps Enter from causing a change event
     range.addEventListener("dblclick", () => { set(slider.value); changed(slider.value); });
     const words = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
     const element = make("div", {class: "slider", title: slider.name},
@@ -1224,15 +1223,15 @@ const LIVE_STYLE = `
 `;
 class Address {
   constructor(live) { this.live = live; }
-  /** Whether the page has an address of its own: not within another page. */
+  /** True if the page has an address of its own, and is not inside another page. */
   get exists() { return Boolean(this.live.player.options.fill) && location.protocol !== "about:"; }
-  /** The numbers that are not those of the scene. */
-  get words() {
+  /** The changed numbers, as the fragment of an address. */
+  get fragment() {
     const {data: {sliders}, values} = this.live, changed = sliders.map((s, k) => [s, values[k]]).filter(([s, x]) => x !== s.value);
     return new URLSearchParams(changed.map(([s, x]) => [s.name, String(x)])).toString();
   }
   write() {
-    if (this.exists) history.replaceState(null, "", `#${this.words}`);
+    if (this.exists) history.replaceState(null, "", `#${this.fragment}`);
   }
   read() {
     if (!this.exists) return;
@@ -1244,43 +1243,43 @@ class Address {
     if (Object.keys(numbers).length) this.live.change(numbers);
   }
   async copy() {
-    const {live, words} = this;
+    const {live, fragment} = this;
     this.write();
     try {
-      await navigator.clipboard.writeText(this.exists ? location.href : `#${words}`);
-      live.say("The address with these numbers is copied.");
+      await navigator.clipboard.writeText(this.exists ? location.href : `#${fragment}`);
+      live.say("A link with these numbers has been copied.");
     } catch {
-      live.say(this.exists ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+      live.say(this.exists ? "The address of this page now contains these numbers." : `Changed numbers: ${fragment || "none"}`);
     }
   }
 }
-const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
-const GHOST = 0.28;  // how much one sees of the first motion
-const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
+const SMALLEST_POSITIVE = 1e-17;  // m: drawn instead of a zero violation on a logarithmic axis
+const GHOST = 0.28;  // opacity of the first motion
+const REACH = {mouse: 6, touch: 16};  // px around a body within which it can be grasped
 const STEP_BYTES = 4e7;
-const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
+const USUAL = 0.95;  // fraction of the instants without a force above the usual force, which scales the arrows
 class LiveRun {
-  /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
+  /** `live` is the page; `run` is shown; `record` is its data, and `data` its further data for a live page. */
   constructor(live, run, record, data) {
     const {ts, q, v, measures, frame, reactions, forces, events} = run;
     Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events}});
-    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed, or stopped
-    this.follower = new Follower(run, data.follow);
+    this.times = data.times ? Float64Array.from(data.times) : ts;  // all output times, even if the first motion failed or was stopped
+    this.updater = new SymbolUpdater(run, data.symbol_updates);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
   }
   use(engine) {
     this.engine = engine;
-    this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // of one picture
-    this.usual = this.freedoms(this.close(null), null);
+    this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // per frame
+    this.firstFreedoms = this.freedoms(this.close(null), null);
   }
-  /** The numbers of this run's sliders; those that nobody has moved are its own. */
+  /** The numbers of this run's sliders; sliders that were not moved have the run's own numbers. */
   get values() {
     const {values, data: {sliders}} = this.live;
     return Float64Array.from(this.data.sliders, ([k, own]) => (values[k] === sliders[k].value ? own : values[k]));
   }
   get end() { return this.run.ts[this.run.ts.length - 1]; }
   close(values) { return this.engine.close(values, {t: this.times[0], ...this.data.start}); }
-  /** The degrees of freedom near a closed state, whose marks are found; null where branches of the motion meet. */
+  /** The degrees of freedom near a closed state, whose marks are set; null where branches of the motion meet. */
   freedoms(state, values) {
     this.marks = state.marks = this.engine.mark(values, state);
     const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
@@ -1293,20 +1292,20 @@ class LiveRun {
     this.run.replace(ts, q, v, measures, frame, events);
     this.run.held = null;
     this.showReactions(reactions, forces);
-    this.follower.follow(this.engine.numbers(null));
+    this.updater.update(this.engine.numbers(null));
     this.changed = false;
   }
-  /** Begin to solve the motion of the numbers as they are; returns words where its loops do not close. */
+  /** Begin to simulate the motion with the current numbers; returns a message if its loops do not close. */
   begin() {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
-    if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
+    if (!state.closed) return `The loops do not close with these numbers: a gap of ${this.lengthOf(state.violation)} remains. The last possible motion is shown.`;
     const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
-    this.follower.follow(engine.numbers(values));
+    this.updater.update(engine.numbers(values));
     return "";
   }
-  /** Solve on for as many steps as fit into one picture; returns what is said, and whether it ended too early. */
+  /** Simulate as many steps as fit into one frame; returns the message, with `bad` for a motion that ended too early. */
   goOn() {
     const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
     const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
@@ -1323,12 +1322,13 @@ class LiveRun {
     job.tried += part.tried;
     job.state = part.last;
     this.show(run);
-    if (part.limited && job.tried < most) return {words: `Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
+    if (part.limited && job.tried < most) return {words: `Simulating: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
     this.job = null;
     const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
-    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
+    const ended = part.done ? `${+span.toPrecision(3)} s simulated in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
       : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
-    const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
+    const first = this.firstFreedoms === null ? "" : `, ${this.firstFreedoms} in the first motion`;
+    const words = job.freedoms === this.firstFreedoms || job.freedoms === null ? ended : `${ended} Degrees of freedom: ${job.freedoms}${first}.`;
     return {words, bad: !part.done && !part.stop};
   }
   drop() {
@@ -1346,12 +1346,12 @@ class LiveRun {
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
-  /** Events as they are shown: {t, name}. */
+  /** Events in the form in which they are shown, {t, name}. */
   named(events) {
     const names = this.engine.data.events?.names ?? [], nameOf = k => names[k % names.length] + ["", " lets go", " rests"][Math.floor(k / names.length)];
     return events.map(({t, index}) => ({t, name: nameOf(index)}));
   }
-  /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
+  /** The arrows of forces computed in the page; null with redundant constraints, since forces are not unique. */
   reactions(forces) {
     const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
     if (!forces.length || !reactions) return null;
@@ -1367,7 +1367,7 @@ class LiveRun {
     const button = this.player.buttons.reactions;
     if (button) button.disabled = !this.player.runs.some(run => run.reactions);
   }
-  /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
+  /** The measures of a motion that the page computes, under the names of the recorded ones. */
   measures(run, found) {
     const {length} = this.engine.data.scales;
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
@@ -1376,12 +1376,12 @@ class LiveRun {
       "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
     return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
   }
-  /** The state at the time that is shown. */
+  /** The state at the time shown. */
   stateNow() {
     const t = this.player.t, {q, v} = this.run.state(t);
     return {...this.engine.close(this.values, {t, q, v}), t};
   }
-  /** What is on a panel's canvas at a place (px), if a hand can grasp it. */
+  /** The body at a pixel of a panel's canvas, if it can be grasped. */
   bodyAt(canvas, point, pointer = "mouse") {
     if (!this.engine) return null;
     const painter = this.player.painter(canvas);
@@ -1406,7 +1406,7 @@ class LiveRun {
     const view = this.player.view(canvas.clientWidth, canvas.clientHeight);
     return [(x - view.x) / view.scale, (view.y - y) / view.scale];
   }
-  /** Begin a record that a hand goes on with: of what was until now. */
+  /** Begin the record of a pull with the motion up to now. */
   record(state) {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
     const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
@@ -1416,7 +1416,7 @@ class LiveRun {
     this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation, []);
   }
-  /** Add one state to the record, and the events before it, and show it. */
+  /** Add a state, and the events before it, to the record, and show it. */
   append({t, q, v, held = -1}, violation, events) {
     const {past} = this;
     this.happened.push(...this.named(events));
@@ -1435,7 +1435,7 @@ class LiveRun {
     this.show({...run, count: run.ts.length, events: []});
     this.run.events = this.happened;
   }
-  /** Solve on from where the hand lets go, for as long as the first motion is. */
+  /** Continue the simulation after a pull, for the duration of the first motion. */
   letGo(state) {
     const {engine, past} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
     const run = engine.run(this.values, state, times);
@@ -1449,8 +1449,8 @@ class LiveRun {
     this.happened.push(...this.named(run.events));
     this.showPast();
     this.player.setEnd(this.live.end);
-    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
-    this.live.say(run.done ? "Let go: the motion goes on by itself." : ended, !run.done && !run.stop);
+    const ended = `Released: the motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
+    this.live.say(run.done ? "Released: the motion continues by itself." : ended, !run.done && !run.stop);
     this.player.play();
   }
   paintGhost(painter, context, t) {
@@ -1468,10 +1468,10 @@ class LiveRun {
     painter.circle(from, 3.2 * painter.pt, {fill: painter.theme.accent});
     painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
   }
-  /** Left, bottom, right, top (m) of all that is drawn of the motion as it is now. */
+  /** Left, bottom, right, top (m) of everything drawn in the current motion. */
   bounds() { return boundsOf(this.run, 0.1 * this.engine.data.scales.length); }
 }
-const SETTLED = 150;  // ms without a change until the address says the numbers
+const SETTLED = 150;  // ms without a change before the numbers are written to the address
 class Live {
   constructor(player, data) {
     Object.assign(this, {player, data: data.live, firstEnd: data.end, dirty: false});
@@ -1480,7 +1480,7 @@ class Live {
     this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
       ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
       reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
-      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.address.copy()},
+      share: {words: "Copy link", title: "copy a link with these numbers", act: () => this.address.copy()},
     });
     player.show.ghost = true;
     player.buttons.ghost = this.panel.buttons.ghost;
@@ -1490,11 +1490,11 @@ class Live {
   }
   async load() {
     try {
-      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
+      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("no WebAssembly");
       const engines = await Promise.all(this.data.engines.map(loadEngine));
       for (const run of this.runs) run.use(engines[run.data.engine]);
     } catch (error) {
-      this.say(`This browser cannot simulate (${error.message}): the page plays what was recorded.`, true);
+      this.say(`This browser cannot simulate (${error.message}): the page plays the recorded motion.`, true);
       return false;
     }
     this.isReady = true;
@@ -1509,7 +1509,7 @@ class Live {
   keys() {
     return {g: () => this.player.toggle("ghost"), Backspace: () => this.isReady && this.reset()};
   }
-  greet() { this.say(`Move a slider, or pull at a body: the ${this.runs.length > 1 ? "motions are" : "motion is"} solved anew.`); }
+  greet() { this.say(`Move a slider or drag a body: the ${this.runs.length > 1 ? "motions are" : "motion is"} simulated again.`); }
   say(words, bad = false) { this.panel.say(words, bad); }
   set(k, value) {
     this.values[k] = value;
@@ -1517,7 +1517,7 @@ class Live {
     clearTimeout(this.settling);
     this.settling = setTimeout(() => this.address.write(), SETTLED);
   }
-  /** Change numbers by the names of their parameters, and solve at once. */
+  /** Change numbers by the names of their parameters, and simulate at once. */
   change(numbers) {
     this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
     this.panel.show(this.values);
@@ -1534,11 +1534,11 @@ class Live {
     this.greet();
     this.player.draw();
   }
-  /** Solve before the next picture, once for all changes until then. */
+  /** Simulate before the next frame, once for all changes until then. */
   solveSoon() {
     if (this.dirty) return;
     this.dirty = true;
-    cancelAnimationFrame(this.request);  // what was being solved is of other numbers
+    cancelAnimationFrame(this.request);  // a simulation in progress has the old numbers
     this.request = requestAnimationFrame(() => this.solve());
   }
   solve() {
@@ -1548,23 +1548,23 @@ class Live {
     if (this.isSolving) this.player.setEnd(Math.max(...this.runs.map(run => (run.job ? run.times[run.times.length - 1] : run.end))));
     this.goOn();
   }
-  /** Solve on until the time of one picture is over, and so on until the end. */
+  /** Continue the simulation for one frame, and so on until the end. */
   goOn() {
     this.runs.forEach((run, k) => { if (run.job) this.said[k] = run.goOn(); });
     const several = this.said.length > 1, words = this.said.map((said, k) => (several ? `${this.player.runs[k].label}: ` : "") + said.words);
     this.say(words.join("\n"), this.said.some(said => said.bad));
     if (this.isSolving) this.request = requestAnimationFrame(() => this.goOn());
-    else this.player.setEnd(this.end);  // of a motion that ends early, there
+    else this.player.setEnd(this.end);  // a motion may end early
     this.player.draw();
   }
-  /** Solve all that is still to be solved. */
+  /** Complete all simulations at once. */
   finish() {
     if (this.dirty) this.solve();
     cancelAnimationFrame(this.request);
     while (this.isSolving) this.goOn();
     cancelAnimationFrame(this.request);
   }
-  /** What the whole view shows: all that is drawn of the motions as they are now. */
+  /** Set the bounds of the view to those of the current motions. */
   fit() {
     const {bounds} = this.player.data, all = this.runs.map(run => run.bounds());
     this.firstBounds ??= bounds.slice();
@@ -1631,10 +1631,10 @@ class Player {
     }
     this.root = make("div", {class: "player", tabindex: -1},
       make("header", {}, make("h1", {title: data.title}, data.title),
-        button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
-        button("?", "keys", () => this.toggleHelp(), "icon")),
+        button(icon("theme"), "switch between dark and light (D)", () => this.switchTheme(), "icon"),
+        button("?", "keyboard shortcuts (?)", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
-    this.keys = this.options.fill ? window : this.root;  // a page is nothing else
+    this.keys = this.options.fill ? window : this.root;  // a filled window has no other use of keys
     this.onKey = event => this.key(event);
     this.keys.addEventListener("keydown", this.onKey);
     keepKeys(this.root, this.panels[0].canvas);
@@ -1678,7 +1678,7 @@ class Player {
   on(listener) {
     this.listeners.push(listener);
   }
-  tell() {
+  notify() {
     for (const listener of this.listeners) listener(this);
   }
   toggle(name) {
@@ -1713,9 +1713,9 @@ class Player {
       this.request = requestAnimationFrame(frame);
     };
     this.request = requestAnimationFrame(frame);
-    this.tell();
+    this.notify();
   }
-  /** The end of the timeline. */
+  /** Set the end of the timeline. */
   setEnd(end) {
     this.data.end = end;
     this.t = Math.min(this.t, end);
@@ -1732,12 +1732,12 @@ class Player {
     if (!this.playing) return;
     cancelAnimationFrame(this.request);
     this.setPlaying(false);
-    this.tell();
+    this.notify();
   }
   seek(t) {
     this.t = clamp(t, this.data.start, this.data.end);
     this.draw();
-    this.tell();
+    this.notify();
   }
   switchTheme() {
     this.chosen = this.themeName() === "dark" ? "light" : "dark";
@@ -1787,7 +1787,7 @@ class Player {
     }
     this.draw();
   }
-  /** Pixels of a place in metres in a panel: x + scale X, y - scale Y. */
+  /** The view of a panel: a place (X, Y) in metres is at the pixel (x + scale X, y - scale Y). */
   view(width, height) {
     const [left, bottom, right, top] = this.data.bounds;
     const margin = Math.min(44, 0.12 * Math.min(width, height));
@@ -1795,7 +1795,7 @@ class Player {
     const scale = fit * this.zoom.factor;
     return {scale, x: width / 2 - scale * (left + right) / 2 + this.zoom.x, y: height / 2 + scale * (bottom + top) / 2 + this.zoom.y};
   }
-  /** What paints on a panel's canvas. */
+  /** The painter of a panel's canvas. */
   painter(canvas, context = null) {
     const {clientWidth: width, clientHeight: height} = canvas, pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
     return new SymbolPainter(context, this.view(width, height), this.theme, pt, null);
@@ -1805,7 +1805,7 @@ class Player {
     const {data, t, theme, show} = this;
     this.panels.forEach(({run, canvas, note}, k) => {
       const live = this.live?.runs[k];
-      note.hidden = Boolean(live?.changed);  // it is of the first motion
+      note.hidden = Boolean(live?.changed);  // the note is about the first motion
       const {context, width, height} = contextOf(canvas);
       if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);
@@ -1840,9 +1840,9 @@ class Player {
 }
 /** Show `data` in an element.
  *
- *  options: fill (the whole window), theme ("light", "dark"; by default what the system prefers), autoplay.
- *  Returns time, playing, play(), pause(), seek(t), speed, pixel(panel, x, y) -> [x, y] in the panel's canvas (CSS px),
- *  on(listener) and destroy(). The same object is the element's property `player`.
+ *  options: fill (the whole window), theme ("light", "dark"; by default the preference of the system), autoplay.
+ *  Returns an object with time, playing, play(), pause(), seek(t), speed, pixel(panel, x, y) -> [x, y] in the panel's canvas
+ *  (CSS px), on(listener) and destroy(). The same object is the element's property `player`.
  */
 function mount(element, data, options = {}) {
   const player = new Player(element, data, options);
@@ -1863,10 +1863,10 @@ function mount(element, data, options = {}) {
     destroy: () => player.destroy(),
   };
   element.player = handle;
-  element.dataset.lmSuppressShortcuts = "true";  // of JupyterLab, which would take keys away from it
+  element.dataset.lmSuppressShortcuts = "true";  // so that JupyterLab's shortcuts do not intercept keys
   return handle;
 }
-/** anywidget: the model has `data`, and `time` (s) and `playing`, which follow the player and move it. */
+/** anywidget: the model has `data`, and `time` (s) and `playing`, which are synchronized with the player. */
 function render({model, el}) {
   const player = mount(el, model.get("data"), {theme: model.get("theme") || null});
   const seek = () => { if (Math.abs(model.get("time") - player.time) > 1e-9) player.seek(model.get("time")); };

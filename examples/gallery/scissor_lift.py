@@ -18,7 +18,7 @@ def make():
     figure = Figure(figsize=(7, 3.2), layout="constrained")
     plots.draw_energy(figure.subplots(), sol.ts, parts)
     facts = {
-        "redundant rows": float(len(found.redundant)),
+        "redundant constraints": float(len(found.redundant)),
         "degrees of freedom": float(found.degrees_of_freedom or 0),
         "largest change of energy (J)": float(np.abs(parts.total - parts.total[0]).max()),
     }

@@ -9,27 +9,27 @@ from udkjax.show import doctor
 
 def test_a_good_environment_gets_no_advice():
     found = doctor.facts()
-    assert found["advice"] == [] and set(found["missing_extras"]) <= {"notebook"}  # which is asked for by itself
+    assert found["advice"] == [] and set(found["missing_extras"]) <= {"notebook"}  # an extra of its own
     assert (found["engine"], found["precision"]) == ("native", "float64")
     assert {"udkjax", "jax", "jaxlib", "equinox", "diffrax", "llvmlite", "numpy", "python"} <= set(found["versions"])
     shown = doctor.summary(found)
-    assert "nothing to complain about" in shown and found["versions"]["jax"] in shown and "engine" in shown
+    assert "no problems found" in shown and found["versions"]["jax"] in shown and "engine" in shown
 
 
-def test_single_precision_is_said():
+def test_single_precision_is_reported():
     with jax.enable_x64(False):
         assert any("float64 is off" in line for line in doctor._advice("native", ""))
 
 
-def test_where_machine_code_is_cached_is_said(monkeypatch, tmp_path):
+def test_the_cache_of_machine_code_is_reported(monkeypatch, tmp_path):
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     (tmp_path / "0123").write_bytes(bytes(3 * 2**20))
     assert f"1 in {tmp_path}, 3.0 MiB" in doctor.summary(doctor.facts())
     monkeypatch.setenv("UDKJAX_CACHE", "0")
-    assert "nothing, as UDKJAX_CACHE=0 says" in doctor.summary(doctor.facts())
+    assert "nothing, because UDKJAX_CACHE=0 is set" in doctor.summary(doctor.facts())
 
 
-def test_an_engine_that_does_not_work_is_said():
+def test_a_broken_engine_is_reported():
     def broken(*_, **__):
         raise OSError("no executable memory")
 

@@ -1,4 +1,4 @@
-"""Pictures of identifications that are made up."""
+"""Pictures of made-up identifications."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ def shown(figure) -> list[Any]:
     return [axes for axes in figure.axes if axes.axison and axes.get_label() != "<colorbar>"]
 
 
-def test_records_stand_side_by_side_and_one_without_a_channel_leaves_its_place():
+def test_records_are_side_by_side_and_a_missing_channel_leaves_an_empty_panel():
     data = made()
     figure = pictures(data)["fit"]
     panels = shown(figure)
@@ -78,7 +78,7 @@ def test_records_stand_side_by_side_and_one_without_a_channel_leaves_its_place()
     np.testing.assert_array_equal(line.get_ydata(), data.predicted[1, : N // 2, 0])
 
 
-def test_what_is_left_is_held_against_the_noise():
+def test_residuals_are_compared_with_the_noise():
     data = made()
     over_time, spread, correlated, *_ = shown(pictures(data)["residuals"])
     assert [line.get_label() for line in over_time.lines[::2]] == ["push", "pull"]
@@ -95,7 +95,7 @@ def test_what_is_left_is_held_against_the_noise():
     assert len(bars) == N // 4 and bars[2][1][1] == pytest.approx(lag3)
 
 
-def test_of_many_channels_those_are_shown_that_look_least_like_noise():
+def test_only_the_channels_that_look_least_like_noise_are_shown_if_there_are_many():
     data = made(channels=5)
     data["correlated"][0, 3], data["correlated"][1, 1] = 1e-6, 1e-9
     found = {"residuals": residuals(data, most_channels=2), "fit": fit(data, most_panels=4)}
@@ -105,7 +105,7 @@ def test_of_many_channels_those_are_shown_that_look_least_like_noise():
     assert len(shown(found["fit"])) == 4 and "4 of 9" in found["fit"].get_suptitle()
 
 
-def test_what_is_not_known_has_no_correlation_and_no_bar():
+def test_an_unknown_standard_error_has_no_correlation_and_no_bar():
     figure = pictures(made())["correlation"]
     matrix, errors = shown(figure)
     drawn = matrix.images[0].get_array()
@@ -123,7 +123,7 @@ def test_a_cost_that_rises_begins_another_fit():
     assert [list(line.get_ydata()) for line in change.lines] == [[1.0, 0.1, identify_figures.ZERO_DRAWN], [0.2, 1e-9]]
 
 
-def test_profiles_are_drawn_beside_what_the_standard_error_says():
+def test_profiles_are_drawn_with_their_approximation_by_the_standard_error():
     data = made()
     data["parameter_units"] = "parameter", ["kg", "kg", "m"]
     x = np.array([[1.98, 2.0, 2.03, np.nan], [1.0, 2.0, 3.0, 4.0]])
@@ -140,8 +140,8 @@ def test_profiles_are_drawn_beside_what_the_standard_error_says():
     np.testing.assert_array_equal(curve.get_xdata(), x[0, :3])
     np.testing.assert_allclose(line.get_ydata(), ((line.get_xdata() - 2.0) / 0.01) ** 2)
     assert limit.get_ydata()[0] == 3.84 and (one.get_title(loc="left"), one.get_xlabel()) == ("body.b.mass", "kg")
-    assert len(two.lines) == 2  # its standard error is not known
-    assert two.patches[0].get_width() == 3.0  # of an interval that is open, what was looked at
+    assert len(two.lines) == 2  # its standard error is unknown
+    assert two.patches[0].get_width() == 3.0  # an unbounded interval is drawn as far as the profile goes
 
 
 def test_single_samples_and_exact_fits_can_be_drawn(tmp_path):

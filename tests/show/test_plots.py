@@ -46,7 +46,7 @@ def test_trajectory_draws_the_mechanism_where_it_is(linkage, exact):
     assert energy.get_xlabel() == "time (s)"
 
 
-def test_the_pin_of_one_link_alone_is_drawn_with_its_path():
+def test_a_pin_of_a_single_link_is_drawn_with_its_path():
     mech = udk.Drawing(
         pins={"O": (0, 0), "A": (1, 0), "P": (3, 1)}, links={"plate": udk.Link(["O", "A", "P"], mass=1)}, ground=["O"]
     ).mechanism()
@@ -64,7 +64,7 @@ def test_poses_are_far_apart(exact):
     assert chosen[0] == 0 and len(set(chosen)) == 4
     angles = exact[chosen, 0, 2]
     assert np.ptp(angles) == pytest.approx(np.ptp(exact[:, 0, 2]))
-    assert farthest_instants(exact[:1].repeat(3, axis=0), 4) == [0]  # a mechanism that stands has one pose
+    assert farthest_instants(exact[:1].repeat(3, axis=0), 4) == [0]  # a mechanism at rest has one pose
 
 
 def test_two_pictures_do_not_share_anything(linkage, exact):
@@ -72,14 +72,14 @@ def test_two_pictures_do_not_share_anything(linkage, exact):
     assert not set(first.axes) & set(second.axes)
 
 
-def test_a_run_that_failed_is_drawn_as_far_as_it_came(linkage, exact):
+def test_a_failed_run_is_drawn_up_to_its_failure(linkage, exact):
     broken = np.where(np.arange(len(exact))[:, None, None] < 5, exact, np.nan)
     figure = trajectory(linkage, solution(linkage, broken, code=Result.step_limit))
     figure.savefig(io.BytesIO(), format="png")
     assert np.isfinite(figure.axes[0].get_xlim()).all()
 
 
-# Plots on axes that they are given.
+# Plots on given axes.
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_heat_maps(axes, sweep_data):
     one = Figure().subplots()
     plots.draw_sweep(one, sweep_data.isel(rtol=0), "violation")
     np.testing.assert_array_equal(one.lines[0].get_ydata(), [0, 2, 4])
-    with pytest.raises(ValueError, match="several panels: choose values"):
+    with pytest.raises(ValueError, match="several panels: select values"):
         plots.draw_sweep(axes, sweep_data.expand_dims(method=["SVD", "Varga"]), "violation")
 
 
@@ -122,7 +122,7 @@ def test_reactions_and_their_uniqueness(axes):
     assert plots.draw_reactions(axes, TS, {"A": {"link": load}, "B": {"link": 2 * load}}, unique) is axes
     np.testing.assert_allclose(line(axes, "A")[:, 1], 5)
     np.testing.assert_allclose(line(axes, "B (not unique)")[:, 1], 10)
-    assert axes.lines[1].get_linestyle() == ":" and axes.get_ylabel() == "force of a joint (N)"
+    assert axes.lines[1].get_linestyle() == ":" and axes.get_ylabel() == "joint force (N)"
 
 
 def test_coupler_curves_begin_at_a_mark(axes):
@@ -149,7 +149,7 @@ def test_the_fit_of_one_channel(axes):
         plots.draw_fit(axes, data, "x")
 
 
-def test_every_function_that_draws_says_what_is_on_its_axes(linkage, exact):
+def test_every_drawing_function_labels_its_axes_with_units(linkage, exact):
     sol = solution(linkage, exact)
     cases: list[Any] = [
         (plots.draw_motion, linkage, exact),
@@ -164,14 +164,14 @@ def test_every_function_that_draws_says_what_is_on_its_axes(linkage, exact):
 
 
 def luminance(colour):
-    """How light a colour is, in the eyes (L* of CIE, from 0 to 100)."""
+    """Perceived lightness of a colour (CIE L*, 0 to 100)."""
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
     y = np.dot([0.2126, 0.7152, 0.0722], linear)
     return 116 * np.cbrt(y) - 16 if y > 0.008856 else 903.3 * y
 
 
-def test_curves_are_told_apart_in_print():
-    """Two curves on the same axes differ by their dashes or marks, or by how light they are."""
+def test_curves_can_be_told_apart_in_print():
+    """Two curves on the same axes differ by dashes, markers or lightness."""
     three = {"A": {"b": np.ones((5, 3))}, "B": {"b": np.ones((5, 3))}, "C": {"b": np.ones((5, 3))}}
     cases: list[Any] = [
         (plots.draw_reactions, TS, three),
@@ -185,4 +185,4 @@ def test_curves_are_told_apart_in_print():
         for one, other in combinations(curves, 2):
             differ = one.get_linestyle() != other.get_linestyle() or one.get_marker() != other.get_marker()
             assert differ or abs(luminance(one.get_color()) - luminance(other.get_color())) > 10, draw.__name__
-    assert max(luminance(colour) for colour in COLOURS) < 75  # none vanishes on white
+    assert max(luminance(colour) for colour in COLOURS) < 75  # all are visible on white

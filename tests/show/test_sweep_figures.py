@@ -1,4 +1,4 @@
-"""Pictures of sweeps that are made up."""
+"""Pictures of made-up sweeps."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ COORDS = {"rtol": TOLS, "method": ["SVD", "Varga"], "mass": MASSES, "start": [-0
 
 
 def made(*dims):
-    """A sweep over these dimensions, whose violation is the tolerance times the mass; the last but one member failed."""
+    """A sweep over these dimensions, with tolerance times mass as violation; the last but one member failed."""
     data = xarray.Dataset(coords={dim: COORDS[dim] for dim in dims})
     value = np.ones(tuple(len(COORDS[dim]) for dim in dims))
     for k, dim in enumerate(dims):
@@ -40,14 +40,14 @@ def panels(figure) -> list[Any]:
 
 def test_two_axes_are_a_map():
     figures = pictures(made("rtol", "mass"))
-    assert list(figures) == ["result", "violation"]  # which has one number a member; q_end has not
+    assert list(figures) == ["result", "violation"]  # one number per member, unlike q_end
     (axes,) = panels(figures["violation"])
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_yscale()) == ("mass (kg)", "rtol", "log")
     (mesh,) = axes.collections
     expected = TOLS[:, None] * MASSES
     expected[-1, -2] = np.nan
     np.testing.assert_array_equal(np.ma.filled(mesh.get_array(), np.nan), expected)
-    assert isinstance(mesh.norm, LogNorm) and figures["violation"].get_suptitle() == "violation (m); grey: no value"
+    assert isinstance(mesh.norm, LogNorm) and figures["violation"].get_suptitle() == "violation (m); grey: missing values"
     corners = mesh.get_coordinates()
     np.testing.assert_allclose(corners[0, :, 0], [0.5, 1.5, 3.0, 5.0])
     np.testing.assert_allclose(corners[:, 0, 1], 10.0 ** np.arange(-10.5, -6))
@@ -79,7 +79,7 @@ def test_other_axes_have_panels():
     assert len(panels(figure)) == 3 and "the first 3 of 4 panels" in figure.get_suptitle()
 
 
-def test_choices_are_read_from_above():
+def test_choices_are_listed_from_top_to_bottom():
     (axes,) = panels(pictures(made("method", "rtol"))["violation"])
     assert [text.get_text() for text in axes.get_yticklabels()] == ["SVD", "Varga"]
     assert axes.get_ylim() == (1.5, -0.5)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 COMMAND = "from udkjax.cli import main; main()"
-PATIENCE = 120.0  # s for the server to compile and diagnose, on a machine that others use as well
+PATIENCE = 120.0  # s: time for the server to compile and diagnose on a busy machine
 
 
 class StudioPage:
@@ -21,14 +21,14 @@ class StudioPage:
         page.on("console", lambda m: self.problems.append(m.text) if m.type in ("error", "warning") else None)
         page.on("request", lambda request: self.requests.append(request.url))
         page.goto(address, timeout=1e3 * PATIENCE)
-        self.until("window.studio?.sync !== undefined")  # before, it is the element of that name
+        self.until("window.studio?.sync !== undefined")  # until then window.studio is the element with this id
         self.settle()
 
     def js(self, code):
         return self.page.evaluate(code)
 
     def until(self, condition):
-        """Wait for a condition; Playwright's own way evaluates text, which the page forbids."""
+        """Wait for a condition; Playwright's own function evaluates text, which the page forbids."""
         for _ in range(int(PATIENCE / 0.05)):
             if self.page.evaluate(condition):
                 return
@@ -36,7 +36,7 @@ class StudioPage:
         raise AssertionError(f"{condition} did not come true; {self.problems}; {self.status()}")
 
     def settle(self):
-        """Wait until text, engine and findings are those of the drawing."""
+        """Wait until text, engine and findings are up to date with the drawing."""
         self.page.evaluate("studio.sync.settled()")
         self.page.wait_for_timeout(60)  # a frame or two
 
@@ -52,19 +52,19 @@ class StudioPage:
         return self.page.locator(".findings .body").inner_text()
 
     def pixel(self, x, y):
-        """Return where a place (mm) of the drawing is on the screen."""
+        """Return the pixel of a place (mm) of the drawing."""
         box = self.page.locator("main canvas").bounding_box()
         view = self.js("studio.view")
         return box["x"] + view["x"] + view["scale"] * x / 1e3, box["y"] + view["y"] - view["scale"] * y / 1e3
 
     def pin(self, name):
-        """Return where a pin is on the screen now."""
+        """Return the pixel of a pin."""
         box = self.page.locator("main canvas").bounding_box()
         x, y = self.js(f"studio.canvas.places.get({json.dumps(name)})")
         return box["x"] + x, box["y"] + y
 
     def link_end(self, index):
-        """Return where a link is on the screen, away from its first pin."""
+        """Return the pixel of a link's end away from its first pin."""
         box = self.page.locator("main canvas").bounding_box()
         outline = f"studio.canvas.outlines.find(({{of}}) => of.kind === 'link' && of.index === {index}).points"
         x, y = self.js(f"{outline}.at(-1)")
@@ -92,13 +92,13 @@ class StudioPage:
 
     def run(self):
         """Return the motion that the page computed: times and coordinates of all bodies."""
-        run = "const {run, mover} = studio.motion"
-        return self.js(f"(() => {{ {run}; return {{ts: [...run.ts], q: [...run.q], bodies: mover.scene.bodies}}; }})()")
+        run = "const {run, pageEngine} = studio.motion"
+        return self.js(f"(() => {{ {run}; return {{ts: [...run.ts], q: [...run.q], bodies: pageEngine.scene.bodies}}; }})()")
 
 
 @contextmanager
 def served(folder: Path, opened: str = ""):
-    """Serve a studio in a folder; gives its address."""
+    """Serve a studio in a folder; yields its address."""
     command = [sys.executable, "-c", COMMAND, "studio", str(folder / opened), "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
         try:
@@ -112,7 +112,7 @@ def served(folder: Path, opened: str = ""):
 
 @contextmanager
 def studio_page(browser, address, folder, width=1280, height=800, **options):
-    """Open the page of a studio, and hold that it said no error and asked nobody else."""
+    """Open the page of a studio, and require that it reports no error and contacts no other server."""
     context = browser.new_context(viewport={"width": width, "height": height}, **options)
     try:
         found = StudioPage(context.new_page(), address, folder)

@@ -9,7 +9,7 @@ BASE = f"http://127.0.0.1:{PORT}"
 
 
 class HereWorker:
-    """A worker that does its tasks in this process."""
+    """A worker that runs its tasks in this process."""
 
     def call(self, name, arguments, seconds):
         from udkjax.studio import tasks
@@ -18,7 +18,7 @@ class HereWorker:
 
 
 class Answer:
-    """What a server answered."""
+    """The answer of a server."""
 
     def __init__(self, messages):
         start, *parts = messages
@@ -50,7 +50,7 @@ def exchange(app, method, path, parts, headers):
 
 @pytest.fixture
 def client(tmp_path):
-    """Send requests to a studio in a temporary folder, as its own page does unless told otherwise."""
+    """Send requests to a studio in a temporary folder, by default as its own page does."""
     from udkjax.studio.application import Studio, application
     from udkjax.studio.folder import Folder
 

@@ -7,7 +7,7 @@ const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
 const {applyFix} = await page("fixes"), {shapeProblem} = await page("checks");
-const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("mover"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
+const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("page_engine"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
 const at = (x, y, pin = null, link = null) => ({place: [x, y], pin, link, pixel: [1000 * x, -1000 * y]});
@@ -33,7 +33,7 @@ test("links share pins, and are written in the file's unit", () => {
   assert.deepEqual(d.members(found, "A"), ["ground", "link1"]);
 });
 
-test("an action without sense is a problem in words", () => {
+test("a senseless action is a problem in words", () => {
   const found = fourBar();
   for (const result of [actions.drawLink(found, at(0, 0, "A"), at(0, 0, "A"), context), actions.drawLink(found, at(0, 0, "A"), at(0, 0, "B"), context),
     actions.drawMotor(found, at(0.5, 0.5)), actions.drawGround(found, at(0.5, 0.5)), actions.drawSlide(found, at(1, 1), at(2, 1), context), actions.drawSlot(found, at(1, 1), at(2, 1)),
@@ -59,14 +59,14 @@ test("a pin on a plate's edge keeps the order of its corners", () => {
   assert.deepEqual(made.link[0].pins, ["A", "B", name, "C", "D"]);
 });
 
-test("merging pins carries all that is at them, and drops links that lose their length", () => {
+test("merging pins keeps everything at them, and drops links left with one pin", () => {
   const found = d.mergePins(fourBar(), "B", "A");
   assert.deepEqual(found.link.map(link => link.pins), [["A", "C"], ["D", "C"]]);
   assert.ok(!("B" in found.pins));
   assert.equal(d.mergePins(fourBar(), "A", "A").link.length, 3);
 });
 
-test("what is deleted takes with it what hangs on it, and nothing else", () => {
+test("deleting an item deletes everything that needs it, and nothing else", () => {
   const whole = fourBar();
   assert.deepEqual(d.removeElements(whole, [{kind: "link", index: 0}]).motor, undefined);
   assert.deepEqual(Object.keys(d.removeElements(whole, [{kind: "link", index: 0}]).pins), ["B", "C", "D"]);
@@ -143,7 +143,7 @@ test("copies have pins of their own", () => {
   assert.deepEqual(found.ground, ["A", "D", "E"]);
 });
 
-test("undo brings back the very state, redo too, and a step that says nothing new is none", () => {
+test("undo and redo restore the very states, and an equal state adds no step", () => {
   const history = new History({n: 0}), states = [history.state], equal = (a, b) => a.n === b.n;
   for (let n = 1; n <= 50; n++) {
     states.push({n});
@@ -159,9 +159,11 @@ test("undo brings back the very state, redo too, and a step that says nothing ne
   assert.equal(history.canRedo, false);
 });
 
-test("lengths have units, and go back into them", () => {
+test("lengths are read and written with units", () => {
   const document = {units: {length: "mm", angle: "deg"}};
   assert.equal(units.length("1.5 in", document), 1.5 * 0.0254);
+  assert.equal(units.length("3 µm", document), 3e-6);
+  assert.equal(units.direction("90°", {}), Math.PI / 2);
   assert.equal(units.length(12, document), 12e-3);
   assert.ok(Number.isNaN(units.length("12 parsec", document)) && Number.isNaN(units.length(null, document)) && Number.isNaN(units.length("nan", document)));
   assert.equal(units.written(0.0305, document), 30.5);
@@ -173,14 +175,14 @@ test("lengths have units, and go back into them", () => {
   assert.equal(units.niceBelow(0.001), 0.001);
 });
 
-test("values are typed as they stand", () => {
+test("values are typed as they are shown", () => {
   for (const value of [12, -1.5e-3, "12 mm", ["A", "B"], [1, 2], ["0 N", "-10 N"], [[1, 2], [3, 4]], true, {type: "sine", amplitude: 1}]) assert.deepEqual(readValue(valueText(value)), Array.isArray(value) && value.every(x => /^[A-Z]$/.test(x)) ? "A, B" : value);
   assert.deepEqual(readValue("A, B", true), ["A", "B"]);
   assert.equal(readValue("12", true), "12");
   assert.equal(readValue("  "), undefined);
 });
 
-test("the view zooms about a pixel and fits what there is", () => {
+test("the view zooms about a pixel and fits all points", () => {
   const before = {scale: 1000, x: 10, y: 20}, pixel = [300, 200], after = view.zoomAt(before, pixel, view.ZOOM_STEP);
   view.toMetres(before, pixel).forEach((x, k) => assert.ok(Math.abs(x - view.toMetres(after, pixel)[k]) < 1e-15));
   const fitted = view.fit([[0, 0], [2, 1]], 800, 600, 1);
@@ -213,7 +215,7 @@ test("every element has symbols that name it, and strange ones have none", () =>
   for (const {points = [], frame} of symbolsOf(strange, 1e-3)) assert.ok([...points.flat(), ...frame.flat()].every(Number.isFinite));
 });
 
-test("a fix makes a pin a slot, and the link that gives it up keeps its mass", () => {
+test("a fix turns a pin into a slot, and the link that loses the pin keeps its mass", () => {
   const document = fourBar(), scene = {bodies: ["link1", "link2", "link3"], frames: [[0.015, 0.02, 0], [0.075, 0.065, 0], [0.11, 0.045, 0]], masses: [1, 2, 3], inertias: [0.1, 0.2, 0.3]};
   const drawn = {kind: "slot", on: "link2", link: "link1", direction: [1, 1e-17]}, found = applyFix(document, {constraint: "B", drawn}, scene);
   assert.deepEqual(found.slot, [{pin: "B", direction: [1, 0], on: "link2"}]);
@@ -226,7 +228,7 @@ test("a fix makes a pin a slot, and the link that gives it up keeps its mass", (
   assert.equal(applyFix({...document, gear: [{links: ["link1", "link3"], teeth: [1, 2]}]}, {constraint: "gear1", drawn: {kind: "remove"}}, scene).gear, undefined);
 });
 
-test("a view far inside of a drawing, or of places without end, costs nothing", () => {
+test("a view deep inside a drawing, or of extremely far places, costs nothing", () => {
   const document = {...fourBar(), slide: [{link: "link3", direction: 0}]};
   assert.ok(symbolsOf(document, 1e-12).length < 500);
   const far = view.fit([[1e308, -1e308], [-1e308, 1e308]], 800, 600, 1);
@@ -246,18 +248,18 @@ test("a body's frames become a motion of the drawing, and a run is smooth betwee
   }
 });
 
-test("texts can be read on all grounds", async () => {
+test("texts are legible on all backgrounds", async () => {
   const {THEMES, contrast, mix, readable} = await page("player/painter");
   assert.equal(contrast("#000000", "#ffffff"), 21);
   for (const theme of Object.values(THEMES)) {
     const {back, panel, ink, soft, accent, onAccent, force, bodies} = theme, texts = [ink, soft, accent, force, ...bodies.map(colour => readable(colour, theme))];
     for (const colour of texts) for (const ground of [back, panel]) assert.ok(contrast(colour, ground) >= 4.5, `${colour} on ${ground}`);
-    assert.ok(contrast(mix(accent, ink, 0.25), mix(panel, accent, 0.14)) >= 4.5);  // what is pressed
+    assert.ok(contrast(mix(accent, ink, 0.25), mix(panel, accent, 0.14)) >= 4.5);  // a pressed button
     assert.ok(contrast(onAccent, accent) >= 4.5);
   }
 });
 
-test("whatever stands in a file is drawn, or said not to be a drawing", () => {
+test("any content of a file is drawn, or refused as not being a drawing", () => {
   const whole = {
     format: 2, units: {length: "mm", angle: "deg"}, ground: ["A", "D"], pins: {A: [0, 0], B: [30, 40], C: [120, 90], D: [100, 0], E: [60, 60]},
     link: [{name: "crank", pins: ["A", "B"], density: 7850, width: 15, thickness: 5}, {name: "plate", pins: ["B", "C", "E"], mass: "1 kg", centre: [70, 60], outline: [[0, 0], [1, 0], [0, 1]]},
@@ -269,7 +271,7 @@ test("whatever stands in a file is drawn, or said not to be a drawing", () => {
     damper: [{between: ["A", "C"], damping: 1}, {pin: "A", damping: 1}], load: [{pin: "C", force: ["1 N", "2 N"]}, {link: "plate", torque: 1}],
   };
   let refused = 0, drawn = 0;
-  const look = document => { // of each kind one is removed, another one each time
+  const look = document => {  // removes one element of each kind, each time another one
     symbolsOf(document, 1e-3);
     shapes.extentPoints(document);
     d.settle(document);
@@ -292,7 +294,7 @@ test("whatever stands in a file is drawn, or said not to be a drawing", () => {
   assert.ok(refused > 100 && drawn > 500, `${refused} ${drawn}`);
 });
 
-test("a name never covers a sign: it stands elsewhere, or is left out", async () => {
+test("a name never covers a sign: it moves, or is left out", async () => {
   const {Labels} = await page("player/labels"), written = [];
   const context = {canvas: {clientWidth: 400, clientHeight: 400}, measureText: words => ({width: 8 * words.length})};
   const names = new Labels();

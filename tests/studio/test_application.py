@@ -93,7 +93,7 @@ def test_a_file_is_opened_changed_and_saved(client):
     assert again.status_code == 409 and again.json()["revision"] == saved.json()["revision"]
 
 
-def test_a_scene_says_where_its_bodies_are(client):
+def test_a_scene_has_the_frames_of_its_bodies(client):
     scene = client.ask("compile", text=SIX_BAR).json()["scene"]
     mechanism = udk.loads(SIX_BAR)
     assert scene["bodies"] == list(mechanism.bodies)
@@ -116,7 +116,7 @@ def test_mistakes_come_with_the_drawing(client):
     assert broken["document"] is None and "TOML" in broken["problems"][0]
 
 
-def test_numbers_that_are_none_are_named(client):
+def test_places_that_are_not_finite_are_named(client):
     answer = client.ask("compile", text=SIX_BAR.replace("D = [250, 150]", "D = [nan, inf]"))
     assert answer.status_code == 200
     assert answer.json()["scene"] is None and "D" in answer.json()["problems"][0]
@@ -132,7 +132,7 @@ def test_a_hundred_thousand_pins_are_refused_at_once(client):
     assert client.ask("compile", text="", document=document).status_code == 413
 
 
-def test_files_of_format_1_are_drawn_anew(client):
+def test_files_of_format_1_are_converted(client):
     (client.folder / "old.toml").write_text(udk.dumps(udk.library.parallelogram()))
     opened = client.ask("open", path="old.toml").json()
     assert opened["drawn"] and opened["document"]["format"] == 2
@@ -141,11 +141,11 @@ def test_files_of_format_1_are_drawn_anew(client):
 def test_the_paper_linkage_is_diagnosed(client):
     text = client.ask("open", template="parallelogram").json()["text"]
     found = client.ask("diagnose", text=text).json()
-    assert (found["freedoms"], found["redundant"]) == (1, 1)
+    assert (found["degrees_of_freedom"], found["redundant"]) == (1, 1)
     assert found["sets"][0]["constraints"] == ["A1", "A2", "A3", "B1", "B2", "B3"]
     assert {fix["constraint"] for fix in found["sets"][0]["fixes"]} == {"A1", "A2", "A3", "B1", "B2", "B3"}
-    assert set(found["loose"]) == {"A1", "A2", "A3", "B1", "B2", "B3"}
-    assert "gravity" in found["motion"]
+    assert set(found["not_unique"]) == {"A1", "A2", "A3", "B1", "B2", "B3"}
+    assert found["motion"] == "Gravity and loads move it; add a motor to drive it"
 
 
 def test_a_triangle_is_said_not_to_move(client):
@@ -155,14 +155,14 @@ def test_a_triangle_is_said_not_to_move(client):
         .replace('ground = ["O", "C"]', 'ground = ["O", "C", "A"]')
     )
     found = client.ask("diagnose", text=text).json()
-    assert found["freedoms"] == 0 and "cannot move" in found["motion"]
+    assert found["degrees_of_freedom"] == 0 and "cannot move" in found["motion"]
 
 
 @pytest.mark.slow
-def test_a_motor_is_said_where_it_stops_and_what_is_in_line_there(client):
+def test_the_limits_of_a_motor_and_the_pins_in_line_there_are_found(client):
     text = ARMS.replace("A = [0, 1]", "A = [0, 2]")
     (found,) = client.ask("diagnose", text=text, about="travel").json()["travel"]
-    # Crank and ground are 2 long, coupler and rocker the root of 2.5: in line where A is the root of 10 away from C.
+    # Crank and ground have length 2, coupler and rocker sqrt(2.5): these two are in line when A and C are sqrt(10) apart.
     expected = math.acos((4 + 4 - 10) / 8) - math.pi / 2
     (end,) = [end for end in found["ends"] if end["value"] > 0]
     assert found["motor"] == "motor1"
@@ -171,27 +171,27 @@ def test_a_motor_is_said_where_it_stops_and_what_is_in_line_there(client):
 
 
 @pytest.mark.slow
-def test_curves_need_forces(client):
+def test_curves_of_forces_and_powers_agree_with_the_work_done(client):
     found = client.ask("diagnose", text=SIX_BAR, about="dynamics").json()
     names = {curve["name"] for curve in found["curves"]}
-    assert {"motor1: effort", "motor1: power", "kinetic energy", "violation", "B: force on rocker"} <= names
+    assert {"motor1: driving torque", "motor1: power", "kinetic energy", "violation", "B: force on rocker"} <= names
     curves = {curve["name"]: np.array(curve["values"]) for curve in found["curves"]}
     work = np.concatenate(
         [[0], np.cumsum(np.diff(found["times"]) * (curves["motor1: power"][1:] + curves["motor1: power"][:-1]) / 2)]
     )
     change = curves["work of drivers and loads"]
-    assert np.abs(work - change).max() < 1e-3 * np.abs(change).max()  # of the trapezoidal rule at 401 instants
+    assert np.abs(work - change).max() < 1e-3 * np.abs(change).max()  # the error of the trapezoidal rule at 401 instants
 
 
-def test_what_motors_hold_still_needs_their_efforts(client):
-    """An arm of 2 kg and 1 m that a motor turns from the vertical: at rest in each position it needs m g sin(angle) / 2."""
+def test_an_arm_is_held_by_a_torque(client):
+    """An arm of 2 kg and 1 m, turned by a motor from the vertical, is held at rest by the torque m g sin(angle) / 2."""
     arm = 'format = 2\nground = ["O"]\n[pins]\nO = [0, 0]\nA = [0, 1]\n[[link]]\nname = "arm"\npins = ["O", "A"]\nmass = 2\n'
     found = client.ask("diagnose", text=arm + '[[motor]]\npin = "O"\nspeed = 3\n', about="holding").json()
     curves, times = {curve["name"]: curve["values"] for curve in found["curves"]}, np.array(found["times"])
-    np.testing.assert_allclose(curves["motor1: effort"], -9.81 * np.sin(3 * times), atol=1e-9)
+    np.testing.assert_allclose(curves["motor1: holding torque"], -9.81 * np.sin(3 * times), atol=1e-9)
     np.testing.assert_allclose(curves["O: force on arm"], 2 * 9.81, rtol=1e-12)
     (problem,) = client.ask("diagnose", text=arm, about="holding").json()["problems"]
-    assert "motors do not hold all of it" in problem
+    assert "motors do not hold the whole mechanism" in problem
 
 
 @pytest.mark.slow
@@ -213,17 +213,17 @@ def test_an_exported_script_holds_the_drawing():
     assert names["SCENE"] == hostile
 
 
-def test_templates_that_are_none_are_refused(client):
+def test_unknown_templates_are_refused(client):
     for name in ("nothing", "../four_bar", None, 3, {"a": 1}):
         assert client.ask("open", template=name).status_code == 404
 
 
 @pytest.mark.slow
-def test_what_takes_too_long_is_stopped_and_the_next_is_served():
+def test_a_task_that_takes_too_long_is_stopped_and_the_next_is_served():
     worker = Worker()
     try:
         with pytest.raises(RefusedError, match="longer than"):
-            worker.call("list_templates", {}, 0.001)  # shorter than it takes to import
+            worker.call("list_templates", {}, 0.001)  # less than the imports take
         assert worker.call("list_templates", {}, 60.0)["templates"]
         with pytest.raises(RefusedError, match="no template"):
             worker.call("open_template", {"name": "nothing"}, 60.0)
@@ -240,34 +240,36 @@ def test_fixes_are_changes_of_the_drawing(client):
         np.testing.assert_allclose(drawn["direction"], [np.sqrt(0.5), -np.sqrt(0.5)], atol=1e-12)  # along the crank, as drawn
 
 
-def test_the_engine_takes_places_of_pins_and_a_hand_that_nothing_drives(client):
+def test_the_engine_takes_places_of_pins_and_the_one_for_pulling_has_no_motors(client):
     answer = client.ask("compile", text=SIX_BAR, engine="wasm").json()
     names = [parameter["name"] for parameter in answer["engine"]["parameters"]]
     assert names == [f"pin.{pin}[{k}]" for pin in answer["pins"] for k in (0, 1)]
     assert set(answer["engine"]["modules"]) == {"run", "close", "evaluate"}
-    assert set(answer["hand"]["modules"]) == {"close", "evaluate"}  # it is moved, and does not move
+    assert set(answer["hand"]["modules"]) == {"close", "evaluate"}  # it closes positions, and runs no motion
     assert len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
+    assert answer["scene"]["drivers"] == [{"name": "motor1", "effort": "motor1: driving torque", "unit": "N m"}]
 
 
-def test_a_cylinder_moves_the_page_s_engine_and_lets_go_of_the_hand(client):
+def test_a_cylinder_is_in_the_page_s_engine_but_not_in_the_one_for_pulling(client):
     text = BOOM.replace("LIFT", 'motor = [{between = ["C", "A"], speed = "20 mm/s"}]')
     answer = client.ask("compile", text=text, engine="wasm").json()
     assert answer["why"] == "" and len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
+    assert answer["scene"]["drivers"] == [{"name": "motor1", "effort": "motor1: driving force", "unit": "N"}]
     (travel,) = client.ask("diagnose", text=text, about="travel").json()["travel"]
     reach = [math.hypot(500, 150) + sign * math.hypot(300, 200) for sign in (-1, 1)]  # mm: C is in line with O and A
     drawn = math.hypot(200, 350)
     np.testing.assert_allclose([1e3 * end["value"] + drawn for end in travel["ends"]], reach, rtol=1e-6)
 
 
-def test_what_is_at_rest_has_a_finite_duration(client):
+def test_a_mechanism_at_rest_has_a_finite_duration(client):
     scene = client.ask("compile", text=SIX_BAR.replace("60 rpm", "0 rpm")).json()["scene"]
     assert 0 < scene["duration"] < 100
     nothing_moves_it = ARMS.replace('motor = [{pin = "O", speed = 1}]', "gravity = [0, 0]")
     assert client.ask("compile", text=nothing_moves_it).json()["scene"]["duration"] == 1.0
 
 
-def test_a_slide_is_shown_as_long_as_it_takes_to_cross_the_mechanism():
-    """A block at 2 mm/s goes in a run about as far as the link that it pulls is long, not the way of a few swings."""
+def test_a_run_of_a_slide_lasts_until_it_has_crossed_the_mechanism():
+    """A block at 2 mm/s moves in a run by about the length of the link that it pulls; a few swings would be too short."""
     links = {"block": udk.Link(["P"], mass=1.0, width=0.01), "arm": udk.Link(["P", "Q"], mass=1.0)}
     slides, motors = {"guide": {"link": "block", "direction": [0, 1]}}, {"push": {"slide": "guide", "speed": -0.002}}
     mech = udk.Drawing({"P": (0, 0), "Q": (0.2, 0)}, links, slides=slides, motors=motors).mechanism()
@@ -283,31 +285,31 @@ def test_all_pins_of_a_line_are_named_once():
 
 
 @pytest.mark.parametrize("document", [[1], "x", 3, True])
-def test_a_document_that_is_none_is_refused(client, document):
+def test_a_document_that_is_not_an_object_is_refused(client, document):
     answer = client.ask("compile", text="", document=document)
     assert answer.status_code == 400 and "document: must be an object" in answer.text
 
 
-def test_subjects_that_are_none_are_refused(client):
+def test_unknown_subjects_are_refused(client):
     text = client.ask("open", template="four_bar").json()["text"]
     for about in ({"a": 1}, ["structure"], "__class__", 3):
         assert client.ask("diagnose", text=text, about=about).status_code == 400
 
 
-def test_tables_within_one_another_are_a_mistake(client):
+def test_deeply_nested_tables_are_a_mistake(client):
     answer = client.ask("compile", text=f"[{'.'.join(['a'] * 2000)}]\nx = 1").json()
-    assert answer["problems"] == ["tables lie within one another too deeply"]
+    assert answer["problems"] == ["tables are nested too deeply"]
 
 
-def test_lengths_that_become_too_large_are_said_to(client):
-    """The radius of gyration of hardly any mass is infinite, and no answer can hold that."""
+def test_an_infinite_length_is_reported(client):
+    """With a mass of almost zero the radius of gyration is infinite, and JSON has no infinity."""
     text = client.ask("open", template="parallelogram").json()["text"].replace("mass = 1.0", "mass = 1e-320")
     answer = client.ask("compile", text=text)
     assert answer.status_code == 200 and "characteristic length is infinite" in answer.json()["problems"][0]
 
 
-def test_names_are_no_formulas_in_a_table(client):
-    """A spreadsheet computes a cell that begins with an equals sign: with an apostrophe before it, it is a text."""
+def test_a_name_is_not_a_formula_in_a_table(client):
+    """A spreadsheet computes a cell that begins with an equals sign, unless an apostrophe precedes it."""
     name = "=HYPERLINK(0)"
     text = f'format = 2\nground = ["A"]\n[pins]\nA = [0, 0]\nB = [1, 0]\n[[link]]\nname = "{name}"\npins = ["A", "B"]\nmass = 1\n'
     assert client.ask("save", text=text, path="x.csv", export=True).status_code == 200

@@ -10,7 +10,7 @@ from tests.studio.browsing import PATIENCE, served, studio_page
 from udkjax.studio.templates import TEMPLATES
 
 TOLERANCE = 1e-8  # of the page's runs
-STEPS = 600  # of a mouse that pulls: ten seconds at 60 pictures a second
+STEPS = 600  # moves of a pulling mouse: ten seconds at 60 frames per second
 RECORD_FRAMES = """(() => {
     const {motion, parts} = studio, pull = motion.pullTo.bind(motion);
     window.frames = [];
@@ -43,7 +43,7 @@ def draw_five_bar(studio):
 
 
 def assert_moves_as_simulated(studio, text, atol=1e-9):
-    """Hold the page's motion against `simulate` of the text."""
+    """Compare the page's motion with `simulate` of the text."""
     mechanism, run = udk.loads(text), studio.run()
     q = np.array(run["q"]).reshape(len(run["ts"]), -1, 3)
     sol = udk.simulate(mechanism, np.array(run["ts"]), rtol=TOLERANCE, atol=TOLERANCE)
@@ -57,8 +57,8 @@ def test_the_paper_five_bar_is_drawn_diagnosed_moved_and_saved(studio):
     studio.settle()
     assert [link["pins"] for link in studio.document["link"]] == [["A", "B"], ["C", "D"], ["B", "F", "D"], ["E", "F"]]
     found = studio.findings
-    assert "1 freedom · 1 redundant constraint" in found
-    assert "A, B, C, D, E, F: 1 redundant row, everywhere. One of these mends it:" in found
+    assert "1 degree of freedom · 1 redundant constraint" in found
+    assert "A, B, C, D, E, F: 1 redundant constraint in every position. Any one of these changes removes it:" in found
     for pin in "ABCDEF":
         assert f"{pin}: make it a slot" in found
     assert "not unique at A (x, y)" in found
@@ -96,14 +96,14 @@ def test_fifty_undos_return_to_the_first_state_to_the_bit_and_fifty_redos_to_the
         studio.page.keyboard.press("Control+z")
     studio.settle()
     assert studio.js("JSON.stringify(studio.state)") == states[0]
-    assert studio.js("studio.motion.mover") is None
+    assert studio.js("studio.motion.pageEngine") is None
     assert studio.js("[studio.marked.size, studio.paths.length]") == [0, 0]
     for k in range(50):
         studio.page.keyboard.press("Control+y" if k % 2 else "Control+Shift+z")
     studio.settle()
     assert studio.js("JSON.stringify([studio.state.document, studio.state.text])") == last
     assert "1 redundant constraint" not in studio.findings  # one crank was made longer
-    assert_moves_as_simulated(studio, studio.js("studio.state.text")) if "1 freedom" in studio.findings else None
+    assert_moves_as_simulated(studio, studio.js("studio.state.text")) if "1 degree of freedom" in studio.findings else None
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_a_slider_crank_is_drawn_and_its_text_is_edited_beside_it(studio):
     studio.click(40, 100)
     studio.settle()
     assert studio.document["slide"] == [{"name": "slide1", "link": "slider1", "direction": [1, 0]}]
-    assert "1 freedom, 0 with its motors held · nothing redundant" in studio.findings
+    assert "1 degree of freedom, 0 with motors held · no redundant constraints" in studio.findings
     assert "motor1 turns all the way round" in studio.findings
     assert_moves_as_simulated(studio, studio.js("studio.state.text"))
     text = studio.js("studio.state.text")
@@ -156,9 +156,9 @@ def test_a_pin_in_a_slot_of_a_link_is_drawn_and_held_by_its_motor(studio):
     text = studio.js("studio.state.text")
     assert_moves_as_simulated(studio, text)
     studio.page.get_by_role("tab", name="Statics").click()
-    studio.page.get_by_role("button", name="where motors hold").click()
+    studio.page.get_by_role("button", name="compute the holding torques").click()
     studio.until("studio.curves.servedFor() !== null")
-    assert {"motor1: effort", "A: force on link1", "slot1: force on link2"} <= set(studio.js("studio.curves.names()"))
+    assert {"motor1: holding torque", "A: force on link1", "slot1: force on link2"} <= set(studio.js("studio.curves.names()"))
 
 
 @pytest.mark.slow
@@ -186,12 +186,12 @@ def test_a_drag_released_over_a_panel_has_ended_and_escape_takes_one_away(studio
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_a_pin_that_is_pulled_takes_the_mechanism_along_and_loops_stay_closed(studio, template):
     studio.js(f"studio.files.openTemplate({json.dumps(template)})")
-    studio.until("studio.motion.mover !== null")
+    studio.until("studio.motion.pageEngine !== null")
     studio.page.wait_for_timeout(100)
     studio.tool("h")
     carried = "studio.canvas.carrier(studio.document, p) >= 0 && studio.canvas.places.has(p)"
     moving = studio.js(f"Object.keys(studio.document.pins).filter(p => {carried})")
-    studio.js(RECORD_FRAMES)  # the violation of each state that is shown, in units of the scene, and what is said of it
+    studio.js(RECORD_FRAMES)  # the constraint violation of each state shown, in units of the scene, and the status line
     x, y = studio.pin(moving[0]) if moving else studio.link_end(0)
     studio.page.mouse.move(x, y)
     studio.page.mouse.down()
@@ -228,7 +228,7 @@ mass = 1
     (studio.folder / "evil.toml").write_text(text)
     studio.js("studio.files.openFile('evil.toml')")
     studio.settle()
-    assert "2 freedoms" in studio.findings
+    assert "2 degrees of freedom" in studio.findings
     studio.tool("v")
     for name in ("__proto__", "constructor"):
         studio.page.mouse.click(*studio.pin(name))
@@ -239,7 +239,7 @@ mass = 1
 
 
 @pytest.mark.slow
-def test_what_changed_on_disk_is_not_overwritten_unasked(studio):
+def test_a_file_that_changed_on_disk_is_not_overwritten_without_asking(studio):
     file = studio.folder / "shared.toml"
     text = 'format = 2\nground = ["A"]\n[pins]\nA = [0, 0]\nB = [0.1, 0]\n[[link]]\nname = "a"\npins = ["A", "B"]\nmass = 1\n'
     file.write_text(text)
@@ -293,7 +293,7 @@ def test_a_finger_drags_and_two_zoom(browser, server):
         assert studio.js("studio.view.scale") / scale == pytest.approx(2.0, rel=0.05)
 
 
-def test_the_patience_of_these_tests_is_longer_than_what_the_server_allows_itself():
+def test_these_tests_wait_longer_than_the_server_may_take():
     from udkjax.studio.limits import COMPILE_SECONDS
 
     assert PATIENCE >= COMPILE_SECONDS
@@ -309,12 +309,12 @@ def test_a_picture_is_brought_to_scale_by_two_of_its_points(studio):
     studio.until("studio.picture !== null && studio.tool === 'scale'")
     picture = studio.js("({x: studio.picture.x, y: studio.picture.y, width: studio.picture.width})")
     ends = [1e3 * picture["x"], 1e3 * picture["y"]], [1e3 * (picture["x"] + picture["width"]), 1e3 * picture["y"]]
-    studio.drag([ends[0][0] + 20, ends[0][1] - 10], [ends[1][0] - 20, ends[1][1] - 10])  # of the picture, less 40 mm
+    studio.drag([ends[0][0] + 20, ends[0][1] - 10], [ends[1][0] - 20, ends[1][1] - 10])  # the picture's width less 40 mm
     studio.page.keyboard.type("300 mm")
     studio.page.keyboard.press("Enter")
     studio.until("studio.tool === 'select'")
     scaled = studio.js("studio.picture.width") / picture["width"]
-    assert scaled == pytest.approx(300 / (1e3 * picture["width"] - 40), rel=0.01)  # of a pixel
+    assert scaled == pytest.approx(300 / (1e3 * picture["width"] - 40), rel=0.01)  # the error of a pixel
     assert studio.document == {"format": 2, "units": {"length": "mm", "angle": "deg"}, "ground": [], "pins": {}}
 
 
@@ -328,15 +328,15 @@ def test_curves_scrub_and_forces_and_rest_are_computed_when_asked_for(studio):
     studio.page.get_by_role("tab", name="Dynamics").click()
     studio.page.get_by_role("button", name="compute forces").click()
     studio.until("studio.curves.servedFor() !== null")
-    assert studio.js("studio.curves.name").endswith("(not unique)")  # of a linkage with one link too many
+    assert studio.js("studio.curves.name").endswith("(not unique)")  # the linkage has a redundant link
     studio.page.get_by_role("tab", name="Statics").click()
-    studio.page.get_by_role("button", name="find the position of rest").click()
-    studio.until("studio.curves.fact.textContent.startsWith('at rest')")
+    studio.page.get_by_role("button", name="find the stable equilibrium").click()
+    studio.until("studio.curves.fact.textContent.startsWith('stable equilibrium, natural frequencies')")
     drawn = udk.loads(studio.js("studio.state.text"))
     rest = np.asarray(udk.equilibrium(drawn, stable=True).q)
     np.testing.assert_allclose(np.reshape(studio.js("Array.from(studio.motion.posed.q)"), (-1, 3)), rest, atol=1e-9)
     assert "Hz" in studio.page.locator(".fact").inner_text()
-    studio.page.get_by_role("button", name="where motors hold").click()
+    studio.page.get_by_role("button", name="compute the holding torques").click()
     studio.until("studio.curves.fact.textContent.startsWith('motors do not hold')")
     studio.page.keyboard.press("Home")
     assert studio.js("studio.motion.posed") is None
@@ -349,18 +349,18 @@ def test_a_pin_is_freed_by_a_click_and_the_motion_stays(studio):
     draw_five_bar(studio)
     studio.settle()
     studio.tool("v")
-    studio.drag((160, 100), (150, 100))  # the structure stays, masses and centres do not
+    studio.drag((160, 100), (150, 100))  # changes masses and centres, but not the structure
     studio.drag((110, 150), (100, 150))
     studio.settle()
     before, bodies = np.reshape(studio.run()["q"], (-1, 4, 3)), studio.run()["bodies"]
-    studio.page.get_by_role("button", name="free F").click()
+    studio.page.get_by_role("button", name="apply the change at F").click()
     studio.settle()
-    assert "1 freedom · nothing redundant" in studio.findings and "all unique" in studio.findings
+    assert "1 degree of freedom · no redundant constraints" in studio.findings and "all unique" in studio.findings
     assert studio.document["slot"][0]["pin"] == "F"
     after = studio.run()
     order = [after["bodies"].index(body) for body in bodies]
     q = np.reshape(after["q"], (-1, 4, 3))[:, order]
-    np.testing.assert_allclose(q[:, :, :2], before[:, :, :2], atol=1e-7)  # of two runs of other equations
+    np.testing.assert_allclose(q[:, :, :2], before[:, :, :2], atol=1e-7)  # the two runs have different equations
     assert_moves_as_simulated(studio, studio.js("studio.state.text"))
     studio.page.keyboard.press("Control+z")
     studio.settle()
@@ -387,12 +387,12 @@ def test_exports_are_chosen_and_named_in_a_dialog(studio):
     studio.settle()
     for ending in ("csv", "svg", "py"):
         studio.page.get_by_role("button", name="export as").click()
-        studio.page.get_by_label("form", exact=True).select_option(ending)
+        studio.page.get_by_label("format", exact=True).select_option(ending)
         studio.page.get_by_label("file name").fill(f"exported.{ending}")
         studio.page.get_by_label("file name").press("Enter")
         studio.until(f"studio.parts.status.textContent.startsWith('wrote exported.{ending}')")
         assert (studio.folder / f"exported.{ending}").stat().st_size > 500
-    studio.page.keyboard.press("Control+n")  # what the dialog leaves the keys to
+    studio.page.keyboard.press("Control+n")  # the dialog has returned the keyboard to the page
     studio.settle()
     assert studio.document["pins"] == {}
 
@@ -434,11 +434,11 @@ def test_a_click_selects_while_it_runs_and_what_is_selected_can_be_deleted(studi
     studio.settle()
     studio.page.keyboard.press(" ")
     studio.until("studio.motion.t > 0.1")
-    studio.js("studio.motion.speed = 0.01")  # so that it is met
+    studio.js("studio.motion.speed = 0.01")  # so that the click meets the pin
     name = studio.js("Object.keys(studio.document.pins)[1]")
     studio.page.mouse.click(*studio.pin(name))
     assert studio.js("[studio.motion.playing, studio.motion.posed, studio.selection[0].name]") == [True, None, name]
-    assert studio.js("getComputedStyle(studio.canvas.element).outlineStyle") == "none"  # no ring around all that was clicked
+    assert studio.js("getComputedStyle(studio.canvas.element).outlineStyle") == "none"  # no focus ring after a click
     studio.page.keyboard.press("Delete")
     assert name not in studio.document["pins"]
     assert studio.js("[studio.motion.playing, studio.motion.t]") == [False, 0]
@@ -446,15 +446,15 @@ def test_a_click_selects_while_it_runs_and_what_is_selected_can_be_deleted(studi
 
 
 @pytest.mark.slow
-def test_names_that_are_taken_and_what_is_no_length_are_refused_in_words(studio):
+def test_taken_names_and_texts_that_are_not_lengths_are_refused_in_words(studio):
     studio.link((40, 100), (60, 130))
     studio.tool("v")
     studio.click(60, 130)
     before = studio.document
     for label, typed, said in (
-        ("name", "A", "there is a pin A already"),
+        ("name", "A", "another pin is called A"),
         ("name", "", "a pin needs a name"),
-        *(("x", typed, "is no length") for typed in ("abc", "", "nan", "5 kg", "1e400", "[1, 2]")),
+        *(("x", typed, "is not a length") for typed in ("abc", "", "nan", "5 kg", "1e400", "[1, 2]")),
     ):
         field = studio.page.get_by_label(label, exact=True)
         shown = field.input_value()
@@ -476,7 +476,7 @@ def test_a_text_that_cannot_be_read_is_kept_and_not_saved(studio):
     broken = text.replace("[[link]]", "[[link")
     area.fill(broken)
     studio.until("studio.source.isBroken")
-    studio.click(150, 150)  # which selects nothing
+    studio.click(150, 150)  # selects nothing
     assert area.input_value() == broken and studio.document["link"]
     area.focus()
     studio.page.keyboard.press("Control+s")
@@ -486,7 +486,7 @@ def test_a_text_that_cannot_be_read_is_kept_and_not_saved(studio):
     studio.tool("v")
     studio.drag((60, 130), (70, 130))
     studio.until("studio.source.area.value === studio.state.text")
-    studio.page.get_by_role("button", name="Bring it back").click()
+    studio.page.get_by_role("button", name="Restore the edit").click()
     studio.until("studio.source.isBroken")
     assert area.input_value() == broken
     studio.page.get_by_role("button", name="Back to the text").click()

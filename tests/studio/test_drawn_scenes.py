@@ -1,4 +1,4 @@
-"""Mechanisms drawn anew: the same motion from pins and links."""
+"""Mechanisms converted into drawings: the same motion from pins and links."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_the_paper_linkage_is_redundant_as_drawn():
     assert (found.degrees_of_freedom, found.redundant) == (1, 1)
 
 
-def test_what_cannot_be_drawn_is_named():
+def test_an_element_that_cannot_be_drawn_is_named():
     wheel = udk.Body(1.0, 0.1)
     welded = udk.Mechanism({"a": wheel}, {"held": udk.Weld(("ground", "a"), [(0, 0), (0, 0)])})
     with pytest.raises(udk.SceneError, match=r"joint 'held'.*Weld"):
@@ -38,7 +38,7 @@ def test_what_cannot_be_drawn_is_named():
 
 
 def test_a_drawing_stays_as_it_is_unless_a_number_departs_from_it():
-    """One that was changed by hand is drawn anew, with that number: a body's mass, which no link of a density has."""
+    """A mechanism with a changed number is converted with that number: here a body's mass, which its density no longer gives."""
     pins, bar = {"O": (0.0, 0.0), "A": (0.3, 0.4)}, udk.Link(["O", "A"], density=7850.0, width=0.02, thickness=0.01)
     drawn = udk.Drawing(pins, {"bar": bar}, ground=["O"]).mechanism()
     assert drawing_text_of(drawn) == udk.dumps(drawn) and "density" in udk.dumps(drawn)

@@ -1,4 +1,4 @@
-"""Files of the studio's folder: none outside of it, whole or not at all, never over what changed meanwhile."""
+"""Files of the studio's folder: never outside of it, written atomically, and never over a file that changed in the meantime."""
 
 import os
 
@@ -41,35 +41,35 @@ def test_no_path_leads_out(folder, path):
     assert (folder.root.parent / "outside.toml").read_text() == "outside"
 
 
-def test_what_is_saved_is_read_again(folder):
+def test_a_saved_file_is_read_again(folder):
     text = 'name = "Pennestr\u00ec"\r\n'
     revision = folder.write("sub/new.toml", text.encode(), None)
     assert folder.read("sub/new.toml") == (text, revision)
     assert [name for name in os.listdir(folder.root / "sub") if name.startswith(".")] == []
 
 
-def test_what_changed_on_disk_is_not_overwritten(folder):
+def test_a_file_that_changed_on_disk_is_not_overwritten(folder):
     _, revision = folder.read("a.toml")
     (folder.root / "a.toml").write_text("changed by an editor")
-    with pytest.raises(RefusedError, match="changed by someone else") as caught:
+    with pytest.raises(RefusedError, match="created or changed by another program") as caught:
         folder.write("a.toml", b"mine", revision)
     assert caught.value.status == 409
     assert (folder.root / "a.toml").read_text() == "changed by an editor"
-    folder.write("a.toml", b"mine", caught.value.details["revision"])  # after the user was asked
+    folder.write("a.toml", b"mine", caught.value.details["revision"])  # as after a question to the user
     assert (folder.root / "a.toml").read_text() == "mine"
 
 
-def test_a_new_file_does_not_overwrite_one_that_is_there(folder):
+def test_a_new_file_does_not_overwrite_an_existing_one(folder):
     with pytest.raises(RefusedError) as caught:
         folder.write("a.toml", b"mine", None)
     assert caught.value.status == 409
     assert (folder.root / "a.toml").read_text() == "a"
 
 
-def test_a_file_that_vanished_is_said_to_have_vanished(folder):
+def test_a_deleted_file_is_reported(folder):
     _, revision = folder.read("a.toml")
     (folder.root / "a.toml").unlink()
-    with pytest.raises(RefusedError, match="is not there any more"):
+    with pytest.raises(RefusedError, match="has been deleted since it was opened here"):
         folder.write("a.toml", b"mine", revision)
 
 
@@ -90,7 +90,7 @@ def test_a_failed_write_leaves_the_old_file(folder, monkeypatch):
     assert folder.list() == ["a.toml", "sub/b.toml"]
 
 
-def test_what_is_no_text_is_refused(folder):
+def test_a_file_that_is_not_text_is_refused(folder):
     (folder.root / "a.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(RefusedError, match="UTF-8"):
         folder.read("a.toml")

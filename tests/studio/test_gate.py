@@ -1,4 +1,4 @@
-"""Hostile requests: nothing is answered that is not the studio's own page on this machine."""
+"""Hostile requests: only the studio's own page on this machine gets answers."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def test_another_host_is_refused(secret, route, host):
     is_refused(secret, secret.ask(route, {"host": host}, path="secret.toml", text="x"), 421)
 
 
-def test_another_host_does_not_even_get_the_page(client):
+def test_another_host_does_not_get_the_page_either(client):
     assert client.send("GET", "/", headers={"host": "evil.example"}).status_code == 421
     assert client.send("GET", "/", without=("origin", "x-studio-token", "content-type")).status_code == 200
 
@@ -61,13 +61,13 @@ def test_another_origin_is_refused(secret, route, origin):
 
 
 @pytest.mark.parametrize("route", ROUTES)
-def test_no_origin_is_refused(secret, route):
+def test_a_missing_origin_is_refused(secret, route):
     is_refused(secret, secret.ask(route, _without=("origin",), path="secret.toml", text="x"), 403)
 
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("token", [None, "", "a-token-of-a-tesT", "a-token-of-a-test ", "a-token", "é"])
-def test_no_token_or_another_one_is_refused(secret, route, token):
+def test_a_missing_or_wrong_token_is_refused(secret, route, token):
     headers = {} if token is None else {"x-studio-token": token.encode()}
     without = ("x-studio-token",) if token is None else ()
     is_refused(secret, secret.ask(route, headers, without, path="secret.toml", text="x"), 401)
@@ -75,7 +75,7 @@ def test_no_token_or_another_one_is_refused(secret, route, token):
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""])
-def test_what_a_form_can_send_is_refused(secret, route, kind):
+def test_content_types_of_forms_are_refused(secret, route, kind):
     is_refused(secret, secret.ask(route, {"content-type": kind}, path="secret.toml", text="x"), 415)
 
 
@@ -84,22 +84,22 @@ def test_other_methods_are_refused(secret, method):
     is_refused(secret, secret.send(method, "/api/open", json.dumps({"path": "secret.toml"}).encode()), 405)
 
 
-HALF = b'{"path": "secret.toml", "text": "\\ud800"}'  # of a character
+HALF = b'{"path": "secret.toml", "text": "\\ud800"}'  # half of a surrogate pair
 
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("body", [b"", b"[]", b"null", b"{", b"\xff", b'{"path": ' + b"[" * 100_000, b"NaN", HALF])
-def test_bodies_that_are_no_object_are_refused(secret, route, body):
+def test_bodies_that_are_not_objects_are_refused(secret, route, body):
     is_refused(secret, secret.send("POST", f"/api/{route}", body), 400)
 
 
 def test_huge_bodies_are_refused(secret):
     is_refused(secret, secret.send("POST", "/api/save", b" " * (MOST_BODY_BYTES + 1)), 413)
 
-    parts = [b" " * (MOST_BODY_BYTES // 10)] * 100  # of no declared length
+    parts = [b" " * (MOST_BODY_BYTES // 10)] * 100  # without a declared length
     is_refused(secret, secret.send("POST", "/api/save", parts), 413)
     is_refused(secret, secret.send("POST", "/api/save", b"{}", {"content-length": str(MOST_BODY_BYTES + 1)}), 413)
-    for length in ("-1", b"\xb2", "9" * 5000, "1e3", ""):  # a raised two is a digit of Unicode, and long numbers are no int
+    for length in ("-1", b"\xb2", "9" * 5000, "1e3", ""):  # a superscript two is a digit in Unicode; int() refuses long numbers
         is_refused(secret, secret.send("POST", "/api/save", b"{}", {"content-length": length}), 413)
 
 
@@ -115,11 +115,11 @@ def test_huge_bodies_are_refused(secret):
         "/engine/target.py",
     ],
 )
-def test_files_besides_those_of_the_page_are_not_served(secret, path):
+def test_only_the_files_of_the_page_are_served(secret, path):
     assert secret.send("GET", path).status_code == 404
 
 
-def test_every_answer_keeps_the_page_to_itself(client):
+def test_every_answer_isolates_the_page(client):
     for answer in (client.send("GET", "/"), client.send("GET", "/nothing"), client.ask("list"), client.send("PUT", "/")):
         policy = answer.headers["content-security-policy"]
         assert "default-src 'none'" in policy and "unsafe-inline" not in policy and "'unsafe-eval'" not in policy
@@ -140,7 +140,7 @@ def test_the_page_names_no_other_address(client):
 
 
 @pytest.mark.slow
-def test_the_command_serves_this_machine_alone_until_it_is_stopped(tmp_path):
+def test_the_command_serves_only_this_machine_until_it_is_stopped(tmp_path):
     (tmp_path / "x.toml").write_text("format = 2\n")
     with subprocess.Popen(
         [sys.executable, "-c", "from udkjax.cli import main; main()", "studio", str(tmp_path / "x.toml"), "--no-browser"],

@@ -1,4 +1,4 @@
-"""Documents and the text they came from: what changes changes, comments stay, and nothing else moves."""
+"""Documents merged into their texts: changes are written, comments stay, and nothing else moves."""
 
 import copy
 
@@ -59,7 +59,7 @@ def test_a_moved_pin_changes_its_line_alone(text):
 
 
 def changes(document):
-    """Changes of a document, each of what it is before."""
+    """Iterate over changed copies of a document."""
 
     def removed(d):
         del d["link"][0]
@@ -108,7 +108,7 @@ def test_comments_stay_where_they_belong():
         assert comment in written
 
 
-def test_a_document_of_nothing_becomes_a_file():
+def test_a_document_without_a_text_becomes_a_file():
     document = {
         "format": 2,
         "units": {"length": "mm"},
@@ -121,7 +121,7 @@ def test_a_document_of_nothing_becomes_a_file():
     assert "[pins]\nO = [0, 0]" in text and '[[link]]\nname = "a"' in text
 
 
-def test_numbers_that_are_none_come_as_texts():
+def test_numbers_that_are_not_finite_become_strings():
     document = read_document("format = 2\n[pins]\nA = [nan, inf]\nB = [-inf, 1e400]\n")
     assert document["pins"] == {"A": ["nan", "inf"], "B": ["-inf", "inf"]}
 
@@ -131,11 +131,11 @@ def test_bad_input_is_named():
         read_document("format = ")
     with pytest.raises(SceneError, match="TOML"):
         merge_document("format = ", {"format": 2})
-    with pytest.raises(SceneError, match="nothing"):
+    with pytest.raises(SceneError, match="name has no value"):
         merge_document("", {"name": None})
     with pytest.raises(RefusedError, match="characters"):
         read_document("#" * 1_000_000)
-    with pytest.raises(RefusedError, match="text"):
+    with pytest.raises(RefusedError, match="text: must be a string"):
         read_document(None)
     with pytest.raises(RefusedError, match="elements"):
         read_document("[pins]\n" + "".join(f"p{k} = [0, 0]\n" for k in range(2_000)))

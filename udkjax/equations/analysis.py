@@ -54,13 +54,13 @@ class Analysis(PrintsTable):
     def _table(self) -> PrintedTable:
         rows = {
             "coordinates": self.coordinates,
-            "constraint rows": len(self.row_names),
+            "constraint equations": len(self.row_names),
             "rank": "not known" if self.rank is None else self.rank,
             "degrees of freedom": "not known" if self.degrees_of_freedom is None else self.degrees_of_freedom,
-            "redundant rows": ", ".join(f"{name} (row {row + 1})" for name, row in self.redundant) or "none",
+            "redundant constraints": ", ".join(f"{name} (equation {row + 1})" for name, row in self.redundant) or "none",
         }
         if self.redundant_rows is None:
-            rows["redundant rows"] = "not known"
+            rows["redundant constraints"] = "not known"
         scales = self.scales
         rows["length, mass"] = f"{format_numbers(scales.length, 'm')}, {format_numbers(scales.mass, 'kg')}"
         rows["time"] = format_numbers(self.time if has_numbers(scales.rate) else scales.rate, "s")

@@ -256,10 +256,10 @@ def check_lines(found: Check) -> dict[str, str]:
     lines = {
         "bodies": f"{found.bodies}",
         "coordinates": f"{found.coordinates}",
-        "constraint rows": f"{found.rows}",
+        "constraint equations": f"{found.rows}",
         "rank": f"{found.rank}",
         "degrees of freedom": f"{found.degrees_of_freedom}",
-        "redundant rows": ", ".join(f"{name} (row {row + 1})" for name, row in found.redundant) or "none",
+        "redundant constraints": ", ".join(f"{name} (equation {row + 1})" for name, row in found.redundant) or "none",
     }
     if found.dependent:
         lines["depend on each other"] = ", ".join(found.dependent)

@@ -191,6 +191,14 @@ def conversion_factor(units: str, wanted: str) -> float:
     return given.size / goal.size
 
 
+def unit_sizes(wanted: str) -> dict[str, float]:
+    """Return the size of each single unit with the dimension of `wanted`, an SI unit, by all spellings that are read."""
+    names = {*_UNITS, *_WORDS, *(name.replace(usual, spelling) for spelling, usual in _SPELLINGS.items() for name in _UNITS)}
+    dimension = _read(wanted).dimension
+    units = {name: _read(name) for name in sorted(names)}
+    return {name: unit.size for name, unit in units.items() if unit.dimension == dimension}
+
+
 def _read(text: str) -> _Unit:
     """Read a product of powers of units; a slash divides by the unit that follows it."""
     plain = text

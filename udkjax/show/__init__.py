@@ -1,4 +1,4 @@
-"""Pictures and tables, for people."""
+"""Plots, figures, tables and the player of motions."""
 
 from udkjax.lazy_names import lazy_names
 

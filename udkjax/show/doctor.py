@@ -1,4 +1,4 @@
-"""Facts about this machine and this environment, ready to paste into a bug report."""
+"""Facts about this machine and its environment, ready to paste into a bug report."""
 
 import os
 import platform
@@ -21,7 +21,7 @@ FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 
 def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
-    """Return versions, devices, precision, engine, cache and what could be better, by names that scripts can rely on."""
+    """Return versions, devices, precision, engine, cache and advice, by names that scripts can rely on."""
     folder, sizes = code_cache.cache_folder(), [size for _, size, _ in code_cache.cached_files()]
     engine, reason = engine_here(run)
     return {
@@ -51,14 +51,14 @@ def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
     except Exception as error:
         return "none", f"a small simulation fails: {type(error).__name__}: {error}"
     engine, _, reason = solution.settings["engine"].partition(": ")
-    return engine, reason or "by default; diffrax where a choice of yours needs it, as `Solution.settings` says"
+    return engine, reason or "by default; models that cannot be compiled are run by diffrax, see `Solution.settings`"
 
 
 def summary(found: dict[str, Any]) -> str:
     """Describe the findings of `facts`."""
     cached = f"{found['cached_programs']} in {found['cache']}, {found['cached_bytes'] / 2**20:.1f} MiB"
     if found["cache"] is None:
-        cached = "nothing, as UDKJAX_CACHE=0 says"
+        cached = "nothing, because UDKJAX_CACHE=0 is set"
     lines = {
         **found["versions"],
         "missing extras": ", ".join(found["missing_extras"]) or "none",
@@ -72,12 +72,12 @@ def summary(found: dict[str, Any]) -> str:
         "environment": ", ".join(f"{key}={value}" for key, value in found["environment"].items()) or "-",
     }
     width = max(map(len, lines))
-    advice = [f"! {line}" for line in found["advice"]] or ["nothing to complain about"]
+    advice = [f"! {line}" for line in found["advice"]] or ["no problems found"]
     return "\n".join([f"{key:<{width}}  {value}" for key, value in lines.items()] + advice)
 
 
 def _advice(engine: str, reason: str) -> Iterator[str]:
     if jnp.result_type(float) != jnp.float64:
-        yield "float64 is off, so that loops close to single precision only: unset JAX_ENABLE_X64, or set it to 1"
+        yield "float64 is off, so loops close only to single precision: unset JAX_ENABLE_X64, or set it to 1"
     if engine != "native":
         yield f"machine code is not used here ({reason}): simulations take up to a hundred times as long"

@@ -17,7 +17,7 @@ with OptionalImport():
 
 
 def driven_figure(mech: Mechanism, motion: Kinematics, driver: str) -> Figure:
-    """Draw a mechanism over the values of a driver: its poses, and its angles."""
+    """Draw the poses and the angles of a mechanism over the values of a driver."""
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     scene, angles = figure.subplots(1, 2)
     q = np.asarray(motion.q)
@@ -29,7 +29,7 @@ def driven_figure(mech: Mechanism, motion: Kinematics, driver: str) -> Figure:
 
 
 def draw_channels(axes: Axes, x: ArrayLike, channels: Mapping[str, Float[ArrayLike, "T"]], unit: str = "") -> Axes:
-    """Draw quantities of one unit under their names over time, or over the values of a driver."""
+    """Draw quantities with the same unit, by name, over time or over the values of a driver."""
     for k, (name, values) in enumerate(channels.items()):
         axes.plot(np.asarray(x), np.asarray(values), DASHES[k % 4], color=COLOURS[k % len(COLOURS)], lw=1.3, label=name)
     axes.set(ylabel=unit)
@@ -40,7 +40,7 @@ def draw_channels(axes: Axes, x: ArrayLike, channels: Mapping[str, Float[ArrayLi
 def channels_figure(
     x: ArrayLike, channels: Mapping[str, tuple[ArrayLike, str]], label: str = "time (s)", title: str = ""
 ) -> Figure:
-    """Draw quantities, each its values and its unit, under their names: one panel for each unit."""
+    """Draw quantities (values and unit, by name), with one panel for each unit."""
     kinds = list(dict.fromkeys(unit for _, unit in channels.values()))
     figure = Figure(figsize=(8, 1.2 + 2.2 * len(kinds)), layout="constrained")
     panels = np.ravel(figure.subplots(len(kinds), 1, sharex=True))
@@ -52,7 +52,7 @@ def channels_figure(
 
 
 def reactions_figure(ts: ArrayLike, loads: Mapping[str, Mapping[str, ArrayLike]], title: str = "") -> Figure:
-    """Draw the size of the force at each pin over time."""
+    """Draw the magnitude of the force at each pin over time."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     draw_reactions(figure.subplots(), ts, loads)
     figure.suptitle(title)

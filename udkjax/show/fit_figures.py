@@ -1,4 +1,4 @@
-"""Pictures of measurements beside what a mechanism shows, and of what the one leaves of the other."""
+"""Pictures of measurements and predictions of a mechanism, and of their residuals."""
 
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,18 +17,18 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-MOST_PANELS = 24  # of the picture of the fit, each a channel of a record; those beyond are only in the dataset
-MOST_COLUMNS = 3  # of panels side by side
-MOST_CHANNELS = 8  # of the picture of residuals, each a channel: those that look least like noise
-MOST_COLOURS = 7  # records that have a colour each
-MOST_BINS = 40  # at most, of a distribution
-MOST_LAGS = 30  # at most, of an autocorrelation
-NOISE_RANGE = 4.0  # standard deviations of noise that a distribution shows
-SAMPLES_PER_LAG = 4  # samples per lag at least
+MOST_PANELS = 24  # panels of the picture of the fit, one for each channel of each record; further ones are only in the dataset
+MOST_COLUMNS = 3  # panels side by side
+MOST_CHANNELS = 8  # channels in the picture of residuals: those that look least like noise
+MOST_COLOURS = 7  # records with a colour of their own
+MOST_BINS = 40  # bins of a histogram
+MOST_LAGS = 30  # lags of an autocorrelation
+NOISE_RANGE = 4.0  # range of a distribution, in standard deviations of the noise
+SAMPLES_PER_LAG = 4  # least number of samples per lag
 
 
 class Series(NamedTuple):
-    """A channel of a record: the samples of it that there are."""
+    """The samples of a channel of a record."""
 
     record: str
     channel: str
@@ -41,7 +41,7 @@ class Series(NamedTuple):
 
 
 def series(data: "xarray.Dataset") -> list[Series]:
-    """Return all channels of all records, in this order; those that a record does not have are left out."""
+    """Return all channels of all records, channel by channel, without those that a record lacks."""
     found = []
     for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
         one = data.isel(record=r, channel=c)
@@ -69,8 +69,8 @@ def fit(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> Figure:
         axes.set_ylabel(one.units)
         axes.set_xlabel("time (s)" if not any(place + columns * k in panels for k in range(1, rows)) else "")
     _key(figure, grid[min(panels)])
-    few = f"{len(panels)} of {len(every)}; all are in the dataset" if len(panels) < len(every) else ""
-    title(figure, data, "measured and predicted", few)
+    remark = f"{len(panels)} of {len(every)} panels; the dataset has all of them" if len(panels) < len(every) else ""
+    title(figure, data, "measured and predicted", remark)
     return figure
 
 
@@ -83,7 +83,7 @@ def draw_series(axes: Axes, one: Series) -> None:
 
 
 def _panels(data: "xarray.Dataset", every: list[Series], most_panels: int) -> tuple[int, dict[int, Series]]:
-    """Return the number of columns of panels, and the place of each series that is shown: a few records stand side by side."""
+    """Return the number of columns of panels, and the series by panel; up to three records are side by side."""
     records, channels = list(data["record"].values), list(data["channel"].values)
     columns, places = min(MOST_COLUMNS, -(-len(every) // 4)), list(range(len(every)))
     if 1 < len(records) <= MOST_COLUMNS:
@@ -92,7 +92,7 @@ def _panels(data: "xarray.Dataset", every: list[Series], most_panels: int) -> tu
 
 
 def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Figure:
-    """Draw the residuals of each channel: over time, its distribution beside that of the noise, and its correlation in time."""
+    """Draw the residuals of each channel over time, their distribution with that of the noise, and their autocorrelation."""
     every = series(data)
     channels = _least_white(data, most_channels)
     shown = channels[:most_channels]
@@ -116,19 +116,20 @@ def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Fig
         axes.set_title(words, fontsize="small", loc="left")
     if 1 < len(records) <= MOST_COLOURS:
         _key(figure, grid[0, 0])
-    few = f"the {most_channels} of {len(channels)} channels that look least like noise" if len(channels) > most_channels else ""
-    title(figure, data, "measured minus predicted; grey: two standard deviations of the noise", few)
+    several = f"the {most_channels} of {len(channels)} channels that look least like noise"
+    remark = several if len(channels) > most_channels else ""
+    title(figure, data, "measured minus predicted; grey: two standard deviations of the noise", remark)
     return figure
 
 
 def _least_white(data: "xarray.Dataset", most_channels: int) -> list[str]:
-    """Return the channels: as they are, or, where there are too many, those that look least like noise."""
+    """Return the channels; if there are too many, those that look least like noise come first."""
     names = [str(name) for name in data["channel"].values]
     if len(names) <= most_channels:
         return names
-    doubt = np.nan_to_num(data["correlated"].transpose("record", "channel").values, nan=1.0).min(0)
-    kept = set(np.argsort(doubt, kind="stable")[:most_channels])
-    return [name for k, name in enumerate(names) if k in kept] + [name for k, name in enumerate(names) if k not in kept]
+    p_values = np.nan_to_num(data["correlated"].transpose("record", "channel").values, nan=1.0).min(0)
+    first = set(np.argsort(p_values, kind="stable")[:most_channels])
+    return [name for k, name in enumerate(names) if k in first] + [name for k, name in enumerate(names) if k not in first]
 
 
 def _over_time(axes: Axes, one: Series, colour: str) -> None:
@@ -140,7 +141,7 @@ def _over_time(axes: Axes, one: Series, colour: str) -> None:
 
 
 def _distribution(axes: Axes, own: list[Series]) -> None:
-    """Draw a histogram of all records, and the density of Gaussian noise of the size that it is taken to have."""
+    """Draw a histogram of all records, and the density of Gaussian noise with the assumed standard deviations."""
     left = np.concatenate([one.residual for one in own])
     noise = np.concatenate([one.noise for one in own])
     if np.ptp(left) > 0:
@@ -148,7 +149,7 @@ def _distribution(axes: Axes, own: list[Series]) -> None:
         axes.hist(left, count, density=True, orientation="horizontal", color=COLOURS[4], alpha=0.7, lw=0)
     sizes = noise[np.isfinite(noise) & (noise > 0)]
     if sizes.size:
-        levels = np.unique(np.quantile(sizes, np.linspace(0, 1, MOST_BINS)))  # of noise that differs from sample to sample
+        levels = np.unique(np.quantile(sizes, np.linspace(0, 1, MOST_BINS)))  # noise may differ from sample to sample
         y = NOISE_RANGE * sizes.max() * np.linspace(-1, 1, 201)
         density = np.exp(-0.5 * (y[:, None] / levels) ** 2) / (np.sqrt(2 * np.pi) * levels)
         axes.plot(density.mean(1), y, color="black", lw=1)
@@ -158,7 +159,7 @@ def _distribution(axes: Axes, own: list[Series]) -> None:
 
 
 def _autocorrelation(axes: Axes, own: list[Series]) -> None:
-    """Draw the autocorrelation of the residuals over the noise, and the band that holds 19 of 20 values of white noise."""
+    """Draw the autocorrelation of the residuals divided by the noise, and the band of 95 % of the values of white noise."""
     parts = [one.residual / np.where(one.noise > 0, one.noise, 1.0) for one in own]
     parts = [part for part in parts if np.isfinite(part).all()]
     count = min(MOST_LAGS, max((len(part) for part in parts), default=0) // SAMPLES_PER_LAG)
@@ -176,7 +177,7 @@ def _autocorrelation(axes: Axes, own: list[Series]) -> None:
 
 
 def _key(figure: Figure, axes: Axes) -> None:
-    """Name the curves of all panels by those of one."""
+    """Draw a legend of all panels from the curves of one."""
     figure.legend(
         *axes.get_legend_handles_labels(), loc="outside lower center", ncols=MOST_COLOURS, fontsize="small", frameon=False
     )
@@ -188,5 +189,5 @@ def _unit(one: "xarray.Dataset") -> str:
 
 
 def title(figure: Figure, data: "xarray.Dataset", words: str, remark: str = "") -> None:
-    """Say above a figure which mechanism it is of, and what it shows."""
+    """Set the title of a figure: the mechanism, a description, and a remark."""
     figure.suptitle(f"{data.attrs.get('title') or 'mechanism'}: {words}" + (f"\n({remark})" if remark else ""), fontsize="medium")

@@ -1,4 +1,4 @@
-"""Pictures of an identification, from its dataset alone: the fit, what it leaves, what is known, and how it settled."""
+"""Pictures of an identification, drawn from its dataset: fit, residuals, correlations and standard errors, convergence."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,14 +18,14 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-MOST_WRITTEN = 14  # parameters up to which correlations are written as numbers too
-LARGEST_ERROR = 1e3  # percent: standard errors that are larger are drawn as this
-HIGHEST_COST = 3.0  # times the limit of a profile likelihood: higher costs are not drawn
+MOST_WRITTEN = 14  # parameters: with more, correlations are not written as numbers
+LARGEST_ERROR = 1e3  # percent: larger standard errors are drawn as this
+HIGHEST_COST = 3.0  # upper end of a profile's axis, in multiples of the limit of the cost
 ZERO_DRAWN = 1e-18  # zero is drawn as this on a logarithmic axis
 
 
 def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
-    """Draw a result of `Estimate.to_xarray`, with profile likelihoods or without."""
+    """Draw a result of `Estimate.to_xarray`, with or without profile likelihoods."""
     found = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
     found |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
     return found | ({"profiles": profiles(data)} if "profile" in data else {})
@@ -39,7 +39,7 @@ def save_fit_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
 
 
 def correlation(data: "xarray.Dataset") -> Figure:
-    """Draw the correlations of the parameters' errors, and how large these are; grey: what the records do not tell."""
+    """Draw the correlations of the parameters' errors, and the standard errors; unidentifiable ones are grey."""
     names = [_short(str(name)) for name in data["parameter"].values]
     values, count = data["correlation"].values, len(names)
     size = 0.42 if count <= MOST_WRITTEN else 0.26
@@ -58,12 +58,12 @@ def correlation(data: "xarray.Dataset") -> Figure:
     _errors(errors, data)
     errors.set_ylim(matrix.get_ylim())
     figure.colorbar(drawn, ax=matrix, location="bottom", aspect=30, shrink=0.8, pad=0.02)
-    title(figure, data, "what is known of the parameters")
+    title(figure, data, "correlations and standard errors of the parameters")
     return figure
 
 
 def _errors(axes: Axes, data: "xarray.Dataset") -> None:
-    """Standard errors as a part of the values; of those that are not known, none."""
+    """Draw standard errors in percent of the values; unknown ones get a label."""
     error, value = data["standard_error"].values, np.abs(data["value"].values)
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = np.where(np.isfinite(error), np.clip(100 * error / value, ZERO_DRAWN, LARGEST_ERROR), np.nan)
@@ -80,10 +80,10 @@ def _errors(axes: Axes, data: "xarray.Dataset") -> None:
 
 
 def convergence(data: "xarray.Dataset") -> Figure:
-    """Draw the cost of each trial, and by how much the next step would change an unknown.
+    """Draw the cost of each trial, and the largest change of an unknown by the next step.
 
-    Within a fit the cost never rises. Where it does, another one begins: of a longer part of the records, from another guess, or
-    with other weights.
+    Within a fit the cost never rises. Where it rises another fit begins: with a longer part of the records, another guess, or
+    other weights.
     """
     figure = Figure(figsize=(7, 5.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -98,21 +98,21 @@ def convergence(data: "xarray.Dataset") -> Figure:
         plain(axes)
     panels[-1].set_xlabel("trial")
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    gaps = "a gap: another guess, part of the records, tolerance or weight of channels"
-    title(figure, data, "how the fit settled", gaps if fits[1:] else "")
+    gaps = "after a gap: another guess, part of the records, tolerance or weight of channels"
+    title(figure, data, "convergence of the fit", gaps if fits[1:] else "")
     return figure
 
 
 def _short(name: str) -> str:
-    """Return the name of a parameter; of one that is tied, its first part, and how many there are."""
+    """Return the name of a parameter; for tied parameters the first name and their number."""
     first, *others = name.split(" = ")
     return f"{first} = ... ({len(others) + 1} tied)" if others else first
 
 
 def profiles(data: "xarray.Dataset") -> Figure:
-    """Draw the curves of a dataset with profiles, what the standard error says of them, and the confidence intervals.
+    """Draw profile likelihoods, their approximations from the standard errors, and the confidence intervals.
 
-    The rise of the cost C is 2 (C - C_min) / s^2: of a linear model, the square of the distance in standard errors.
+    The rise of the cost C is 2 (C - C_min) / s^2, for a linear model the square of the distance in standard errors.
     """
     names = [str(name) for name in data["profile"].values]
     columns = min(MOST_COLUMNS, len(names))
@@ -134,12 +134,12 @@ def _profile(axes: Axes, data: "xarray.Dataset", name: str) -> None:
     one, known, limit = data.sel(profile=name), data.sel(parameter=name), data["interval"].attrs["limit"]
     x, rise = (part[np.isfinite(part)] for part in (one["profile_value"].values, one["rise"].values))
     value, error = float(known["value"]), float(known["standard_error"])
-    axes.plot(x, rise, "o-", ms=3, lw=1.2, color=COLOURS[0], label="fitted anew")
+    axes.plot(x, rise, "o-", ms=3, lw=1.2, color=COLOURS[0], label="other parameters refitted")
     left, right = x.min(), x.max()
     axes.axvspan(*(np.clip(one["interval"].values, left, right)), color="0.9", lw=0, zorder=0)
     if np.isfinite(error) and error > 0:
         line = np.linspace(left, right, 101)
-        axes.plot(line, ((line - value) / error) ** 2, "--", lw=1, color=COLOURS[1], label="from the standard error")
+        axes.plot(line, ((line - value) / error) ** 2, "--", lw=1, color=COLOURS[1], label="approximated by the standard error")
     axes.axhline(limit, color="0.5", lw=0.8)
     axes.set_ylim(min(0.0, 1.1 * rise.min()) - 0.03 * limit, max(1.25 * limit, min(1.1 * rise.max(), HIGHEST_COST * limit)))
     axes.set_title(name, fontsize="small", loc="left")

@@ -1,12 +1,12 @@
-"""Plots, each on axes of matplotlib that it is given and returns: what a run does, what a sweep finds, what is identified.
+"""Plots of runs, sweeps and identifications; each draws on given matplotlib axes and returns them.
 
     from matplotlib import pyplot
     from udkjax.show import plots
 
     plots.draw_energy(pyplot.gca(), sol.ts, udk.energy(mech, sol))
 
-Every axis has its unit. Everyone can distinguish the colours, and where curves meet they differ by marks or dashes, too. A figure
-that is made here (`trajectory`) belongs to nobody else.
+Every axis has its unit. The colours can be told apart by colour-blind readers, too, and curves also differ by markers or dashes.
+Only `trajectory` makes a figure of its own.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,6 +21,7 @@ from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
 from udkjax.scene import GROUND, Mechanism
 from udkjax.show import fit_figures, sweep_figures
+from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.marks import body_points, marks, to_ground
 from udkjax.show.player.player_data import trace_anchors
 from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
@@ -33,20 +34,20 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-WIDE_SCENE_RATIO = 1.5  # from this ratio of width to height on, the scene stands above the curves, not beside them
-SMALLEST_VIOLATION = 1e-17  # m, rad: violations below it are drawn as it, since zero has no logarithm
-SAME_ANGLE = 1e-6  # rad: curves closer than the width of a line share it
-MOST_TICKS = 6  # along an axis of the plane: more would touch one another
+WIDE_SCENE_RATIO = 1.5  # width over height: wider scenes are drawn above the curves, others to their left
+SMALLEST_VIOLATION = 1e-17  # m, rad: smaller violations are drawn as this, since zero has no logarithm
+SAME_ANGLE = 1e-6  # rad: closer curves are indistinguishable, and drawn as one
+MOST_TICKS = 6  # along an axis of the plane: more labels would touch
 _CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 73)[:-1]) for f in (np.cos, np.sin)])
 
 
 def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
-    """Draw one simulation: the mechanism at its start and in `ghosts` later poses, and its angles, constraints and energy.
+    """Draw a simulation: the mechanism at its start and in `ghosts` later poses, its angles, constraint violation and energy.
 
-    Links are drawn as the player draws them; the fine lines are the paths of pins that move.
+    Links look as in the player; the fine lines are the paths of moving pins.
     """
     ts, q = np.asarray(sol.ts), np.asarray(sol.q)
-    alive = q[np.isfinite(q).all((1, 2))]  # a run that failed has no values after its end
+    alive = q[np.isfinite(q).all((1, 2))]  # a failed run has NaN from its failure on
     if np.ptp(alive[..., 0]) > WIDE_SCENE_RATIO * np.ptp(alive[..., 1]):
         figure = Figure(figsize=(10, 6.2), layout="constrained")
         panels = figure.subplot_mosaic([["scene"] * 3, ["angles", "constraints", "energy"]], height_ratios=(1.5, 1))
@@ -68,8 +69,8 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
 
 
 def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int = 5) -> Axes:
-    """Draw the mechanism in the first of the configurations `q`, fainter in `ghosts` others, and the paths of its pins."""
-    held, drawn = body_points(mech), list(_outlines(mech, q))
+    """Draw the mechanism in the first of the poses `q`, more faintly in `ghosts` others, and the paths of its pins."""
+    attachments, drawn = body_points(mech), list(_outlines(mech, q))
     for place, *point in trace_anchors(mech, q, None, float(analyse(mech).length)):
         path = to_ground(point, q[:, int(place)])
         axes.plot(*path.T, color=COLOURS[int(place) % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
@@ -83,15 +84,15 @@ def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"],
             axes.plot(x, y, color=colour, alpha=strength, lw=2.6, solid_capstyle="round", solid_joinstyle="round", zorder=3)
     for place, body in enumerate(mech.bodies):
         colour = COLOURS[place % len(COLOURS)]
-        if len(held[body]):
-            axes.plot(*to_ground(held[body], q[0, place, None]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
+        if len(attachments[body]):
+            axes.plot(*to_ground(attachments[body], q[0, place, None]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
         axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
-    axes.plot(*held[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
+    axes.plot(*attachments[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
     return _plane(axes)
 
 
 def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray, "T bodies 3"]) -> Axes:
-    """Draw the angle of each body over time; bodies that turn as one share a curve."""
+    """Draw the angle of each body over time; bodies with the same angle share a curve."""
     groups: list[tuple[np.ndarray, list[str], str]] = []
     for place, body in enumerate(mech.bodies):
         angle = q[:, place, 2]
@@ -110,16 +111,16 @@ def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray,
 
 
 def draw_violation(axes: Axes, ts: ArrayLike, violated: ArrayLike) -> Axes:
-    """Draw the largest violation of any constraint over time, in metres or radians."""
+    """Draw the largest constraint violation over time, in metres or radians."""
     size = largest_violation(violated)
     axes.semilogy(ts, np.maximum(size, SMALLEST_VIOLATION), color=COLOURS[1], lw=1)
     axes.set_ylim(SMALLEST_VIOLATION, 1e3 * np.nanmax(size, initial=SMALLEST_VIOLATION))
-    axes.set(xlabel="time (s)", ylabel="violation (m, rad)")
+    axes.set(xlabel="time (s)", ylabel="constraint violation (m, rad)")
     return axes
 
 
 def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
-    """Draw the kinetic, potential and total energy over time, seen from their total at the start."""
+    """Draw the kinetic, potential and total energy over time, the latter two relative to the total energy at the start."""
     start = np.asarray(parts.total)[0]
     axes.plot(ts, np.asarray(parts.kinetic), color=COLOURS[0], lw=1, label="kinetic")
     axes.plot(ts, np.asarray(parts.potential) - start, "--", color=COLOURS[2], lw=1, label="potential")
@@ -130,10 +131,10 @@ def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
 
 
 def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
-    """Draw a number of each member of a sweep over its axes: a heat map of two of them, a line over one; grey: no value.
+    """Draw a number of each member of a sweep: a heat map over two axes or a line over one; missing values are grey.
 
     Raises:
-        ValueError: more than two axes: choose one value of the others by `data.sel` or `data.isel`.
+        ValueError: the sweep has more than two axes; select values of the others by `data.sel` or `data.isel`.
     """
     drawn = sweep_figures.draw_panel(axes, data, name)
     if drawn is not None:
@@ -147,29 +148,29 @@ def draw_reactions(
     loads: Mapping[str, Mapping[str, ArrayLike]],
     unique: Mapping[str, Mapping[str, ArrayLike]] | None = None,
 ) -> Axes:
-    """Draw the size of the force of each joint over time.
+    """Draw the magnitude of each joint's force over time.
 
     Args:
         axes: axes to draw on.
         ts: times (s).
         loads: result of `udk.reactions`: by joint and body, force x, force y (N) and torque (N m).
-        unique: result of `udk.unique_reactions`. Of forces that are not unique at all times, which are dotted, the share of
-            least norm is drawn: other shares would move the mechanism alike.
+        unique: result of `udk.unique_reactions`. Forces that are not unique at all times are dotted: redundant constraints
+            share them, and the solution of least norm is drawn.
     """
     for k, (joint, bodies) in enumerate(loads.items()):
         body, load = next(iter(bodies.items()))
         force = np.linalg.norm(np.asarray(load, float)[:, :2], axis=1)
-        known = unique is None or bool(np.asarray(unique[joint][body])[:, :2].all())
-        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "ls": (DASHES[k % 3] if known else ":")}
-        axes.plot(np.asarray(ts), force, lw=1.3, label=joint if known else f"{joint} (not unique)", **style)
-    axes.set(xlabel="time (s)", ylabel="force of a joint (N)")
+        is_unique = unique is None or bool(np.asarray(unique[joint][body])[:, :2].all())
+        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "ls": (DASHES[k % 3] if is_unique else ":")}
+        axes.plot(np.asarray(ts), force, lw=1.3, label=joint if is_unique else f"{joint} (not unique)", **style)
+    axes.set(xlabel="time (s)", ylabel="joint force (N)")
     axes.set_ylim(bottom=0)
     legend(axes)
     return plain(axes)
 
 
 def draw_coupler_curves(axes: Axes, curves: Mapping[str, Float[ArrayLike, "T 2"]]) -> Axes:
-    """Draw paths of points (m) under their names, each with a mark where it begins."""
+    """Draw paths of points (m) by name, each with a marker at its start."""
     for k, (name, path) in enumerate(curves.items()):
         x, y = np.asarray(path, float).T
         colour = COLOURS[k % len(COLOURS)]
@@ -185,11 +186,11 @@ def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | Non
     Args:
         axes: axes to draw on.
         data: result of `Estimate.to_xarray`.
-        channel: the name of a channel.
-        record: the name of a record; by default the first that has the channel.
+        channel: name of the channel.
+        record: name of the record; by default the first one with the channel.
 
     Raises:
-        ValueError: there is no such channel.
+        ValueError: no record has the channel.
     """
     every = fit_figures.series(data)
     found = [one for one in every if one.channel == channel and record in (None, one.record)]
@@ -205,7 +206,7 @@ def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | Non
 
 
 def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
-    """Return up to `count` instants, from the first on, whose poses differ most: each is the farthest from those before it."""
+    """Return up to `count` instants whose poses differ most: the first instant, then always the farthest from those chosen."""
     poses = np.concatenate([q[..., :2], np.cos(q[..., 2:]), np.sin(q[..., 2:])], axis=-1).reshape(len(q), -1)
     chosen, distance = [0], np.linalg.norm(poses - poses[0], axis=1)
     while len(chosen) < count and distance.max() > 0:
@@ -215,11 +216,11 @@ def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[in
 
 
 def _outlines(mech: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> Iterator[tuple[int, Float[np.ndarray, "points 2"], bool]]:
-    """Iterate over the lines of which bodies are drawn: the body's number, points in its frame (m), whether closed."""
+    """Iterate over the lines that bodies are drawn with: index of the body, points in its frame (m), True for a closed line."""
     for mark in marks(mech, q):
-        if mark["kind"] in ("link", "outline"):
+        if mark["kind"] in (MarkKind.LINK, MarkKind.OUTLINE):
             yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)
-        elif mark["kind"] in ("wheel", "disc"):
+        elif mark["kind"] in (MarkKind.WHEEL, MarkKind.DISC):
             yield mark["body"], np.add(mark["at"], mark["radius"] * _CIRCLE), True
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a sweep, from its dataset alone: a map of each number that is kept of a member, and one of how members ended."""
+"""Pictures of a sweep, drawn from its dataset: a map of the members' results, and one of each number saved per member."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice, product
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 
 Colours = tuple[Colormap | str, Normalize]
 
-RESULT_VARIABLE, MEMBER_DIMENSION = "result", "member"  # the variable of the codes, and the dimension of a design
-OTHER_RESULT = "not computed"  # label of codes that no `Result` has
-RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")  # of the results in their order, successes in grey, and of the others
-MISSING_COLOUR = "0.75"  # where there is no value
-LOGARITHMIC_RATIO = 1e2  # from this ratio of the largest to the smallest value on, colours and axes are logarithmic
+RESULT_VARIABLE, MEMBER_DIMENSION = "result", "member"  # the variable of the result codes, and the dimension of a design
+OTHER_RESULT = "not computed"  # label of codes outside `Result`
+RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")  # of the members of `Result` in order, success in grey; then of other codes
+MISSING_COLOUR = "0.75"  # of missing values
+LOGARITHMIC_RATIO = 1e2  # largest over smallest value: for larger ratios colours and axes are logarithmic
 COLUMNS = 4  # of panels
-MOST_PANELS = 12  # of one picture; of the dimensions that these cannot show, the first values are drawn
+MOST_PANELS = 12  # in one picture; of the other dimensions only the first values are drawn
 
 
 def pictures(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> dict[str, Figure]:
-    """Draw the dataset of a sweep: `result`, and every variable with one number a member, not the same for all of them.
+    """Draw the dataset of a sweep: `result`, and every variable with one number per member that differs between members.
 
-    Two dimensions are the axes of a map, those with most values; each combination of the others has a panel. One dimension is a
-    line. Members of a design, which has no grid, are points over its first two axes.
+    The two dimensions with most values are the axes of a map; each combination of the others has a panel. A single dimension
+    gives a line. Members of a design, which has no grid, are points over its first two axes.
     """
     differing = [name for name in scalars(data) if len(np.unique(data[name])) > 1]
     return {name: _picture(data, name, most_panels) for name in (RESULT_VARIABLE, *differing)}
@@ -68,7 +68,7 @@ def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
     for axes, (chosen, said) in zip(grid, panels, strict=False):
         drawn = _panel(axes, data.isel(chosen), name, across, colours)
         axes.set_title(said, fontsize="small")
-    for axes in grid[:count][-columns:]:  # below which there is none
+    for axes in grid[:count][-columns:]:  # the lowest panel of each column
         axes.tick_params(labelbottom=True)
         axes.set_xlabel(words(data, across[-1]) if len(across) == 2 else axes.get_xlabel())
     for axes in grid[count:]:
@@ -77,17 +77,17 @@ def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
         _key(figure, drawn, data, name)
     whole = prod(data.sizes[d] for d in others)
     remarks = [f"the first {count} of {whole} panels"] if count < whole else []
-    remarks += ["grey: no value"] if drawn is not None and not np.isfinite(data[name].values).all() else []
+    remarks += ["grey: missing values"] if drawn is not None and not np.isfinite(data[name].values).all() else []
     figure.suptitle("; ".join([words(data, name), *remarks]))
     return figure
 
 
 def draw_panel(axes: Axes, data: "xarray.Dataset", name: str) -> ScalarMappable | None:
-    """Draw `result` or another variable with one number a member; return what a colour bar needs, None of a line."""
+    """Draw `result` or another variable with one number per member; returns the mappable of a colour bar, None for a line."""
     across, panels = _layout(data)
     if len(panels) > 1:
         raise ValueError(
-            f"a sweep over {', '.join(map(str, data[RESULT_VARIABLE].dims))} needs several panels: choose values by data.sel"
+            f"a sweep over {', '.join(map(str, data[RESULT_VARIABLE].dims))} needs several panels: select values by data.sel"
         )
     return _panel(axes, data.isel(panels[0][0]), name, across, _codes() if name == RESULT_VARIABLE else _scale(data[name].values))
 
@@ -101,7 +101,7 @@ def _panel(axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str],
 
 
 def _layout(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
-    """The dimensions that are drawn across, and for each panel which values of the others it has, and what is said of them."""
+    """Return the dimensions of the axes, and for each panel its indices into the other dimensions, and its title."""
     dims = _dims(data)
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
     across = (MEMBER_DIMENSION,) if MEMBER_DIMENSION in dims else tuple(d for d in dims if d in longest)
@@ -115,7 +115,7 @@ def _layout(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> tuple[tup
 def _map(
     axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str], cmap: Colormap | str, norm: Normalize
 ) -> ScalarMappable:
-    """A heatmap: the first dimension upwards, the second to the right."""
+    """Draw a heat map: the first dimension upwards, the second to the right."""
     up, right = across
     values = np.ma.masked_invalid(_drawable(part[name], name).transpose(up, right).values)
     axes.set_facecolor(MISSING_COLOUR)
@@ -124,13 +124,13 @@ def _map(
         if not _numeric(part, dim):
             ticks(np.arange(part.sizes[dim]), [str(v) for v in part[dim].values], rotation=30 if dim == right else 0)
     if not _numeric(part, up):
-        axes.set_ylim(part.sizes[up] - 0.5, -0.5)  # as one reads
+        axes.set_ylim(part.sizes[up] - 0.5, -0.5)  # in reading order, from top to bottom
     _label(axes, words(part, right), words(part, up))
     return drawn
 
 
 def _line(axes: Axes, part: "xarray.Dataset", name: str, dim: str) -> None:
-    """A value over one axis; where a member failed, a cross at the lower edge."""
+    """Draw a value over one axis; a cross at the lower edge marks a failed member."""
     codes, values = part[RESULT_VARIABLE].values, _drawable(part[name], name).values
     numeric = _numeric(part, dim)
     x = part[dim].values if numeric else np.arange(part.sizes[dim])
@@ -158,7 +158,7 @@ def _line(axes: Axes, part: "xarray.Dataset", name: str, dim: str) -> None:
 
 
 def _points(axes: Axes, part: "xarray.Dataset", name: str, cmap: Colormap | str, norm: Normalize) -> ScalarMappable:
-    """Members of a design over its first two axes, or its only one."""
+    """Draw the members of a design over its first two axes, or its only one."""
     names = [
         str(c)
         for c in part.coords
@@ -179,38 +179,38 @@ def _points(axes: Axes, part: "xarray.Dataset", name: str, cmap: Colormap | str,
 
 
 def _key(figure: Figure, drawn: ScalarMappable, data: "xarray.Dataset", name: str) -> None:
-    """Draw the key to the colours."""
+    """Draw the colour bar."""
     bar = figure.colorbar(drawn, ax=figure.axes, aspect=30)
     if name == RESULT_VARIABLE:
         name_results(bar)
 
 
 def name_results(bar: Colorbar) -> None:
-    """Name the colours of a colour bar of results."""
+    """Label the colours of a colour bar of results."""
     bar.set_ticks(range(len(Result) + 1), labels=[_result(code) for code in range(len(Result) + 1)])
     bar.ax.tick_params(length=0)
 
 
 def _codes() -> Colours:
-    """A colour for each result, and one for what is none."""
+    """Return a colour for each result, and one for other codes."""
     count = len(Result) + 1
     return ListedColormap(RESULT_COLOURS[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
 
 
 def _scale(values: np.ndarray) -> Colours:
-    """Colours from the smallest to the largest value, logarithmic where these are far apart."""
+    """Return colours from the smallest to the largest value, logarithmic if these are far apart."""
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
     return "viridis", LogNorm(low, high) if _decades(finite) else Normalize(low, high)
 
 
 def _drawable(values: "xarray.DataArray", name: str) -> "xarray.DataArray":
-    """Codes of no `Result` are drawn as one."""
+    """Return values to draw: all codes outside `Result` are replaced by one."""
     return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT_VARIABLE else values
 
 
 def _edges(part: "xarray.Dataset", dim: str, scale: Callable[[str], object]) -> np.ndarray:
-    """Return the edges of a map's cells: half way between the values, of labels between their places."""
+    """Return the edges of a map's cells: half way between values, or between the places of labels."""
     if not _numeric(part, dim):
         return np.arange(part.sizes[dim] + 1) - 0.5
     values = part[dim].values.astype(float)
@@ -234,13 +234,13 @@ def _decades(values: np.ndarray) -> bool:
 
 
 def _numeric(data: "xarray.Dataset", dim: str) -> bool:
-    """Return True if a dimension has distinct numbers on it, in order."""
+    """Return True if the values of a dimension are distinct numbers in order."""
     values = data[dim].values
     return values.dtype.kind in "iuf" and (len(values) < 2 or bool(np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)))
 
 
 def words(data: "xarray.Dataset", name: str) -> str:
-    """Return the words for a variable or an axis, with its unit."""
+    """Return the label of a variable or an axis, with its unit."""
     units = data[name].attrs.get("units", "")
     return f"{name.replace('_', ' ')} ({units})" if units not in ("", "1") else name.replace("_", " ")
 

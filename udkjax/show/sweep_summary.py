@@ -1,4 +1,4 @@
-"""Texts of the command line about a sweep, before it and after it."""
+"""Command line summaries of a sweep, before and after it has run."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 def estimate_summary(plan: SweepPlan, cost: SweepCost) -> str:
     """Describe the work of a sweep."""
     shape = " x ".join(f"{dimension.size} {dimension.name}" for dimension in plan.dimensions)
-    tried = "" if cost.tried == cost.groups else f", {cost.tried} of which were tried"
+    tried = "" if cost.tried == cost.groups else f", of which {cost.tried} were tried"
     computing, compiling = duration(cost.computing), duration(cost.compiling)
     lines = {
         "members": f"{cost.members}: {shape}",
-        "kept of each": f"{bytes_per_member(plan)} bytes: {', '.join(variables_of(plan))}",
+        "saved per member": f"{bytes_per_member(plan)} bytes: {', '.join(variables_of(plan))}",
         "programs": plural(cost.groups, "program") + tried,
         "chunks": f"{cost.chunks}",
         "dataset": size(cost.stored),
-        "memory": f"{size(cost.memory)} at most" if cost.memory else "not known on this system",
-        "time": f"about {computing} on the devices of this process, and {compiling} to compile",
+        "memory": f"at most {size(cost.memory)}" if cost.memory else "unknown on this system",
+        "time": f"about {computing} on the devices of this process, plus {compiling} to compile",
     }
     return table(f"{plan.mechanism.name or 'mechanism'}: a sweep", lines)
 
 
 def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
-    """Return the counts of members of a sweep by how they ended, and the range of each number that was kept."""
+    """Return the number of members of a sweep by result, and the range of each number saved per member."""
     codes, counts = np.unique(data[RESULT_VARIABLE].values, return_counts=True)
     known = {int(result): result.name for result in Result}
     ranges = {}
@@ -50,7 +50,7 @@ def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
 
 
 def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:
-    """Describe how the members of a sweep ended, and the range of each number that was kept."""
+    """Describe the results of the members of a sweep, and the range of each number saved per member."""
     found = sweep_results(data)
     ended = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in found["results"].items())
     lines = {"members": f"{found['members']}: {ended}"}
@@ -63,7 +63,7 @@ def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Return a number of bytes as text."""
+    """Return a number of bytes as text, in a readable unit."""
     units = ("bytes", "KiB", "MiB", "GiB", "TiB")
     power = min(int(math.log2(max(count, 1)) / 10), len(units) - 1)
     return f"{count / 1024**power:.3g} {units[power]}"

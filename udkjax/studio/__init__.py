@@ -1,4 +1,4 @@
-"""The studio: a page, served to this machine alone, in which mechanisms are drawn, moved and diagnosed."""
+"""The studio: a page in which mechanisms are drawn, moved and diagnosed, served to this machine only."""
 
 from udkjax.lazy_names import lazy_names
 

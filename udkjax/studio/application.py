@@ -1,12 +1,12 @@
-"""The server of the studio: the files of the page, and five routes that take and answer JSON.
+"""The server of the studio: the files of the page, and five routes with JSON requests and answers.
 
     POST /api/list        {}                                          -> {files, templates, folder}
     POST /api/open        {path} or {template}                        -> {text, document, path, revision, problems}
     POST /api/save        {path, text, revision, export?}             -> {path, revision}, or 409 with the revision on disk
     POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
-    POST /api/diagnose    {text, about?}                              -> what the page says of the drawing
+    POST /api/diagnose    {text, about?}                              -> findings about the drawing
 
-Where a request is refused the answer is {problem} and a status that says why.
+A refused request is answered by {problem} and an HTTP status.
 """
 
 import json
@@ -23,13 +23,15 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from udkjax.annotations import JsonObject
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.studio.folder import Folder
 from udkjax.studio.gate import INTERFACE, Gate
 from udkjax.studio.limits import COMPILE_SECONDS, DIAGNOSE_SECONDS, EXPORT_SECONDS, RefusedError, require_size
 from udkjax.studio.worker import Worker
 
-KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-PLACES = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}
+MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+FOLDERS = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}  # package and folder of each address prefix
+UNIT_SIZES = "unit_sizes.js"  # a module of the page that is made from the package's table of units
 EXPORTS = (".html", ".svg", ".png", ".gif", ".dxf", ".csv", ".py")
 
 
@@ -38,21 +40,21 @@ class Studio:
 
     Args:
         folder: folder of the files to open and save.
-        reader: the process that reads and merges texts, which takes milliseconds.
-        compiler: the one that compiles engines.
-        examiner: the one that diagnoses and exports, which takes longest.
+        reader: process that reads and merges texts, which takes milliseconds.
+        compiler: process that compiles engines.
+        examiner: process that diagnoses and exports, which takes longest.
     """
 
     def __init__(self, folder: Folder, reader: Worker, compiler: Worker, examiner: Worker):
         self.folder, self.reader, self.compiler, self.examiner = folder, reader, compiler, examiner
 
     def list(self, request: JsonObject) -> JsonObject:
-        """Return the scene files of the folder, and the templates."""
+        """Return the folder's scene files, and the templates."""
         templates = self.reader.call("list_templates", {}, COMPILE_SECONDS)
         return {"files": self.folder.list(), "folder": self.folder.root.name, **templates}
 
     def open(self, request: JsonObject) -> JsonObject:
-        """Return the text of a file or of a template, and its tables."""
+        """Return the text and the tables of a file or template."""
         if "template" in request:
             opened = self.reader.call("open_template", {"name": request["template"]}, COMPILE_SECONDS)
             return {**opened, "path": "", "revision": None}
@@ -61,10 +63,10 @@ class Studio:
         return {**opened, "path": request["path"], "revision": revision}
 
     def save(self, request: JsonObject) -> JsonObject:
-        """Write a drawing, or what is exported of it, unless something else is on disk than the page believes."""
+        """Write a drawing or an export of it, unless the file on disk has another revision than the page expects."""
         text, path, revision = require_size(request.get("text")), request.get("path"), request.get("revision")
         if not (revision is None or isinstance(revision, str)):
-            raise RefusedError(400, "revision: must be a text, or null for a new file")
+            raise RefusedError(400, "revision: must be a string, or null for a new file")
         if not request.get("export"):
             return {"path": path, "revision": self.folder.write(path, text.encode(), revision)}
         suffix = self.folder.locate(path, EXPORTS).suffix.lower()
@@ -73,7 +75,7 @@ class Studio:
         return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
 
     def compile(self, request: JsonObject) -> JsonObject:
-        """Return a drawing's text and tables, its mistakes, and what the page needs to move it."""
+        """Return a drawing's text and tables, its mistakes, and the data with which the page moves it."""
         given = {key: request[key] for key in ("text", "document", "engine") if request.get(key) is not None}
         require_size(given.get("text"))
         if not isinstance(given.get("document", {}), dict):
@@ -82,18 +84,18 @@ class Studio:
         return worker.call("compile_drawing", given, COMPILE_SECONDS)
 
     def diagnose(self, request: JsonObject) -> JsonObject:
-        """Return freedoms, redundant constraints with their fixes, and what else is found about a drawing."""
+        """Return findings about a drawing: degrees of freedom, redundant constraints and their fixes, travel, curves."""
         given = {"text": require_size(request.get("text")), "about": str(request.get("about", "structure"))}
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
 
 
 def application(studio: Studio, port: int, token: str) -> ASGIApp:
-    """Return the server behind its gate.
+    """Return the server, protected by its gate.
 
     Args:
         studio: the actions of its routes.
-        port: at which it listens.
-        token: token that each request of the interface must carry.
+        port: port at which it listens.
+        token: token that each request to the interface must carry.
     """
     actions = [studio.list, studio.open, studio.save, studio.compile, studio.diagnose]
     routes = [Route(f"{INTERFACE}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]
@@ -104,9 +106,7 @@ def _answering(action: Callable[[JsonObject], JsonObject]) -> Callable[[Request]
     async def answer(request: Request) -> Response:
         try:
             given = json.loads(await request.body())
-            json.dumps(
-                given, ensure_ascii=False
-            ).encode()  # raises where a text has half of a character, which no answer can hold
+            json.dumps(given, ensure_ascii=False).encode()  # raises for half a surrogate pair, which no answer can hold
         except (ValueError, RecursionError):
             given = None
         if not isinstance(given, dict):
@@ -120,22 +120,27 @@ def _answering(action: Callable[[JsonObject], JsonObject]) -> Callable[[Request]
 
 
 async def _page_file(request: Request) -> Response:
-    """Return a file of the page: one of those that the package has, and none else."""
-    content = page_files().get(request.path_params["path"] or "index.html")
+    content = page_files().get(request.path_params["path"] or "index.html")  # the package's own files only
     if content is None:
         return JSONResponse({"problem": "there is no such file"}, 404)
-    data, kind = content
-    return Response(data, media_type=kind)
+    data, media_type = content
+    return Response(data, media_type=media_type)
 
 
 def page_files() -> Mapping[str, tuple[bytes, str]]:
-    """Return the files of the page by their addresses, with their kinds."""
-    found = {}
-    for prefix, (package, folder) in PLACES.items():
+    """Return the content and the media type of each file of the page by its address."""
+    found = {UNIT_SIZES: (_unit_sizes().encode(), MEDIA_TYPES[".js"])}
+    for prefix, (package, folder) in FOLDERS.items():
         root = files(package).joinpath(folder)
         if root.is_dir():
             for entry in root.iterdir():
                 suffix = Path(entry.name).suffix
-                if suffix in KINDS and entry.is_file() and (not prefix or suffix == ".js"):
-                    found[prefix + entry.name] = (entry.read_bytes(), KINDS[suffix])
+                if suffix in MEDIA_TYPES and entry.is_file() and (not prefix or suffix == ".js"):
+                    found[prefix + entry.name] = (entry.read_bytes(), MEDIA_TYPES[suffix])
     return found
+
+
+def _unit_sizes() -> str:
+    """Return the module with the sizes of the units of length and angle (m, rad) by all their spellings."""
+    tables = {"LENGTHS": Units.sizes("m"), "ANGLES": Units.sizes("rad")}
+    return "".join(f"export const {name} = {json.dumps(sizes)};\n" for name, sizes in tables.items())

@@ -1,7 +1,7 @@
-"""Mechanisms of bodies and joints, drawn: the same motion from pins in world coordinates and links through them.
+"""Mechanisms of bodies and joints converted into drawings with the same motion: pins in world coordinates and links through them.
 
-Each revolute joint becomes a pin, each body a link of its mass, inertia and centre; slots, slides, gears, springs, motors and
-loads become what drawings have for them. Distances, and drivers of them, stay as in format 1, with points in the links' frames.
+Each revolute joint becomes a pin, each body a link with its mass, inertia and centre; slots, slides, gears, springs, motors and
+loads become the corresponding elements of drawings. Distance joints stay as in format 1, with points in the links' frames.
 """
 
 from collections.abc import Sequence
@@ -34,19 +34,18 @@ from udkjax.scene import (
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_forces import shift_motion
 
-GROUND = GROUND
-SAME_PLACE = 1e-9  # of the extent: joints that are closer share a pin
+SAME_PLACE = 1e-9  # fraction of the extent: joints that are closer share a pin
 
 
 def drawing_text_of(mechanism: Mechanism) -> str:
-    """Return a mechanism as the text of a drawing; raise `SceneError` where it cannot be drawn."""
+    """Return a mechanism as the text of a drawing; raise `SceneError` if it cannot be drawn."""
     if isinstance(mechanism.drawing, Drawing) and not mechanism.departs_from_drawing:
         return dumps(mechanism)
     return dumps(_Draft(mechanism).drawing())
 
 
 class _Draft:
-    """A drawing in the making: pins by name with their places, and the pins of each link."""
+    """A drawing under construction: places and members of pins by name, and elements by section."""
 
     def __init__(self, mechanism: Mechanism):
         self.mechanism = mechanism
@@ -55,14 +54,13 @@ class _Draft:
         self.frames = dict(zip(mechanism.bodies, q, strict=True)) | {GROUND: np.zeros(3)}
         self.rates = dict(zip(mechanism.bodies, v, strict=True)) | {GROUND: np.zeros(3)}
         self.places: dict[str, np.ndarray] = {}
-        self.members: dict[str, list[str]] = {}  # of each pin
+        self.members: dict[str, list[str]] = {}  # bodies of each pin
         self.elements: dict[str, dict[str, Any]] = {}
-        held = [p for e in mechanism.constraints.values() for p in np.ravel(np.asarray(getattr(e, "points", 0.0), float))]
-        self.kept: list[tuple[str, str, Any]] = []  # of format 1
-        self.near = SAME_PLACE * max([1e-300, *map(abs, map(float, held)), *np.abs(q[:, :2]).ravel().tolist()])
+        points = [p for e in mechanism.constraints.values() for p in np.ravel(np.asarray(getattr(e, "points", 0.0), float))]
+        self.format_1: list[tuple[str, str, Any]] = []  # section, name, element
+        self.near = SAME_PLACE * max([1e-300, *map(abs, map(float, points)), *np.abs(q[:, :2]).ravel().tolist()])
 
     def drawing(self) -> Drawing:
-        """Return the finished drawing."""
         mechanism = self.mechanism
         for name, joint in mechanism.joints.items():
             if isinstance(joint, Revolute):
@@ -73,14 +71,14 @@ class _Draft:
             self.driver(name, driver)
         for name, force in mechanism.forces.items():
             self.force(name, force)
-        for name in mechanism.bodies:  # a link of one pin has a place, but cannot say how fast it turns
+        for name in mechanism.bodies:  # velocities of pins determine the angular velocity of a link only if it has two
             centre = self.frames[name][:2]
             if not self.pins_of(name):
                 self.pin(f"{name}'", [name], centre)
             if len(self.pins_of(name)) == 1 and self.rates[name][2]:
                 body = mechanism.bodies[name]
                 self.pin(f"{name}'", [name], centre + [np.sqrt(float(body.inertia / body.mass)), 0.0])
-        for section, name, element in self.kept:
+        for section, name, element in self.format_1:
             self.add(section, name, self.in_links(element))
         links = {name: self.link(name, body) for name, body in mechanism.bodies.items()}
         ground = [pin for pin, members in self.members.items() if GROUND in members]
@@ -98,14 +96,13 @@ class _Draft:
         )
 
     def place(self, body: str, point: Any) -> np.ndarray:
-        """Return the place of a point of a body (m)."""
         x, y, angle = self.frames[body]
         px, py = np.asarray(point, float)
         c, s = np.cos(angle), np.sin(angle)
         return np.array([x + c * px - s * py, y + s * px + c * py])
 
     def pin(self, name: str, bodies: Sequence[str], place: np.ndarray) -> str:
-        """Return the pin of bodies at a place, made or found."""
+        """Return the pin of bodies at a place: one that they share there already, or a new one."""
         for pin, other in self.places.items():
             if np.abs(place - other).max() <= self.near and set(bodies) & set(self.members[pin]):
                 self.members[pin] += [body for body in bodies if body not in self.members[pin]]
@@ -117,15 +114,14 @@ class _Draft:
         return fresh
 
     def add(self, section: str, name: str, element: Any) -> None:
-        """Add an element to a section."""
         self.elements.setdefault(section, {})[name] = element
 
     def angle(self, bodies: Sequence[str]) -> float:
-        """Return the angle of the second body on the first one (rad)."""
+        """Return the angle of the second body relative to the first (rad)."""
         return float(self.frames[bodies[1]][2] - self.frames[bodies[0]][2])
 
     def joint(self, name: str, joint: Joint) -> None:
-        """Draw a joint that is no pin."""
+        """Draw a joint other than a pin."""
         match joint:
             case Revolute():
                 return
@@ -137,27 +133,26 @@ class _Draft:
                 one, two = joint.bodies
                 self.pin(f"{two}'", [two], self.place(two, joint.points[1]))
                 self.add("slide", name, {"link": two, "direction": self.world(one, joint.axis), "on": one})
-            case Gear() if all(self.centre(body, joint.carrier) for body in joint.bodies):
+            case Gear() if all(self.has_centre(body, joint.carrier) for body in joint.bodies):
                 gear = {"links": list(joint.bodies), "radii": np.asarray(joint.radii), "internal": joint.internal}
                 self.add("gear", name, gear | {"carrier": joint.carrier})
             case _:
-                self.by_hand("joint", name, joint)
+                self.keep_distance("joint", name, joint)
 
-    def centre(self, wheel: str, carrier: str) -> bool:
-        """Tell whether a wheel turns on its carrier at one pin."""
+    def has_centre(self, wheel: str, carrier: str) -> bool:
+        """Return True if a wheel turns on its carrier about a single pin."""
         return sum(wheel in members and carrier in members for members in self.members.values()) == 1
 
     def world(self, body: str, axis: Any) -> list[float]:
-        """Return the direction of an axis of a body in world coordinates."""
         angle = float(axis) + float(self.frames[body][2])
         return [float(np.cos(angle)), float(np.sin(angle))]
 
     def pin_between(self, bodies: Sequence[str]) -> str:
-        """Return the pin at which two bodies turn on each other, or an empty text."""
+        """Return the pin about which two bodies turn on each other, or an empty string."""
         return next((pin for pin, members in self.members.items() if set(bodies) <= set(members)), "")
 
     def driver(self, name: str, driver: Driver) -> None:
-        """Draw a driver: a motor where it turns two links at their pin, or moves two places apart."""
+        """Draw a driver as a motor that turns two links about their pin, or changes the distance of two pins."""
         pin = self.pin_between(driver.bodies)
         if driver.coordinate == "angle" and pin:
             where, drawn = {"pin": pin, "of": list(driver.bodies)}, self.angle(driver.bodies)
@@ -165,7 +160,7 @@ class _Draft:
             ends = self.ends(name, driver.bodies, driver.points)
             where, drawn = {"between": ends}, float(np.linalg.norm(self.places[ends[1]] - self.places[ends[0]]))
         else:
-            return self.by_hand("driver", name, driver)
+            return self.keep_distance("driver", name, driver)
         motion = driver.motion
         if isinstance(motion, Polynomial) and len(motion.coefficients) == 2:
             law: dict[str, Any] = {"speed": float(motion.coefficients[1])}
@@ -174,14 +169,12 @@ class _Draft:
         return self.add("motor", name, where | law)
 
     def ends(self, name: str, bodies: Sequence[str], points: Any) -> list[str]:
-        """Return a pin at a point of each of two bodies."""
         return [
             self.pin(f"{name}{k + 1}", [body], self.place(body, point))
             for k, (body, point) in enumerate(zip(bodies, np.asarray(points), strict=True))
         ]
 
     def force(self, name: str, force: ForceElement) -> None:
-        """Draw a force element."""
         match force:
             case Spring():
                 ends = self.ends(name, force.bodies, force.points)
@@ -194,20 +187,20 @@ class _Draft:
             case Torque(value=value) if force.bodies[0] == GROUND and eqx.is_array(value):
                 self.add("load", name, {"link": force.bodies[1], "torque": value})
             case _:
-                self.by_hand("force", name, force)
+                self.keep_distance("force", name, force)
 
-    def by_hand(self, section: str, name: str, element: Any) -> None:
-        """Keep a distance as it is: its points go into the frames that the links will have."""
+    def keep_distance(self, section: str, name: str, element: Any) -> None:
+        """Keep a distance joint in format 1; raise `SceneError` for any other element."""
         if not isinstance(element, Distance):
             cure = "draw it with the pins, slots, slides, gears and motors of format 2"
-            raise SceneError([f"{section} {name!r}: the studio cannot draw one of class {type(element).__name__}; {cure}"])
+            raise SceneError([f"{section} {name!r}: the studio cannot draw elements of class {type(element).__name__}; {cure}"])
         for k, (body, point) in enumerate(zip(element.bodies, np.asarray(element.points), strict=True)):
             if body != GROUND:
                 self.pin(f"{name}{k + 1}", [body], self.place(body, point))
-        self.kept.append((section, name, element))
+        self.format_1.append((section, name, element))
 
     def in_links(self, element: Any) -> Any:
-        """Return an element with its points in the frames of the links: centres of mass, x from the first pin to the second."""
+        """Return an element with its points in link frames: origin at the centre of mass, x from the first pin to the second."""
         moved = []
         for body, point in zip(element.bodies, np.asarray(element.points), strict=True):
             place = self.place(body, point)
@@ -220,16 +213,13 @@ class _Draft:
         return eqx.tree_at(lambda e: e.points, element, jnp.asarray(moved))
 
     def pins_of(self, body: str) -> list[str]:
-        """Return the pins of a body, at least one."""
         return [pin for pin, members in self.members.items() if body in members]
 
     def link(self, name: str, body: Body) -> dict[str, Any]:
-        """Return the table of a link."""
         x, y, _ = self.frames[name]
         return {"pins": self.pins_of(name), "mass": body.mass, "inertia": body.inertia, "centre": [float(x), float(y)]}
 
     def velocity(self, pin: str) -> np.ndarray:
-        """Return the velocity of a pin (m/s)."""
         body = next(body for body in self.members[pin] if body != GROUND)
         vx, vy, rate = self.rates[body]
         arm = self.places[pin] - self.frames[body][:2]

@@ -1,4 +1,4 @@
-"""A drawing in other forms: a page, pictures, a film, a table of its motion, a script."""
+"""Exports of a drawing: a page, pictures, a film, a table of its motion, a script."""
 
 import contextlib
 import csv
@@ -14,7 +14,7 @@ from udkjax.scene import Mechanism
 from udkjax.show.player import Animation, animate
 from udkjax.studio.shown_runs import INSTANTS, duration_of, shown_run
 
-SCRIPT = '''"""{title}, drawn in the studio of udkjax."""
+SCRIPT = '''"""{title}, drawn in the udkjax studio."""
 
 import numpy as np
 
@@ -29,17 +29,17 @@ print(sol)
 udk.animate(mech, sol).save("motion.html")
 '''
 
-FORMULA = ("=", "+", "-", "@", "\t")  # with which a cell begins that a spreadsheet computes; behind an apostrophe it is a text
+FORMULA = ("=", "+", "-", "@", "\t")  # a spreadsheet computes a cell that begins so, unless an apostrophe precedes it
 
 
 def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
-    """Return a drawing in the form that an ending names.
+    """Return a drawing in the format of a file name suffix.
 
     Args:
-        mechanism: mechanism that is drawn.
-        text: its file.
-        suffix: .html (a page that solves the motion anew), .svg, .png, .gif or .dxf, as `animate` saves them; .csv (positions
-            over time) or .py (a script).
+        mechanism: mechanism of the drawing.
+        text: text of its file.
+        suffix: .html (a live page), .svg, .png, .gif or .dxf, as `animate` saves them; .csv (positions over time) or .py (a
+            script).
     """
     if suffix == ".py":
         return script(mechanism, text).encode()
@@ -53,7 +53,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
 
 
 def shown(mechanism: Mechanism, run: Solution, suffix: str) -> Animation:
-    """Return a run as an animation; as a page it solves the motion anew, where machine code can."""
+    """Return a run as an animation: for a page a live one, if machine code can express the mechanism."""
     if suffix == ".html":
         with contextlib.suppress(ValueError, UnsupportedError):
             return animate(mechanism, run, live=True)
@@ -68,7 +68,7 @@ def script(mechanism: Mechanism, text: str) -> str:
 
 
 def table(mechanism: Mechanism, run: Solution) -> str:
-    """Return the motion of all bodies as comma-separated values, a line an instant."""
+    """Return the motion of all bodies as comma-separated values, one line per instant."""
     q = np.asarray(run.q).reshape(len(run.ts), -1)
     units = ("x (m)", "y (m)", "angle (rad)")
     out = io.StringIO()

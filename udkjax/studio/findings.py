@@ -1,4 +1,4 @@
-"""Findings about a drawing, which the page says: freedoms, redundancy and its cure, unique reactions, how far a motor turns."""
+"""Findings about a drawing, shown by the page: degrees of freedom, redundant constraints, unique reactions, travel of motors."""
 
 import math
 
@@ -19,16 +19,16 @@ from udkjax.study.diagnosis import Diagnosis, diagnose
 from udkjax.study.diagnosis.fixes import Fix
 
 MOST_FIXES = 8  # fixes listed for one redundancy
-IN_LINE = 1e-4  # rad: of a toggle that is found to rounding, whose angle errs by the root of that
+IN_LINE = 1e-4  # rad: a dead point is found to rounding, and its angle to the square root of rounding
 
 
 def examine(mechanism: Mechanism, about: str) -> JsonObject:
     """Return the findings about a subject.
 
     Args:
-        mechanism: the drawing's.
-        about: "structure" (freedoms, redundancy, reactions), "travel" (how far each motor turns), "dynamics" (curves of forces),
-            "rest" (a position of rest), or "holding" (curves of forces where motors hold it still).
+        mechanism: mechanism of the drawing.
+        about: "structure" (degrees of freedom, redundant constraints, reactions), "travel" (of each motor), "dynamics" (curves
+            of forces), "rest" (an equilibrium), or "holding" (curves of holding torques and forces).
     """
     subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves, "rest": rest, "holding": holding_curves}
     if about not in subjects:
@@ -40,16 +40,16 @@ def examine(mechanism: Mechanism, about: str) -> JsonObject:
 
 
 def structure(mechanism: Mechanism) -> JsonObject:
-    """Return freedoms, sets of redundant constraints with what mends them, and which reactions are unique."""
+    """Return degrees of freedom, sets of redundant constraints with their fixes, and reactions that are not unique."""
     found = diagnose(mechanism, walk=False)
-    loose = {
+    not_unique = {
         name: {"components": [bool(x) for x in forces.unique], "direction": forces.direction}
         for name, forces in found.forces.items()
         if not all(forces.unique)
     }
     return {
-        "freedoms": found.degrees_of_freedom,
-        "joint_freedoms": found.joint_mobility,
+        "degrees_of_freedom": found.degrees_of_freedom,
+        "joint_mobility": found.joint_mobility,
         "gruebler": found.gruebler,
         "redundant": found.rows - found.ordinary_rank,
         "singular": bool(found.is_singular),
@@ -66,13 +66,13 @@ def structure(mechanism: Mechanism) -> JsonObject:
             }
             for r in found.redundancies
         ],
-        "loose": loose,
+        "not_unique": not_unique,
         "text": str(found),
     }
 
 
 def drawn_change(fix: Fix) -> JsonObject | None:
-    """Return a fix as a change of the drawing: a constraint that is gone, or the slot that takes a pin's place; else None."""
+    """Return a fix as a change of the drawing: a removed constraint, or a slot in place of a pin; None if it is neither."""
     joint = fix.mechanism.joints.get(fix.constraint)
     if joint is None:
         return {"kind": "remove"}
@@ -88,26 +88,26 @@ def _why(found: Diagnosis, mechanism: Mechanism) -> str:
     drivers = list(mechanism.drivers)
     if found.joint_mobility <= 0:
         if found.is_singular:
-            return "it cannot move: it gives way to first order only"
-        return f"it cannot move: its joints hold all {found.coordinates} coordinates of its bodies. Take a joint or a link away"
+            return "The mechanism cannot move, except infinitesimally"
+        return f"The mechanism cannot move: its joints fix all {found.coordinates} coordinates. Remove a joint or a link"
+    names = ", ".join(drivers)
     if drivers and found.mobility == 0 and not found.is_singular:
-        return f"{_names(drivers)} {'moves' if len(drivers) == 1 else 'move'} all of it"
+        return f"{names} {'determines' if len(drivers) == 1 else 'determine'} the whole motion"
     if len(drivers) > found.joint_mobility:
-        return f"{plural(len(drivers), 'motor')} for {plural(found.joint_mobility, 'freedom')}: they must agree with each other"
-    free = plural(found.degrees_of_freedom, "freedom")
+        return f"{plural(len(drivers), 'motor')} for {_freedom(found.joint_mobility)}: their motions must agree"
     if drivers:
-        return f"{_names(drivers)} and the loads move it; {free} left to the loads"
+        return f"{names} and the loads move it; {_freedom(found.degrees_of_freedom)} left to the loads"
     if mechanism.forces or np.any(np.asarray(mechanism.gravity)):
-        return f"{free}: loads and gravity move it; a motor would drive it"
-    return f"{free}, and nothing that drives it: add a motor or a load"
+        return "Gravity and loads move it; add a motor to drive it"
+    return "Nothing moves it: add a motor or a load"
 
 
-def _names(names: list[str]) -> str:
-    return ", ".join(names)
+def _freedom(count: int) -> str:
+    return f"{count} {'degree' if count == 1 else 'degrees'} of freedom"
 
 
 def rest(mechanism: Mechanism) -> JsonObject:
-    """Return the position of rest next to the drawn one, downhill if need be, and its frequencies (Hz)."""
+    """Return the stable equilibrium next to the drawn position, and its natural frequencies (Hz)."""
     found = equilibrium(mechanism, stable=True)
     rates = [float(x) for x in np.asarray(found.omega2)]
     return {
@@ -118,7 +118,7 @@ def rest(mechanism: Mechanism) -> JsonObject:
 
 
 def motor_travel(mechanism: Mechanism) -> JsonObject:
-    """Return the travel of each motor from the drawn position, where the others hold, and the pins in line at its limits."""
+    """Return the travel of each motor from the drawn position, with the others held, and the pins in line at its limits."""
     found = []
     for name, driver in mechanism.drivers.items():
         if driver.coordinate == "y":
@@ -126,19 +126,19 @@ def motor_travel(mechanism: Mechanism) -> JsonObject:
         try:
             ends_of = travel(mechanism, name)
         except SceneError:
-            continue  # positions do not follow from this motor
+            continue  # this motor does not determine the positions
         start = float(np.asarray(driver.motion(0.0)))
         ends = []
         for limit, q in ((ends_of.lower, ends_of.lower_q), (ends_of.upper, ends_of.upper_q)):
             if np.isfinite(float(limit)):
                 ends.append({"value": float(limit) - start, "in_line": pins_in_line(mechanism, np.asarray(q))})
-        lost = [side for side, code in zip(("back", "ahead"), np.asarray(ends_of.status), strict=True) if code == Reached.lost]
+        lost = [side for side, code in zip(("lower", "upper"), np.asarray(ends_of.status), strict=True) if code == Reached.lost]
         found.append({"motor": name, "unit": ends_of.unit, "ends": ends, "lost": lost})
     return {"travel": found}
 
 
 def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
-    """Return the pins that are in line in a position: of two links that share one, and of further ones on that line."""
+    """Return lines of pins in a position: each has the pins of two links that share one, and further pins on that line."""
     frames = dict(zip(mechanism.bodies, q, strict=True))
     pins = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Revolute)}
     places = {}
@@ -164,7 +164,7 @@ def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
 
 
 def _add_to_line(lines: list[list[str]], pins: list[str], places: dict[str, np.ndarray]) -> None:
-    """Put three pins in line on the line that has two of these places already, or on a new one; each place once."""
+    """Add three pins in line to the line that has two of their places already, or as a new line; each place once."""
     near = IN_LINE * np.ptp(list(places.values()), axis=0).max()
     for line in lines:
         new = [pin for pin in pins if all(np.linalg.norm(places[pin] - places[other]) > near for other in line)]

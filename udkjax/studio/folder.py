@@ -1,4 +1,4 @@
-"""Files of one folder: listed, read, and written whole or not at all, never over what changed on disk meanwhile."""
+"""Files of one folder: listed, read, and written atomically, never over a file that has changed on disk in the meantime."""
 
 import contextlib
 import hashlib
@@ -10,11 +10,11 @@ from pathlib import Path, PurePosixPath
 from udkjax.studio.limits import MOST_FOLDERS_DEEP, MOST_LISTED, MOST_TEXT_CHARACTERS, RefusedError
 
 SCENE_SUFFIX = ".toml"
-MOST_CHARACTERS_OF_A_PATH = 200  # file systems take 255 of each name
+MOST_CHARACTERS_OF_A_PATH = 200  # file systems allow 255 per name
 
 
 class Folder:
-    """The folder in which the studio was started. No path leads out of it, neither by `..` nor by a link.
+    """The folder in which the studio was started. No path leads out of it, neither through `..` nor through a link.
 
     Args:
         root: the folder.
@@ -24,7 +24,7 @@ class Folder:
         self.root = root.resolve(strict=True)
 
     def list(self) -> list[str]:
-        """Return the scene files below the folder, at most `MOST_LISTED`, in order."""
+        """Return the scene files below the folder in alphabetical order, at most `MOST_LISTED`."""
         return sorted(self._walk(self.root, MOST_FOLDERS_DEEP))
 
     def _walk(self, folder: Path, deep: int) -> Iterator[str]:
@@ -46,13 +46,13 @@ class Folder:
                     yield name
 
     def locate(self, name: object, suffixes: tuple[str, ...]) -> Path:
-        """Return the file of a relative path; raise `RefusedError` where it is none inside the folder."""
+        """Return the file of a relative path; raise `RefusedError` if it is not inside the folder."""
         if not isinstance(name, str) or not 0 < len(name) <= MOST_CHARACTERS_OF_A_PATH:
             raise RefusedError(400, "path: must be the path of a file in the studio's folder")
         parts = PurePosixPath(name).parts
         wrong = any(not c.isprintable() or c in '\\:*?"<>|' for c in name)
         if wrong or name.startswith("/") or any(part.startswith(".") for part in parts):
-            raise RefusedError(400, f"path: {name!r} is no plain path in the studio's folder")
+            raise RefusedError(400, f"path: {name!r} is not a plain path in the studio's folder")
         if not name.lower().endswith(suffixes):
             raise RefusedError(400, f"path: {name!r} must end in {' or '.join(suffixes)}")
         path = self.root.joinpath(*parts)
@@ -61,15 +61,15 @@ class Folder:
         except OSError:
             raise RefusedError(404, f"there is no folder {PurePosixPath(*parts[:-1]).as_posix()!r}") from None
         if not inside or path.is_symlink() or (path.exists() and not path.is_file()):
-            raise RefusedError(403, f"path: {name!r} leads out of the studio's folder, or is no plain file")
+            raise RefusedError(403, f"path: {name!r} leads out of the studio's folder, or is not a regular file")
         return path
 
     def read(self, name: object) -> tuple[str, str]:
-        """Return the text of a scene file, and its revision."""
+        """Return the text and the revision of a scene file."""
         path = self.locate(name, (SCENE_SUFFIX,))
         try:
             if path.stat().st_size > 4 * MOST_TEXT_CHARACTERS:
-                raise RefusedError(413, f"{name} is longer than the {MOST_TEXT_CHARACTERS} characters that the studio takes")
+                raise RefusedError(413, f"{name} is longer than the studio's limit of {MOST_TEXT_CHARACTERS} characters")
             data = path.read_bytes()
             return data.decode("utf-8"), revision_of(data)
         except UnicodeDecodeError as error:
@@ -78,21 +78,21 @@ class Folder:
             raise RefusedError(404, f"cannot read {name}: {error.strerror}") from None
 
     def write(self, name: object, data: bytes, revision: str | None, suffixes: tuple[str, ...] = (SCENE_SUFFIX,)) -> str:
-        """Write a file, whole or not at all, and return its new revision.
+        """Write a file atomically, and return its new revision.
 
         Args:
-            name: its path.
-            data: its content.
-            revision: revision that the page believes to be on disk; None: no such file.
-            suffixes: the endings that it may have.
+            name: path of the file.
+            data: content of the file.
+            revision: revision expected on disk; None if no such file is expected.
+            suffixes: allowed file name suffixes.
 
         Raises:
-            RefusedError: something else is on disk (status 409, with its revision), or it cannot be written.
+            RefusedError: the file on disk has another revision (status 409, with that revision), or it cannot be written.
         """
         path = self.locate(name, suffixes)
         present = revision_of(path.read_bytes()) if path.exists() else None
         if present != revision:
-            found = "is not there any more" if present is None else "was made or changed by someone else"
+            found = "has been deleted" if present is None else "has been created or changed by another program"
             raise RefusedError(409, f"{name} {found} since it was opened here", revision=present)
         try:
             handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".studio-")
@@ -103,7 +103,7 @@ class Folder:
                     os.fsync(file.fileno())
                 if present is None:
                     os.chmod(temporary, 0o666 & ~_umask())
-                    os.link(temporary, path)  # fails where a file appeared meanwhile
+                    os.link(temporary, path)  # fails if the file exists by now
                 else:
                     os.chmod(temporary, path.stat().st_mode & 0o7777)
                     os.replace(temporary, path)
@@ -111,14 +111,14 @@ class Folder:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(temporary)
         except FileExistsError:
-            raise RefusedError(409, f"{name} was made by someone else meanwhile", revision=None) from None
+            raise RefusedError(409, f"{name} has just been created by another program", revision=None) from None
         except OSError as error:
             raise RefusedError(500, f"cannot write {name}: {error.strerror}") from None
         return revision_of(data)
 
 
 def revision_of(data: bytes) -> str:
-    """Return the digest that names a content of a file."""
+    """Return the digest that identifies the content of a file."""
     return hashlib.sha256(data).hexdigest()
 
 

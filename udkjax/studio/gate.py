@@ -1,8 +1,8 @@
-"""The gate of the server: who may ask, and what every answer forbids the browser.
+"""The gate of the server: checks of every request, and security headers of every answer.
 
-A page of another site can reach a server on this machine in three ways: by a name that it makes point here (so the Host is
-compared with a list), by requests of its own (so the Origin is, and the body must be JSON, which no form sends), and by guessing
-(so each request of the interface carries a random token: it stands in the fragment of the address, which no browser sends).
+A page of another site can reach a server on this machine in three ways: through a host name that it points here (so Host is
+checked), through requests of its own (so Origin is checked, and the body must be JSON, which no form sends), and by guessing (so
+each request to the interface needs a random token, which is in the fragment of the address, which browsers never send).
 """
 
 import hmac
@@ -17,7 +17,7 @@ from udkjax.studio.limits import MOST_BODY_BYTES, RefusedError
 
 TOKEN_HEADER = "x-studio-token"
 INTERFACE = "/api/"
-NAMES = ("127.0.0.1", "localhost")  # by which this machine calls itself
+NAMES = ("127.0.0.1", "localhost")  # of this machine
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -34,12 +34,12 @@ HEADERS: Mapping[str, str] = {
 
 
 class Gate:
-    """ASGI middleware that refuses requests of others, and adds the headers that keep the page to itself.
+    """ASGI middleware that refuses requests of other sites, and adds headers that isolate the page.
 
     Args:
-        app: application behind the gate.
-        port: of the server, which is part of its names.
-        token: token that each request of the interface must carry.
+        app: application that gets the accepted requests.
+        port: port of the server, which is part of its Host and Origin.
+        token: token that each request to the interface must carry.
     """
 
     def __init__(self, app: ASGIApp, port: int, token: str):
@@ -70,23 +70,23 @@ class Gate:
         await self.app(scope, receive if body is None else _Replay(body, receive), sent)
 
     def _check(self, scope: Scope) -> None:
-        """Raise `RefusedError` where a request is not of the studio's own page."""
+        """Raise `RefusedError` if a request does not come from the studio's own page."""
         headers = Headers(scope=scope)
         hosts, origins = headers.getlist("host"), headers.getlist("origin")
         if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
-            raise RefusedError(421, "this server answers to 127.0.0.1 and localhost alone")
+            raise RefusedError(421, "this server answers only as 127.0.0.1 or localhost")
         if any(origin not in self.origins for origin in origins):
-            raise RefusedError(403, "requests of other sites are refused")
+            raise RefusedError(403, "requests from other sites are refused")
         if not scope["path"].startswith(INTERFACE):
             if scope["method"] not in ("GET", "HEAD"):
-                raise RefusedError(405, "files of the page are read only")
+                raise RefusedError(405, "the files of the page are read-only")
             return
         if scope["method"] != "POST":
-            raise RefusedError(405, "the interface takes POST alone")
+            raise RefusedError(405, "the interface accepts only POST")
         if not hmac.compare_digest(headers.get(TOKEN_HEADER, "").encode(), self.token.encode()):
             raise RefusedError(401, "the token is missing or wrong: open the address that udkjax studio printed")
         if not origins:
-            raise RefusedError(403, "a request must say its Origin")
+            raise RefusedError(403, "the Origin header is missing")
         if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
             raise RefusedError(415, "the body must be application/json")
 
@@ -100,7 +100,7 @@ async def _read(receive: Receive, headers: Headers) -> bytes:
     while True:
         message = await receive()
         if message["type"] == "http.disconnect":
-            raise RefusedError(400, "the request broke off")
+            raise RefusedError(400, "the request was interrupted")
         body += message.get("body", b"")
         if len(body) > MOST_BODY_BYTES:
             raise RefusedError(413, f"the request is longer than {MOST_BODY_BYTES} bytes")
@@ -109,7 +109,7 @@ async def _read(receive: Receive, headers: Headers) -> bytes:
 
 
 class _Replay:
-    """A `receive` that gives a body that was read already."""
+    """A `receive` that returns a body that has been read already."""
 
     def __init__(self, body: bytes, receive: Receive):
         self.body, self.receive = body, receive

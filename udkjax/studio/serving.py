@@ -1,4 +1,4 @@
-"""Serving the studio on this machine: a socket of the loopback interface alone, a token, and the address that opens it."""
+"""Serving the studio on this machine: a socket on the loopback interface, a token, and the address that opens the page."""
 
 import secrets
 import socket
@@ -19,7 +19,7 @@ with OptionalImport():
 from udkjax.studio.worker import Worker
 
 LOOPBACK = "127.0.0.1"
-TOKEN_BYTES = 32  # of randomness, which nobody guesses
+TOKEN_BYTES = 32  # random bytes: too many to guess
 
 
 def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say: Callable[[str], None] = print) -> None:
@@ -27,17 +27,17 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
 
     Args:
         root: the folder whose files may be opened and saved.
-        opened: the path of a file in it that the page opens, or empty.
-        port: at which it listens; 0 for one that is free.
-        browse: whether to open a browser.
-        say: takes the address.
+        opened: path of a file in the folder that the page opens, or empty.
+        port: port at which to listen; 0 for any free port.
+        browse: True to open a browser.
+        say: function that shows the address to the user.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES)
     workers = Worker(), Worker(), Worker()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((LOOPBACK, port))
-        listener.listen()  # whoever takes the address at once waits for an answer, and is not refused
+        listener.listen()  # so that early connections wait for the server instead of being refused
         bound = listener.getsockname()[1]
         app = application(Studio(Folder(root), *workers), bound, token)
         address = f"http://{LOOPBACK}:{bound}/#t={token}" + (f"&f={quote(opened)}" if opened else "")

@@ -1,4 +1,4 @@
-"""The run that the studio shows of a drawing: how long it lasts, and its curves of forces and energies."""
+"""The run of a drawing that the studio shows: its duration, and its curves of forces and energies."""
 
 import math
 from typing import Any
@@ -15,16 +15,16 @@ from udkjax.scene import Driver, Mechanism, SceneError
 from udkjax.show.player.measure_curves import measures_of
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 
-TURNS = 2  # of the slowest motor that a run shows
-SWINGS = 12  # characteristic times that a run without a motor shows
-STILL = 1.0  # s: of a run in which no load and no motor moves anything
-INSTANTS = 401  # of a run: two hundred of each of two turns
-DIGITS = 2  # of a duration
-TOLERANCE = 1e-8  # of a run, relative
+TURNS = 2  # turns of the slowest motor in a run
+SWINGS = 12  # duration of a run without motors, in characteristic times
+STILL = 1.0  # s: duration of a run in which nothing moves
+INSTANTS = 401  # output times of a run: two hundred per turn
+DIGITS = 2  # significant digits of a duration
+TOLERANCE = 1e-8  # rtol and atol of a run
 
 
 def duration_of(mechanism: Mechanism) -> float:
-    """Return the time of a run to show (s): turns of the slowest motor, or a slide's way across the mechanism, or else swings."""
+    """Return the duration of a run (s): turns of the slowest motor, a slide's way across the mechanism, or else some swings."""
     scales, ways = analyse(mechanism), []
     for name, driver in mechanism.drivers.items():
         if (speed := constant_speed(mechanism, name)) != 0:
@@ -35,13 +35,13 @@ def duration_of(mechanism: Mechanism) -> float:
 
 
 def shown_run(mechanism: Mechanism) -> Solution:
-    """Return the run that is shown; one that fails is as long as it came."""
+    """Return the run that is shown; a failed run has NaN from its failure on."""
     ts = np.linspace(0.0, duration_of(mechanism), INSTANTS)
     return simulate(mechanism, ts, rtol=TOLERANCE, atol=TOLERANCE, throw=False)
 
 
 def recorded_motion(mechanism: Mechanism) -> JsonObject:
-    """Return the run as plain numbers: `q` and `v` of all bodies at `times`, and why it ended, where it did so too early."""
+    """Return the run as plain numbers: `q` and `v` of all bodies at `times`, and `cause`, the reason of an early end."""
     run = shown_run(mechanism)
     q, v = np.asarray(run.q), np.asarray(run.v)
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
@@ -51,9 +51,9 @@ def recorded_motion(mechanism: Mechanism) -> JsonObject:
 
 
 def force_curves(mechanism: Mechanism) -> JsonObject:
-    """Return curves of the run that need forces: efforts and powers of motors, forces at pins; and energies and violation."""
+    """Return curves of the run: driving torques, forces and powers of motors, forces at pins, energies, constraint violation."""
     run = shown_run(mechanism)
-    ts, found = np.asarray(run.ts), _efforts(mechanism, run)
+    ts, found = np.asarray(run.ts), _efforts(mechanism, run, "driving")
     powers = [
         _curve(f"{n}: power", "W", np.asarray(x) * _rate(mechanism.drivers[n], ts)) for n, x in efforts(mechanism, run).items()
     ]
@@ -62,48 +62,55 @@ def force_curves(mechanism: Mechanism) -> JsonObject:
 
 
 def holding_curves(mechanism: Mechanism) -> JsonObject:
-    """Return curves of what holds a mechanism still in each position of its run: efforts of motors and forces at pins.
+    """Return curves of the torques, forces and forces at pins that hold a mechanism at rest in each position of its run.
 
     Raises:
-        SceneError: motors do not hold all of it.
+        SceneError: motors do not hold the whole mechanism.
     """
     if mobility_of(mechanism) > 0:
-        raise SceneError(["motors do not hold all of it still: what they leave free, loads would move"])
+        raise SceneError(["motors do not hold the whole mechanism at rest: loads would move the rest of it"])
     run = shown_run(mechanism)
     held = with_halted_drivers(mechanism, 0.0)
     rest = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
-    curves = [*_efforts(held, rest), *_pin_forces(held, rest)]
+    curves = [*_efforts(held, rest, "holding"), *_pin_forces(held, rest)]
     return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
 
 
 def mobility_of(mechanism: Mechanism) -> int:
-    """Return the number of degrees of freedom that the motors leave."""
+    """Return the number of degrees of freedom that motors leave."""
     return 3 * len(mechanism.bodies) - int(close(mechanism, 0.0).rank)
 
 
-def _efforts(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
+def effort_name(name: str, driver: Driver, kind: str) -> str:
+    """Return the name of the curve of a driver's "driving" or "holding" torque or force."""
+    return f"{name}: {kind} {'torque' if driver.effort_unit == 'N m' else 'force'}"
+
+
+def _efforts(mechanism: Mechanism, run: StateHistory, kind: str) -> list[JsonObject]:
     drivers = mechanism.drivers
-    return [_curve(f"{name}: effort", drivers[name].effort_unit, effort) for name, effort in efforts(mechanism, run).items()]
+    return [
+        _curve(effort_name(name, drivers[name], kind), drivers[name].effort_unit, values)
+        for name, values in efforts(mechanism, run).items()
+    ]
 
 
 def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
-    """Return curves of the forces at pins; of redundant constraints they are the share of least norm, and marked."""
-    known = unique_pin_forces(mechanism, run)
+    """Return curves of the forces at pins; forces that are not unique are marked, and have the least norm."""
+    unique = unique_pin_forces(mechanism, run)
     return [
-        _curve(f"{pin}: force on {body}", "N", np.hypot(*np.asarray(load)[:, :2].T), known[pin][body])
+        _curve(f"{pin}: force on {body}", "N", np.hypot(*np.asarray(load)[:, :2].T), unique[pin][body])
         for pin, bodies in pin_reactions(mechanism, run).items()
         for body, load in bodies.items()
     ]
 
 
 def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:
-    """Return the rate of a driver's coordinate (rad/s, m/s)."""
     import jax
 
     return np.asarray(jax.vmap(jax.grad(lambda t: driver.motion(t)))(ts))
 
 
 def _curve(name: str, unit: str, values: Any, unique: bool = True) -> JsonObject:
-    """Return a curve; a value that is not a number is null."""
+    """Return a curve as JSON, with null for NaN."""
     numbers = [x if math.isfinite(x) else None for x in np.asarray(values, float).tolist()]
     return {"name": name, "unit": unit, "values": numbers, "unique": unique}

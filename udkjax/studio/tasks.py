@@ -1,4 +1,4 @@
-"""Tasks of the studio's second processes: read, compile, diagnose and export drawings. Arguments and results are plain data."""
+"""Tasks of the studio's worker processes: read, compile, diagnose and export drawings. Arguments and results are plain data."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,13 +15,13 @@ from udkjax.studio.drawn_scenes import drawing_text_of
 from udkjax.studio.exports import exported
 from udkjax.studio.findings import examine
 from udkjax.studio.limits import RefusedError, require_few, require_size
-from udkjax.studio.shown_runs import duration_of, recorded_motion
+from udkjax.studio.shown_runs import duration_of, effort_name, recorded_motion
 from udkjax.studio.templates import TEMPLATES, template_text
 from udkjax.studio.text_edits import merge_document, read_document
 
 
 def list_templates() -> JsonObject:
-    """Return the names and titles of the drawings that one may start from."""
+    """Return the names and titles of the templates."""
     return {"templates": [{"name": name, "title": title} for name, (title, _) in TEMPLATES.items()]}
 
 
@@ -33,7 +33,7 @@ def open_template(name: str) -> JsonObject:
 
 
 def open_text(text: str) -> JsonObject:
-    """Return the text of a scene file as a drawing, with its tables; one of bodies and joints is drawn anew."""
+    """Return a scene file as the text and tables of a drawing; a scene of bodies and joints (format 1) is converted."""
     problems: list[str] = []
     drawn = text
     try:
@@ -47,11 +47,11 @@ def open_text(text: str) -> JsonObject:
 
 
 def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, engine: str = "") -> JsonObject:
-    """Return the text and tables of a drawing, its mistakes, and what the page needs to move it.
+    """Return the text and tables of a drawing, its mistakes, and the data with which the page moves it.
 
     Args:
-        text: of the file; where a document is given, that which the document came from.
-        document: the tables as they were changed in the page.
+        text: text of the file; with `document`, the text before the document was changed.
+        document: tables as changed in the page.
         engine: "wasm" asks for the engine as data for the page, with the places of pins as parameters; "recorded" for a motion
             that is computed here, for a browser without WebAssembly.
     """
@@ -60,11 +60,11 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
         if document is not None:
             text = merge_document(text, document)
         found = read_document(text)
-        with np.errstate(over="ignore", invalid="ignore"):  # it is said below
+        with np.errstate(over="ignore", invalid="ignore"):  # reported below
             mechanism = loads(text)
             if not np.isfinite(analyse(mechanism).length):
                 raise SceneError(
-                    ["the characteristic length is infinite: look at masses that are nearly zero, and places that are not"]
+                    ["the characteristic length is infinite: a mass is too close to zero, or a place is too far away"]
                 )
         if not isinstance(mechanism.drawing, Drawing):
             raise SceneError(["format: the studio draws files of format 2"])
@@ -77,7 +77,7 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
 
 
 def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
-    """Return the engine of a drawing for the page, and that of a hand, which nothing drives; or `why` there is none."""
+    """Return the page's engine of a drawing and, for pulling, one without motors (`hand`); or `why` there is none."""
     pins = list(document.get("pins", {}))
     names = [f"pin.{pin}" for pin in pins]
     try:
@@ -91,7 +91,7 @@ def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
 
 
 def _undriven(document: JsonObject) -> JsonObject:
-    """Return a drawing that nothing drives: the pins of cylinders stay in use, by dampers that do nothing."""
+    """Return a drawing without driven motions; dampers without damping keep the pins of cylinders in use."""
     motors = document.get("motor", [])
     idle = [{"between": motor["between"], "damping": 0} for motor in motors if "between" in motor]
     torques = [motor for motor in motors if "torque" in motor]
@@ -106,7 +106,7 @@ def _read(text: str) -> JsonObject | None:
 
 
 def scene_of(mechanism: Mechanism) -> JsonObject:
-    """Return the data by which the page shows a mechanism's positions and energies."""
+    """Return the data with which the page shows a mechanism's positions and energies."""
     analysis = analyse(mechanism)
     bodies = mechanism.bodies.values()
     return {
@@ -117,12 +117,15 @@ def scene_of(mechanism: Mechanism) -> JsonObject:
         "gravity": np.asarray(mechanism.gravity).tolist(),
         "length": float(analysis.length),
         "duration": duration_of(mechanism),
-        "drivers": list(mechanism.drivers),
+        "drivers": [
+            {"name": name, "effort": effort_name(name, driver, "driving"), "unit": driver.effort_unit}
+            for name, driver in mechanism.drivers.items()
+        ],
     }
 
 
 def diagnose_drawing(text: str, about: str = "structure") -> JsonObject:
-    """Return the findings about a drawing; `about` is one of the subjects of findings.py."""
+    """Return the findings about a drawing; `about` is a subject of findings.py."""
     try:
         require_few(read_document(text))
         return examine(loads(text), about)
@@ -131,7 +134,7 @@ def diagnose_drawing(text: str, about: str = "structure") -> JsonObject:
 
 
 def export(text: str, suffix: str) -> JsonObject:
-    """Return a drawing in another form, as hexadecimal bytes."""
+    """Return an export of a drawing as hexadecimal bytes."""
     try:
         require_few(read_document(text))
         mechanism = loads(text)

@@ -1,4 +1,4 @@
-"""Templates: drawings that one may start from. They are those of the library, drawn anew from its mechanisms."""
+"""Templates: drawings to start from, made from the mechanisms of the library."""
 
 from collections.abc import Callable, Mapping
 
@@ -9,12 +9,12 @@ Maker = Callable[[], Mechanism]
 TEMPLATES: Mapping[str, tuple[str, Maker]] = {
     "four_bar": ("Four-bar linkage", library.four_bar),
     "slider_crank": ("Slider-crank", library.slider_crank),
-    "parallelogram": ("Five-bar parallelogram: one link too many", library.parallelogram),
-    "peaucellier": ("Peaucellier's straight line", library.peaucellier),
+    "parallelogram": ("Five-bar parallelogram with a redundant link", library.parallelogram),
+    "peaucellier": ("Peaucellier straight-line linkage", library.peaucellier),
     "planetary_gear": ("Planetary gear", library.planetary_gear),
     "scissor_lift": ("Scissor lift", library.scissor_lift),
     "excavator": ("Excavator", library.excavator),
-    "andrews_squeezer": ("Andrews' squeezer", library.andrews_squeezer),
+    "andrews_squeezer": ("Andrews' squeezer mechanism", library.andrews_squeezer),
     "n_four_bar": ("Four-bars in a row", library.n_four_bar),
     "elliptic_trammel": ("Elliptic trammel", library.elliptic_trammel),
     "double_pendulum": ("Double pendulum", library.double_pendulum),
@@ -26,5 +26,5 @@ TEMPLATES: Mapping[str, tuple[str, Maker]] = {
 
 
 def template_text(name: str) -> str:
-    """Return the text of a template."""
+    """Return a template as the text of a drawing."""
     return drawing_text_of(TEMPLATES[name][1]())

@@ -1,4 +1,4 @@
-"""Scene files as plain documents, and back: a changed document is written into the text it came from, whose comments stay."""
+"""Scene files as plain documents, and back: a changed document is merged into its original text, which keeps its comments."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,28 +16,28 @@ from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]
 NEW_TABLES = ("pins", "velocities")  # tables that get a header of their own
-HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries get one each
+HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries each get a header
 
 
 def read_document(text: object) -> Document:
-    """Return the tables of a text as JSON holds them; raise `SceneError`, or `RefusedError` where it is too long."""
+    """Return the tables of a text as JSON values; raise `SceneError` if it cannot be read, `RefusedError` if it is too long."""
     try:
         document = _plain(parse_toml(require_size(text), "", SceneError))
     except RecursionError:
-        raise SceneError(["tables lie within one another too deeply"]) from None
+        raise SceneError(["tables are nested too deeply"]) from None
     require_few(document)
     return document
 
 
 def merge_document(text: str, document: Mapping[str, Any]) -> str:
-    """Return a text whose tables are those of a document, changed in as few places as can be, with its comments.
+    """Return a text with the tables of a document, changed in as few places as possible, with its comments.
 
     Args:
-        text: text that the document came from, or empty.
-        document: tables, lists, texts, numbers and truth values.
+        text: original text of the document, or empty.
+        document: tables, lists, strings, numbers and booleans.
 
     Raises:
-        SceneError: the text is no TOML, or the document holds what TOML has no place for.
+        SceneError: the text is not TOML, or a value of the document cannot be written as TOML.
     """
     require_few(document)
     try:
@@ -49,7 +49,7 @@ def merge_document(text: str, document: Mapping[str, Any]) -> str:
 
 
 def _plain(value: object) -> Any:
-    """Return a value of a TOML file as JSON holds it; what is not finite, and times of day, as a text."""
+    """Return a value of a TOML file as a JSON value; numbers that are not finite, and dates and times, become strings."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -64,12 +64,11 @@ def _unwrapped(item: Any) -> Any:
 
 
 def _merge_table(old: Any, new: Mapping[str, Any], depth: int = 0) -> None:
-    """Change a table of a text into a new one, key by key."""
     for key in [key for key in old if key not in new]:
         del old[key]
     for key, value in new.items():
         if value is None:
-            raise TypeError(f"{key} is nothing")
+            raise TypeError(f"{key} has no value")
         if key not in old:
             _add(old, key, _fresh(key, value, depth))
         elif _unwrapped(old[key]) == value and type(_unwrapped(old[key])) is not bool:
@@ -83,7 +82,7 @@ def _merge_table(old: Any, new: Mapping[str, Any], depth: int = 0) -> None:
 
 
 def _add(table: Any, key: str, item: Any) -> None:
-    """Add a key to a table, before the comments at its end: these speak of what follows."""
+    """Add a key to a table, before the comments at its end, which belong to the next table."""
     body = table.value.body if isinstance(table, Table) else []
     tail = []
     while body and body[-1][0] is None:
@@ -101,7 +100,7 @@ def _holds_tables(item: Any) -> bool:
 
 
 def _merge_list(old: Any, new: Sequence[Mapping[str, Any]]) -> None:
-    """Change a list of tables: those of the same name or content are the same, and keep their place and comments."""
+    """Change a list of tables; tables with the same name or content keep their place and comments."""
     before = [_mark(_unwrapped(table)) for table in old]
     after = [_mark(table) for table in new]
     offset = 0
@@ -118,7 +117,7 @@ def _merge_list(old: Any, new: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _mark(table: Mapping[str, Any]) -> str:
-    """Return the key of a table: its name, or else all of it."""
+    """Return the key by which a table is recognized: its name, or else its whole content."""
     return f"name {table['name']}" if "name" in table else repr(sorted(table.items(), key=lambda item: item[0]))
 
 
@@ -142,7 +141,6 @@ def _fresh_table(table: Mapping[str, Any], indent: str = "") -> Table:
 
 
 def _inline(value: Any) -> Any:
-    """Return a value on one line."""
     if isinstance(value, Mapping):
         found = tomlkit.inline_table()
         for key, item in value.items():

@@ -1,8 +1,7 @@
-"""A second process that reads, compiles and diagnoses drawings.
+"""A worker process that reads, compiles and diagnoses drawings.
 
-Requests that take too long end with it, and the page stays served.
-
-Requests and answers are JSON, so that nothing of a scene is ever unpickled.
+A request that takes too long is ended with its process, while the server keeps running. Requests and answers are JSON, so that
+nothing from a scene is ever unpickled.
 """
 
 import json
@@ -17,11 +16,11 @@ from typing import Any
 from udkjax.studio.limits import RefusedError
 
 TASKS = "udkjax.studio.tasks"
-END_SECONDS = 5.0  # time for a process to end by itself
+END_SECONDS = 5.0  # time to wait for a killed process
 
 
 class Worker:
-    """Runs the functions of `tasks.py` one at a time in a process of its own, which is replaced where it takes too long."""
+    """Runs the functions of `tasks.py` one at a time in a process of its own, which is replaced if one takes too long."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -29,29 +28,28 @@ class Worker:
         self._connection: Connection | None = None
 
     def start(self) -> None:
-        """Start the process, so that it has imported what it needs when it is asked for the first time."""
+        """Start the process, so that its imports are done before the first request."""
         with self._lock:
             self._ensure()
 
     def call(self, name: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-        """Return the answer of a task; raise `RefusedError` where it refuses, fails, or takes longer than so many seconds."""
+        """Return the answer of a task; raise `RefusedError` if it refuses, fails, or takes longer than `seconds`."""
         with self._lock:
             connection = self._ensure()
             try:
                 connection.send_bytes(json.dumps({"name": name, "arguments": arguments}).encode())
                 if not connection.poll(seconds):
                     self._stop()
-                    raise RefusedError(504, f"it took longer than {seconds:g} s, and was stopped: draw something smaller")
+                    raise RefusedError(504, f"this took longer than {seconds:g} s and was stopped: simplify the drawing")
                 answer = json.loads(connection.recv_bytes())
             except (EOFError, OSError):
                 self._stop()
-                raise RefusedError(500, "the process that compiles ended unexpectedly; it is started again") from None
+                raise RefusedError(500, "the worker process ended unexpectedly and is started again") from None
         if "problem" in answer:
             raise RefusedError(answer["status"], answer["problem"], **answer["details"])
         return answer["result"]
 
     def close(self) -> None:
-        """End the process."""
         with self._lock:
             self._stop()
 
@@ -90,7 +88,7 @@ def _serve(connection: Connection) -> None:
             return
         except RefusedError as error:
             data = json.dumps({"problem": str(error), "status": error.status, "details": error.details}).encode()
-        except Exception as error:  # a defect of ours: said in the terminal, and in a line on the page
+        except Exception as error:  # a defect of the package: shown in full in the terminal, in one line on the page
             traceback.print_exc()
             problem = f"{type(error).__name__}: {error}"
             data = json.dumps({"problem": problem, "status": 500, "details": {}}).encode()

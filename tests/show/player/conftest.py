@@ -12,7 +12,7 @@ CRANK, ROD = 0.5, 1.5
 
 
 class Motion(NamedTuple):
-    """What `animate` needs of a run."""
+    """The attributes of a run that `animate` uses."""
 
     ts: np.ndarray
     q: np.ndarray
@@ -35,7 +35,7 @@ def slider_crank_run(ts):
 
 
 def pins_at(t):
-    """Where the pins O, P and B of the slider-crank are at time t (m)."""
+    """The positions (m) of the pins O, P and B of the slider-crank at time t."""
     x, y = CRANK * np.cos(OMEGA * t), CRANK * np.sin(OMEGA * t)
     return {"O": (0.0, 0.0), "P": (x, y), "B": (x + np.sqrt(ROD**2 - y**2), 0.0)}
 
@@ -62,7 +62,7 @@ def animation(slider_crank, run):
 
 @pytest.fixture(scope="session")
 def hostile():
-    """A mechanism whose texts are markup and script, and a run in which it stands."""
+    """A mechanism whose texts are markup and script."""
     names = [
         "</script><script>window.hit=1</script>",
         "<img src=x onerror='window.hit=2'>",
@@ -77,5 +77,5 @@ def hostile():
 
 @pytest.fixture(scope="module")
 def opened(browser, tmp_path_factory):
-    """Open an animation in a browser: a function of it, and of the window's properties."""
+    """A function that opens an animation in a browser."""
     return Pages(browser, tmp_path_factory)

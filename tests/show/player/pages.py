@@ -1,4 +1,4 @@
-"""Pages of the player in headless Chromium: opened, waited for, and looked at."""
+"""Pages of the player in headless Chromium: opening, waiting, screenshots."""
 
 import io
 from contextlib import contextmanager
@@ -8,12 +8,12 @@ from PIL import Image
 
 from udkjax.show.player.page import as_json, module
 
-REACH = 8  # px around a pin's centre within which its ring is
+REACH = 8  # px around the centre of a pin that contain its ring
 PLAYER = "document.getElementById('player').player"
 
 
 def until(page, condition):
-    """Wait for a condition; Playwright's own way evaluates text, which the page forbids."""
+    """Wait for a condition; Playwright's own function evaluates text, which the page forbids."""
     for _ in range(200):
         if page.evaluate(condition):
             return
@@ -30,14 +30,14 @@ def picture(page):
 
 
 def on_screen(page, panel, place):
-    """Where a place in metres is on the screen (px)."""
+    """The pixel of a place in metres."""
     x, y = page.evaluate(f"{PLAYER}.pixel({panel}, {place[0]}, {place[1]})")
     box = page.locator(".panel canvas").nth(panel).bounding_box()
     return np.array([box["x"] + x, box["y"] + y])
 
 
 def ring_centre(pixels, place, colour):
-    """The centroid of what has a colour near a place (px): the ring of a pin."""
+    """The centroid of a colour near a pixel: the centre of the ring of a pin."""
     x, y = np.rint(place).astype(int)
     rows, columns = slice(y - REACH, y + REACH + 1), slice(x - REACH, x + REACH + 1)
     weight = np.clip(1 - np.abs(pixels[rows, columns] - rgb(colour)).max(axis=2) / 100, 0, 1)
@@ -47,7 +47,7 @@ def ring_centre(pixels, place, colour):
 
 
 def plain(page):
-    """Hide what lies over pins."""
+    """Hide traces, which cover pins."""
     for name in ("Traces",):
         button = page.get_by_role("button", name=name)
         if button.get_attribute("aria-pressed") == "true":
@@ -74,14 +74,14 @@ window.listeners = listeners;
 
 
 class Pages:
-    """Open animations in a browser; windows of the usual kind share one page, which takes a third of the work."""
+    """Open animations in a browser; calls with default options share one page, which takes a third of the time."""
 
     def __init__(self, browser, folders):
         self.browser, self.folders, self.usual = browser, folders, []
 
     @contextmanager
     def __call__(self, animation, address="", script="", width=1000, height=700, color_scheme="light", **options):
-        """Show an animation, with what is behind its address; hold that it says no error and asks nobody else."""
+        """Show an animation, with a fragment of its address; require that it reports no error and contacts no server."""
         path = self.folders.mktemp("pages") / "page.html"
         animation.save(path)
         is_usual = not script and not options
@@ -115,7 +115,7 @@ class Pages:
 
     @contextmanager
     def widget(self, data):
-        """Show the widget in a page that has the interface of anywidget's model."""
+        """Show the widget in a page with the interface of anywidget's model."""
         path = self.folders.mktemp("pages") / "host.html"
         path.write_text(HOST.replace("SOURCE", as_json(module())).replace("DATA", as_json(data)), encoding="utf-8")
         page = self.browser.new_page()

@@ -1,4 +1,4 @@
-"""The player in headless Chromium: what is on the screen is where the closed form says, and everything can be operated."""
+"""The player in headless Chromium: the picture agrees with the closed form, and all controls work."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_pixels_are_where_the_closed_form_says(opened, animation, closed_form, t
         np.testing.assert_allclose(pixels[90, 500], rgb(THEMES[theme]["back"]), atol=1)
 
 
-def test_the_scale_is_the_same_in_both_directions_and_all_is_in_view(opened, animation):
+def test_the_scale_is_the_same_in_both_directions_and_everything_is_in_view(opened, animation):
     left, bottom, right, top = animation.data["bounds"]
     with opened(animation, width=390, height=844) as page:
         (x0, y0), (x1, y1) = on_screen(page, 0, (left, bottom)), on_screen(page, 0, (right, top))
@@ -37,7 +37,7 @@ def test_the_scale_is_the_same_in_both_directions_and_all_is_in_view(opened, ani
 
 def test_two_runs_move_in_step(opened, slider_crank, closed_form):
     one = closed_form.run(np.linspace(0, 2, 81))
-    ts = np.linspace(0, 2, 41)  # the same motion a quarter of a second later, at other instants
+    ts = np.linspace(0, 2, 41)  # the same motion a quarter of a second later, with other output times
     late = closed_form.run(ts + 0.25)
     animation = udk.animate(slider_crank, {"one": one, "late": Motion(ts=ts, q=late.q, v=late.v)}, measures=())
     with opened(animation) as page:
@@ -65,7 +65,7 @@ def test_it_plays_at_its_speed_and_pauses(opened, animation):
             }}"""
         )
         assert moved == pytest.approx(0.5 * seconds, abs=0.1)
-        page.keyboard.press("Space")  # the button has the focus, and takes it
+        page.keyboard.press("Space")  # goes to the focused button
         stopped = page.evaluate(f"{PLAYER}.time")
         page.wait_for_timeout(100)
         assert page.evaluate(f"[{PLAYER}.time, {PLAYER}.playing]") == [stopped, False]
@@ -108,17 +108,17 @@ def test_keys_and_scrubbing(opened, animation):
         page.mouse.click(strip["x"] + 12 + 0.25 * (strip["width"] - 80), strip["y"] + 70)
         assert time() == pytest.approx(0.5, abs=0.01)
         page.get_by_role("button", name="Names").click()
-        page.keyboard.press(" ")  # which would press the button again, if a click kept it focused
+        page.keyboard.press(" ")  # would press the button again if a click had left it focused
         assert page.evaluate(f"{PLAYER}.playing")
 
 
-def test_the_view_moves_zooms_and_comes_back(opened, animation):
+def test_the_view_moves_zooms_and_is_restored(opened, animation):
     with opened(animation) as page:
         before = on_screen(page, 0, (1, 0))
         page.mouse.move(*before)
         page.mouse.wheel(0, -400)
         page.wait_for_timeout(50)
-        np.testing.assert_allclose(on_screen(page, 0, (1, 0)), before, atol=1.0)  # what is under the pointer stays there
+        np.testing.assert_allclose(on_screen(page, 0, (1, 0)), before, atol=1.0)  # the point under the pointer stays there
         assert on_screen(page, 0, (1.5, 0))[0] > before[0] + 100
         page.mouse.down()
         page.mouse.move(*(before + [60, 30]), steps=4)
@@ -144,12 +144,12 @@ def test_dark_and_light_by_the_system_and_by_hand(opened, animation):
         np.testing.assert_allclose(back(), rgb(THEMES["dark"]["back"]), atol=1)
         page.emulate_media(color_scheme="light")
         np.testing.assert_allclose(back(), rgb(THEMES["light"]["back"]), atol=1)
-        page.get_by_role("button", name="dark or light").click()
+        page.get_by_role("button", name="switch between dark and light").click()
         np.testing.assert_allclose(back(), rgb(THEMES["dark"]["back"]), atol=1)
 
 
 def test_the_strip_shows_the_measure(opened, animation):
-    """Where the curve of the crank's angle, 4 t, meets the line of now: at half of its height at half of the time."""
+    """The curve of the crank's angle, 4 t, meets the line of the current time at half its height at half the time."""
     with opened(animation) as page:
         page.evaluate(f"{PLAYER}.seek(1.0)")
         strip = page.locator(".strip canvas").bounding_box()
@@ -172,9 +172,9 @@ def test_arrows_of_reactions(opened, slider_crank, run):
         assert with_arrows > red() + 100
 
 
-def test_modes_swing(opened, slider_crank):
+def test_modes_oscillate(opened, slider_crank):
     q, shape = np.asarray(slider_crank.q0), np.zeros((1, 3, 3))
-    shape[0, 2, 0] = 1.0  # the slider alone moves along x
+    shape[0, 2, 0] = 1.0  # only the slider moves, along x
     animation = udk.animate_modes(slider_crank, q, shape, [1.25])
     with opened(animation) as page:
         assert page.locator("figcaption").text_content() == "mode 1 1.25 Hz"
@@ -218,7 +218,7 @@ def test_a_frame_in_another_page(browser, animation):
 
 
 def test_the_widgets_module_follows_its_model(opened, animation):
-    """In a page that has the interface of anywidget's model; test_notebook.py runs it in a real notebook."""
+    """In a page with the interface of anywidget's model; test_notebook.py runs the widget in a real notebook."""
     with opened.widget(animation.data) as page:
         player = "document.getElementById('one').player"
         assert page.evaluate(f"{player}.time") == 0.5

@@ -1,4 +1,4 @@
-"""Live pages as data: sliders, what follows them, and what cannot be live."""
+"""Live pages as data: sliders, updates of symbols, and runs that cannot be live."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,9 @@ import udkjax as udk
 from tests.show.player.conftest import Motion
 from udkjax.integrate.portable import drawn_points
 from udkjax.scene.checks import SceneError
-from udkjax.show.player.followers import followers
 from udkjax.show.player.live_parameters import label_of, section_of, sliders_of, usual_range
 from udkjax.show.player.player_data import run_record
+from udkjax.show.player.symbol_updates import symbol_updates
 
 COUPLER_POINT = udk.Drawing(
     pins={"A": (0, 0), "B": (1, 2), "C": (3, 2), "D": (4, 0), "P": (2, 3)},
@@ -19,7 +19,7 @@ COUPLER_POINT = udk.Drawing(
         "rocker": udk.Link(["C", "D"], mass=1),
     },
     ground=["A", "D"],
-)  # P is a pin of no other link
+)  # P is on the coupler only
 
 
 @pytest.fixture(scope="module")
@@ -35,20 +35,20 @@ def test_sliders_are_of_the_numbers_that_are_named(live, slider_crank):
     assert all(s["low"] <= s["value"] <= s["high"] for s in sliders)
     everything = sliders_of(slider_crank, True)
     assert {"gravity[1]", "link.rod.mass", "pin.P.velocity[1]"} < {s.name for s in everything}
-    assert not any(s.name.startswith(("body.", "joint.")) for s in everything)  # these follow from the drawing
+    assert not any(s.name.startswith(("body.", "joint.")) for s in everything)  # these are determined by the drawing
 
 
-def test_ranges_are_as_wanted_or_by_the_unit(slider_crank):
+def test_ranges_are_given_or_depend_on_the_unit(slider_crank):
     (slider,) = sliders_of(slider_crank, {"motor.motor.speed": (1.0, 9.0)})
     assert (slider.low, slider.high) == (1.0, 9.0)
     assert [s.high for s in sliders_of(slider_crank, {"pin.P": (-1.0, 2.5)})] == [2.5, 2.5]
-    with pytest.raises(ValueError, match=r"5 to 9 of motor\.motor\.speed does not hold its value 4"):
+    with pytest.raises(ValueError, match=r"5 to 9 of motor\.motor\.speed does not contain its value 4"):
         sliders_of(slider_crank, {"motor.motor.speed": (5.0, 9.0)})
     assert usual_range("body.a.mass", "kg", 2.0, 1.0, 1.0) == (0.2, 8.0)
     assert usual_range("joint.a.points[0][1]", "m", 2.0, 1.0, 1.0) == (1.5, 2.5)
     assert usual_range("force.s.length", "m", 2.0, 1.0, 1.0) == (0.2, 8.0)
     assert usual_range("body.a.angle", "rad", 0.0, 1.0, 1.0) == (-np.pi, np.pi)
-    assert usual_range("pin.B.velocity[1]", "m/s", 2.5e-16, 2.0, 3.0) == (-6.0, 6.0)  # rounding, of what is zero
+    assert usual_range("pin.B.velocity[1]", "m/s", 2.5e-16, 2.0, 3.0) == (-6.0, 6.0)  # zero but for rounding
 
 
 @pytest.mark.parametrize(
@@ -63,13 +63,13 @@ def test_ranges_are_as_wanted_or_by_the_unit(slider_crank):
         ("driver.crank.motion.coefficients[1]", "crank motion coefficients 2", "Drivers"),
     ],
 )
-def test_what_a_slider_is_called(name, label, section):
+def test_a_slider_has_a_label_and_a_section(name, label, section):
     assert (label_of(name), section_of(name)) == (label, section)
 
 
 @pytest.mark.parametrize("mechanism", [udk.library.four_bar(), COUPLER_POINT.mechanism()], ids=["four-bar", "coupler point"])
-def test_symbols_follow_the_numbers_that_they_are_made_of(mechanism):
-    """With other numbers every place that follows is where the symbols of the changed mechanism have it."""
+def test_symbols_are_updated_with_the_numbers_that_they_are_made_of(mechanism):
+    """With other numbers every updated place is that of the symbols of the changed mechanism."""
     other = mechanism.with_parameters({"pin.C": [2.9, 1.8]})
 
     def symbols(m):
@@ -79,7 +79,7 @@ def test_symbols_follow_the_numbers_that_they_are_made_of(mechanism):
 
     (record, before, _), (_, after, traces) = symbols(mechanism), symbols(other)
     count = sum(np.size(x) for x in mechanism.numbers)
-    rows = followers(mechanism, record, before, count)
+    rows = symbol_updates(mechanism, record, before, count)
     numbers = np.concatenate([np.ravel(x) for x in (*other.numbers, *(points for _, points in drawn_points(other)))])
     assert len(rows["frames"]) > 10 and len(rows["points"]) > 10
     for k, which, x, y in rows["frames"]:
@@ -115,11 +115,11 @@ def test_the_tolerances_are_those_of_the_run(live):
     exact = udk.simulate(pendulum, np.linspace(0.0, 0.5, 6), rtol=1e-11, atol=1e-10)
     settings = udk.animate(pendulum, exact, measures=(), live=["gravity"]).data["live"]["engines"][0]["settings"]
     assert (settings["rtol"], settings["atol"]) == (1e-11, 1e-10)
-    settings = live.data["live"]["engines"][0]["settings"]  # of a motion that knows none
+    settings = live.data["live"]["engines"][0]["settings"]  # the motion has none
     assert (settings["rtol"], settings["atol"]) == (1e-8, 1e-8)
 
 
-def test_runs_of_one_mechanism_share_an_engine_and_a_number_of_one_alone_has_a_slider(slider_crank, run):
+def test_runs_of_a_mechanism_share_an_engine_and_a_parameter_of_a_single_run_has_a_slider(slider_crank, run):
     pendulum = udk.library.simple_pendulum()
     runs = {"one": run, "two": run, "other": udk.simulate(pendulum, np.linspace(0.0, 0.5, 6))}
     mechanisms = {"one": slider_crank, "two": slider_crank, "other": pendulum}
@@ -133,23 +133,23 @@ def test_the_torque_of_a_driver_is_among_its_measures(live):
     assert "torque of motor" in [m["name"] for m in live.data["runs"][0]["measures"]]
 
 
-def test_what_cannot_be_live_says_why(slider_crank, run):
+def test_a_run_that_cannot_be_live_is_refused_with_the_reason(slider_crank, run):
     with pytest.raises(SceneError, match=r"pin\.Q"):
         udk.animate(slider_crank, run, live=["pin.Q"])
     unstable = udk.simulate(slider_crank, np.linspace(0.0, 0.1, 3), stabilization=None, drift_tol=1.0)
-    with pytest.raises(ValueError, match="solves by projection, and the run has stabilization=NoneType"):
+    with pytest.raises(ValueError, match="simulates with projection, but the run has stabilization=NoneType"):
         udk.animate(slider_crank, unstable, live=True)
 
 
 def test_the_events_of_a_live_run_are_those_of_its_simulation(slider_crank):
     passes = udk.Event(lambda t, at: at["slider"].x - 1.3, udk.Log(), name="passes")
     with_events = udk.simulate(slider_crank, np.linspace(0.0, 1.0, 21), events=passes)
-    with pytest.raises(ValueError, match="the run has events, whose conditions a page needs: give `animate` the same"):
+    with pytest.raises(ValueError, match="the run has events, whose conditions the page needs: give `animate` the same"):
         udk.animate(slider_crank, with_events, live=["gravity"])
     without = udk.simulate(slider_crank, np.linspace(0.0, 1.0, 21))
     with pytest.raises(ValueError, match="was not simulated with the events passes"):
         udk.animate(slider_crank, without, live=["gravity"], events=[passes])
-    with pytest.raises(ValueError, match="only a live page"):
+    with pytest.raises(ValueError, match="needed only for a live page"):
         udk.animate(slider_crank, with_events, events=passes)
     shown, happened = udk.animate(slider_crank, with_events).data["runs"][0]["events"], with_events.events
     assert happened is not None and len(happened.time) > 0
@@ -167,7 +167,7 @@ def test_ten_seconds_with_events_are_simulated_where_no_run_is_given():
 
 
 def test_numbers_are_shown_in_the_units_of_the_drawing(slider_crank):
-    """60 rpm and 30 mm of a drawing in mm and degrees, whose own numbers are in SI units, as those of a scene without units."""
+    """60 rpm and 30 mm in a drawing in mm and degrees; the values of sliders are in SI units, as are scenes without units."""
     pins, links = {"O": (0, 0), "A": (30, 40)}, {"crank": {"pins": ["O", "A"], "mass": 2}}
     motors, wanted = {"motor": {"pin": "O", "speed": "60 rpm"}}, ["motor.motor.speed", "pin.A", "link.crank.mass"]
     units = {"length": "mm", "angle": "deg"}

@@ -1,4 +1,4 @@
-"""Live pages in headless Chromium: they simulate what Python simulates, and sliders, a hand and addresses do what they say."""
+"""Live pages in headless Chromium: they simulate as Python does, and sliders, pulling and addresses work."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def note(page):
 
 
 def move(page, label, value):
-    """Move a slider as a hand would, and wait for the picture."""
+    """Move a slider as a user does, and wait for the next frame."""
     number = page.get_by_role("spinbutton", name=f"{label}, number", exact=True)
     number.fill(str(value))
     number.press("Enter")
@@ -62,8 +62,8 @@ def show_all(page):
 
 
 @every_scene
-def test_the_motion_is_the_one_that_python_simulates(opened, name):
-    """With other numbers; and its energies and torques, too."""
+def test_the_motion_is_that_of_python(opened, name):
+    """With other numbers, and with energies and torques."""
     mechanism, ts = getattr(udk.library, name)(), TS * (0.015 if name == "andrews_squeezer" else 1.0)
     given = {"gravity[1]": -6.0} | ({"motor.motor.speed": 3.0} if name == "slider_crank" else {})
     animation = udk.animate(mechanism, udk.simulate(mechanism, ts), live=list(given))
@@ -83,8 +83,8 @@ def test_the_motion_is_the_one_that_python_simulates(opened, name):
             assert_allclose(shown, values, rtol=0, atol=1e-6 * max(1.0, float(np.abs(values).max())))
 
 
-def test_samples_of_loads_and_motions_hold_between_their_times(opened):
-    """A motor that follows a spline, against a torque that is held between samples: both are in what it has to exert."""
+def test_samples_of_loads_and_motions_are_held_between_their_times(opened):
+    """A motor with a spline motion, loaded by a torque that is held between samples: both determine its driving torque."""
     knots = np.linspace(0.0, 2.0, 6)
     mechanism = udk.Mechanism(
         {"arm": udk.Body(2.0, 0.3, (0.5, 0.0))},
@@ -92,7 +92,7 @@ def test_samples_of_loads_and_motions_hold_between_their_times(opened):
         {"motor": udk.Driver(("ground", "arm"), "angle", udk.Spline(knots, 0.4 * np.sin(2 * knots)))},
         {"brake": udk.Torque(("ground", "arm"), udk.Held([1.0, -2.0, 3.0], dt=0.6))},
     )
-    ts = TS + 1e-3  # beside the samples
+    ts = TS + 1e-3  # next to the samples
     animation = udk.animate(mechanism, udk.simulate(mechanism, ts), live=["gravity[1]", "body.arm.mass"])
     other = mechanism.with_parameters({"gravity[1]": -3.0, "body.arm.mass": 1.5})
     run = udk.simulate(other, ts)
@@ -119,7 +119,7 @@ def test_arrows_of_forces_are_those_of_the_new_motion(opened, slider_crank):
 
 
 @pytest.mark.slow
-def test_forces_that_redundant_joints_share_are_not_shown_of_a_new_motion(opened):
+def test_forces_that_are_not_unique_are_not_shown_for_a_new_motion(opened):
     mechanism = udk.library.parallelogram()
     with opened(udk.animate(mechanism, udk.simulate(mechanism, TS), live=["gravity"], reactions=True, measures=())) as page:
         button = page.get_by_role("button", name="Reactions")
@@ -155,9 +155,9 @@ def test_events_happen_at_new_times_while_a_slider_moves(opened, with_events, sl
             assert_allclose([event["t"] for event in shown], expected.time, rtol=0, atol=1e-9)
             alive = np.isfinite(run.q).all((1, 2))
             q = np.asarray(run.q)[alive].reshape(alive.sum(), -1)
-            if not alive.all():  # the page shows the state at the event, too
-                assert "turned stops it" in note(page) and page.locator(".note.bad").count() == 0
-                assert page.evaluate(f"{LIVE}.player.data.end") == pytest.approx(float(expected.time[-1]))  # so does the timeline
+            if not alive.all():  # the page also shows the state at the event
+                assert "stopped by turned" in note(page) and page.locator(".note.bad").count() == 0
+                assert page.evaluate(f"{LIVE}.player.data.end") == pytest.approx(float(expected.time[-1]))  # the timeline's end
                 q = np.vstack([q, np.ravel(expected.q_before[-1])])
             else:
                 assert f"{len(shown)} event" in note(page)
@@ -167,7 +167,7 @@ def test_events_happen_at_new_times_while_a_slider_moves(opened, with_events, sl
 
 
 def test_events_are_marked_on_the_timeline(opened, with_events):
-    """In the player of a recorded run as well; and who comes by one reads its name."""
+    """Also in the player of a recorded run; the name of the event that has just happened is shown."""
     _, animation = with_events
     with opened(animation) as page:
         plain(page)
@@ -184,8 +184,8 @@ def test_events_are_marked_on_the_timeline(opened, with_events):
         assert page.locator(".happened").text_content() == ""
 
 
-def test_conditions_that_cross_zero_together_are_all_noted(opened):
-    """And one that is zero at the start, and rises: it does not cross."""
+def test_conditions_that_cross_zero_together_are_all_recorded(opened):
+    """A condition that is zero at the start and rises does not cross."""
     pendulum = udk.library.simple_pendulum()
     body, start = pendulum.body_names[0], float(pendulum.q0[0, 2])
     conditions = {
@@ -206,7 +206,7 @@ def test_conditions_that_cross_zero_together_are_all_noted(opened):
         assert_allclose([e["t"] for e in shown], expected.time, rtol=0, atol=1e-9)
 
 
-SLOWING = udk.Event(lambda t, at: at["link"].omega + 1.0, udk.Log(), name="slowing")  # which an impact may jump over
+SLOWING = udk.Event(lambda t, at: at["link"].omega + 1.0, udk.Log(), name="slowing")  # an impact may jump across its zero
 # A ball on the floor hangs by a spring on a hook that goes up and down: it lies, is lifted, and falls. A box, which stands on its
 # left foot, falls on the right one, which lifts the left one.
 LIFTED = udk.Mechanism(
@@ -251,8 +251,8 @@ def test_impacts_are_those_of_the_new_motion(opened, name):
             assert alive.all() and len(q) == len(ts)
 
 
-def test_what_a_contact_does_that_is_no_program_yet_is_said(opened):
-    """To be held at rest beside another, and to be hit together with another."""
+def test_contacts_that_a_page_cannot_compute_are_reported(opened):
+    """Two contacts at rest, and two that are hit at once."""
     place = [0.5 * np.cos(0.1), 0.5 * np.sin(0.1) + 0.2]
     box = udk.Mechanism({"box": udk.Body(mass=1.0, inertia=1.0, position=place)})
     feet = [udk.Contact("box", point=[x, 0.0], name=name, restitution=0.5) for x, name in ((-0.5, "left"), (0.5, "right"))]
@@ -260,15 +260,15 @@ def test_what_a_contact_does_that_is_no_program_yet_is_said(opened):
     floors = [udk.Contact(name, name=name) for name in balls.body_names]
     for mechanism, events, words in (
         (box, feet, "left and right are hit at once"),
-        (balls, floors, "two has come to rest beside one"),
+        (balls, floors, "two has come to rest as well as one"),
     ):
         run = udk.simulate(mechanism, np.linspace(0.0, 3.0, 61), events=events, max_events=300)
         with opened(udk.animate(mechanism, run, live=["gravity[1]"], events=events)) as page:
             move(page, "gravity y", -8.0)
-            assert words in note(page) and "no program of a page yet" in note(page) and page.locator(".note.bad").count() == 1
+            assert words in note(page) and "a live page cannot" in note(page) and page.locator(".note.bad").count() == 1
 
 
-def test_a_hand_that_presses_on_a_stop_waits_there_until_it_draws_back(opened):
+def test_a_body_pulled_against_a_stop_stays_there_until_it_is_pulled_back(opened):
     events = [udk.JointLimit("A", -2.4, 0.5, restitution=0.5)]
     run = udk.simulate(PENDULUM, TS, events=events, max_events=300)
     with opened(udk.animate(PENDULUM, run, live=["gravity"], events=events, measures=())) as page:
@@ -284,7 +284,7 @@ def test_a_hand_that_presses_on_a_stop_waits_there_until_it_draws_back(opened):
         page.mouse.up()
 
 
-def test_a_hand_comes_by_events_and_is_not_stopped(opened, with_events):
+def test_a_pull_passes_events_and_is_not_stopped(opened, with_events):
     _, animation = with_events
     with opened(animation) as page:
         page.evaluate(f"{PLAYER}.seek(1.4)")
@@ -292,17 +292,17 @@ def test_a_hand_comes_by_events_and_is_not_stopped(opened, with_events):
         q = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.pose(1.4)]")).reshape(-1, 3)
         place = on_screen(page, 0, q[2, :2])
         drag(page, place, (place[0] + 4, place[1] - 40), hold=1200)
-        until(page, f"{PLAYER}.time > 1.7")  # beyond the event that stops
+        until(page, f"{PLAYER}.time > 1.7")  # beyond the event that stops a motion
         assert page.evaluate(happened)[-1]["name"] == "turned" and page.evaluate(f"{happened}.length") == before
         page.mouse.up()
 
 
-def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
+def test_a_slider_changes_the_picture(opened, live, slider_crank):
     with opened(live) as page:
         plain(page)
         show_all(page)
         move(page, "P x", 0.3)
-        assert "solved anew" in note(page)
+        assert "simulated in" in note(page)
         other = slider_crank.with_parameters({"pin.P[0]": 0.3})
         run = udk.simulate(other, TS)
         assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), atol=1e-7)
@@ -316,13 +316,13 @@ def test_a_slider_moves_what_is_drawn(opened, live, slider_crank):
 
 
 def test_a_slider_changes_all_runs_that_have_its_number(opened, slider_crank):
-    """Each keeps its own values of what nobody has moved, and a hand pulls at one of them."""
+    """Each run keeps its own values of sliders that were not moved, and one of them is pulled."""
     heavy = slider_crank.with_parameters({"link.rod.mass": 9.0})
     mechanisms = {"light": slider_crank, "heavy": heavy}
     runs = {label: udk.simulate(one, TS) for label, one in mechanisms.items()}
     with opened(udk.animate(mechanisms, runs, live=["link.rod.mass", "pin.P[0]"])) as page:
         page.evaluate(f"{LIVE}.change({{'pin.P[0]': 0.4}})")
-        assert "light: 2 s solved anew" in note(page) and "heavy: 2 s solved anew" in note(page)
+        assert "light: 2 s simulated in" in note(page) and "heavy: 2 s simulated in" in note(page)
         for k, one in enumerate(mechanisms.values()):
             other = one.with_parameters({"pin.P[0]": 0.4})
             shown = np.array(page.evaluate(f"[...{LIVE}.runs[{k}].run.q]")).reshape(len(TS), -1)
@@ -347,7 +347,7 @@ def test_a_slider_by_mouse_and_keys(opened, live):
         assert page.evaluate(f"{LIVE}.values[0]") > speed
 
 
-def test_loops_that_cannot_be_closed_are_said_and_the_last_motion_stays(opened):
+def test_loops_that_cannot_be_closed_are_reported_and_the_last_motion_stays(opened):
     mechanism = udk.library.parallelogram()
     with opened(udk.animate(mechanism, udk.simulate(mechanism, TS), live=["joint.A3.points"], measures=())) as page:
         before = shown_q(page)
@@ -356,27 +356,27 @@ def test_loops_that_cannot_be_closed_are_said_and_the_last_motion_stays(opened):
         assert page.locator(".note.bad").count() == 1
         assert_array_equal(shown_q(page), before)
         move(page, "A3 point 1 x", 2.0)
-        assert "solved anew" in note(page) and page.locator(".note.bad").count() == 0
+        assert "simulated in" in note(page) and page.locator(".note.bad").count() == 0
         assert_allclose(shown_q(page), before, atol=1e-4)
-        move(page, "A3 point 2 y", 0.01)  # three unequal links: the constraint that was redundant locks them
-        assert "0 degrees of freedom here, 1 at first" in note(page) or "do not close" in note(page)
+        move(page, "A3 point 2 y", 0.01)  # three unequal links: the formerly redundant constraint locks them
+        assert "Degrees of freedom: 0, 1 in the first motion" in note(page) or "do not close" in note(page)
 
 
 @pytest.mark.parametrize("apart", [3.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_rows_that_other_numbers_make_redundant_are_found(opened, apart):
-    """A bar whose third pin is misplaced cannot be mounted on three cranks, or not be moved; with the right place it can."""
+    """A bar with a misplaced third pin cannot be mounted on three cranks, or cannot move; in the right place it can."""
     name = "joint.B3.points[0][0]"
     sound = udk.library.parallelogram()
     stiff = sound.with_parameters({name: 1.0 + apart})
     still = Motion(ts=TS, q=np.tile(np.asarray(stiff.q0), (len(TS), 1, 1)), v=np.zeros((len(TS), 4, 3)))
     with opened(udk.animate(stiff, still, live={name: (0.0, 9.0)}, measures=())) as page:
         page.evaluate(f"{LIVE}.change({{{name!r}: 1.0}})")
-        assert "solved anew" in note(page)
+        assert "simulated in" in note(page)
         assert_allclose(shown_q(page), np.asarray(udk.simulate(sound, TS).q).reshape(len(TS), -1), rtol=0, atol=1e-6)
 
 
-def test_where_the_first_motion_failed_other_numbers_may_come_to_its_end(opened):
-    """A crank that a motor turns cannot turn fully with a short rod; with a longer one it can."""
+def test_other_numbers_may_complete_a_failed_motion(opened):
+    """A driven crank cannot make a full turn with a short rod, but can with a longer one."""
     drawing = udk.Drawing(
         pins={"O": (0.0, 0.0), "A": (0.5, 0.0), "B": (0.9, 0.3)},
         links={
@@ -415,7 +415,7 @@ def test_numbers_are_typed_in_the_units_of_the_drawing(opened):
         assert_allclose(turned, 3 * np.pi * TS[-1], atol=1e-6)
 
 
-def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
+def test_reset_restores_the_first_motion_to_the_bit(opened, live):
     with opened(live) as page:
         first, values = shown_q(page), page.evaluate(f"[...{LIVE}.values]")
         symbols = page.evaluate(f"JSON.stringify({LIVE}.runs[0].run.symbols)")
@@ -430,7 +430,7 @@ def test_reset_brings_the_first_motion_back_to_the_bit(opened, live):
         assert page.get_by_role("spinbutton", name="rod mass, number").input_value() == "1.5"
 
 
-def test_the_address_has_the_numbers(opened, live):
+def test_the_address_contains_the_numbers(opened, live):
     with opened(live) as page:
         show_all(page)
         move(page, "P x", 0.35)
@@ -464,7 +464,7 @@ def drag(page, start, end, hold):
     page.wait_for_timeout(hold)
 
 
-def test_a_hand_pulls_through_the_dynamics(opened, pendulum):
+def test_a_pull_acts_through_the_dynamics(opened, pendulum):
     mechanism, animation = pendulum
     with opened(animation) as page:
         total = measure(page, "kinetic energy") + measure(page, "potential energy")
@@ -478,7 +478,7 @@ def test_a_hand_pulls_through_the_dynamics(opened, pendulum):
         held = page.evaluate(
             f"({{t: {LIVE}.runs[0].hand.state.t, q: [...{LIVE}.runs[0].hand.state.q], spring: {LIVE}.runs[0].hand.spring}})"
         )
-        assert held["t"] > 0.3  # it is in time
+        assert held["t"] > 0.3  # in real time
         reached = np.array(held["q"]).reshape(-1, 3)[1, :2]
         assert np.linalg.norm(reached - [0.5, 0.4]) < 0.5 * np.linalg.norm(q[1, :2] - [0.5, 0.4])
         page.mouse.up()
@@ -486,9 +486,9 @@ def test_a_hand_pulls_through_the_dynamics(opened, pendulum):
         ts = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.ts]"))
         after = ts >= page.evaluate(f"{LIVE}.runs[0].run.ts[{LIVE}.runs[0].run.ts.length - 1]") - 1.9
         total = measure(page, "kinetic energy") + measure(page, "potential energy")
-        assert np.ptp(total[after]) < 1e-5 * max(1.0, np.abs(total).max())  # free again: nothing is added
+        assert np.ptp(total[after]) < 1e-5 * max(1.0, np.abs(total).max())  # after the release no energy is added
         assert measure(page, "violation").max() < 1e-9
-        # The motion behind the hand is that of Python from the same state.
+        # After the release the motion is that of Python from the same state.
         k = int(np.flatnonzero(after)[0])
         states = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.q]")).reshape(len(ts), -1, 3)
         rates = np.array(page.evaluate(f"[...{LIVE}.runs[0].run.v]")).reshape(len(ts), -1, 3)
@@ -496,7 +496,7 @@ def test_a_hand_pulls_through_the_dynamics(opened, pendulum):
         assert_allclose(states[k : k + 10], run.q, atol=1e-6)
 
 
-def test_beside_the_bodies_a_drag_moves_the_view(opened, pendulum):
+def test_a_drag_outside_the_bodies_moves_the_view(opened, pendulum):
     with opened(pendulum[1]) as page:
         before = on_screen(page, 0, (0, 0))
         box = page.locator(".panel canvas").bounding_box()
@@ -526,7 +526,7 @@ def test_a_finger_pulls(opened, pendulum):
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
-def test_the_whole_view_is_that_of_the_motion_that_is_shown(opened, live):
+def test_the_fitted_view_is_that_of_the_motion_shown(opened, live):
     with opened(live) as page:
         before = page.evaluate(f"{PLAYER}.live.player.data.bounds")
         page.evaluate(f"{LIVE}.change({{'pin.B[0]': 4.0}})")
@@ -538,14 +538,14 @@ def test_the_whole_view_is_that_of_the_motion_that_is_shown(opened, live):
         assert page.evaluate(f"{PLAYER}.live.player.data.bounds") == before
 
 
-def test_a_long_motion_is_solved_a_picture_at_a_time(opened, pendulum):
-    """With so few steps for each picture that it takes several; the motion is that of Python all the same."""
+def test_a_long_motion_is_simulated_frame_by_frame(opened, pendulum):
+    """With so few steps per frame that it takes several frames; the motion is still that of Python."""
     mechanism, animation = pendulum
     with opened(animation) as page:
         page.evaluate(f"{LIVE}.runs[0].steps = 9")
         script = f"{LIVE}.change({{'gravity[1]': -7.0}}); [{LIVE}.runs[0].run.ts.length, {LIVE}.panel.note.textContent]"
         count, words = page.evaluate(script)
-        assert 1 < count < len(TS) and "Solving" in words
+        assert 1 < count < len(TS) and "Simulating" in words
         until(page, f"{LIVE}.runs[0].job === null")
         run = udk.simulate(mechanism.with_parameters({"gravity[1]": -7.0}), TS)
         assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), atol=1e-6)
@@ -561,7 +561,7 @@ def test_markup_in_names_of_a_live_page_is_text(opened, hostile):
         assert any(label.startswith("<img src=x onerror='window") for label in labels)
 
 
-def test_without_webassembly_it_plays_what_was_recorded(opened, live):
+def test_without_webassembly_the_recorded_motion_is_played(opened, live):
     with opened(live, script="delete window.WebAssembly") as page:
         assert "no WebAssembly" in note(page) and "recorded" in note(page)
         assert page.get_by_role("slider", name="motor speed").is_disabled()
@@ -570,7 +570,7 @@ def test_without_webassembly_it_plays_what_was_recorded(opened, live):
 
 
 @pytest.mark.slow
-def test_it_is_readable_in_the_dark_and_on_a_telephone(opened, live):
+def test_the_page_is_readable_in_the_dark_theme_and_on_a_phone(opened, live):
     for width, height, scheme in ((1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")):
         with opened(live, width=width, height=height, color_scheme=scheme) as page:
             assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -586,7 +586,7 @@ def test_it_is_readable_in_the_dark_and_on_a_telephone(opened, live):
 
 
 def contrast(one, two):
-    """The ratio of the luminances of two colours, as the guidelines for accessible content define it."""
+    """The contrast ratio of two colours, as defined by WCAG."""
 
     def luminance(text):
         parts = np.array([int(part) for part in text[4:-1].split(",")]) / 255

@@ -1,4 +1,4 @@
-"""The widget in JupyterLab, in headless Chromium: it appears, plays, and follows Python."""
+"""The widget in JupyterLab, in headless Chromium: it appears, plays, and is controlled by Python."""
 
 import json
 import socket
@@ -29,7 +29,7 @@ CELLS = (
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """JupyterLab with a notebook, and its address."""
+    """The address of JupyterLab with a notebook."""
     pytest.importorskip("jupyterlab", reason="jupyterlab is not installed: pip install '.[browser]'")
     pytest.importorskip("anywidget", reason="anywidget is not installed: pip install '.[notebook]'")
     folder = tmp_path_factory.mktemp("lab")
@@ -80,13 +80,13 @@ def lab(tmp_path_factory):
 
 @pytest.fixture
 def notebook(browser, lab):
-    """The notebook in a page, and how one of its cells is run."""
+    """The notebook in a page, and a function that runs one of its cells."""
     page = browser.new_page(viewport={"width": 1200, "height": 1000})
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.goto(f"{lab}/doc/tree/motion.ipynb")
     page.locator(".jp-Notebook").wait_for(timeout=60_000)
-    page.get_by_text("| Idle").wait_for(timeout=60_000)  # the kernel is there
+    page.get_by_text("| Idle").wait_for(timeout=60_000)  # the kernel is ready
 
     def run_cell(k):
         page.locator(".jp-Notebook .jp-CodeCell").nth(k).locator(".cm-content").click()
@@ -109,7 +109,7 @@ def test_the_widget_plays_in_jupyterlab(notebook):
     widget.get_by_role("button", name="pause").click()
     run_cell(2)  # Python moves the player
     page.wait_for_function(f"Math.abs({player}.time - 1.25) < 1e-9")
-    page.evaluate(f"{player}.seek(0.75)")  # and the player tells Python
+    page.evaluate(f"{player}.seek(0.75)")  # the player reports to Python
     page.wait_for_timeout(500)
     run_cell(3)
     page.get_by_text("0.75", exact=True).wait_for(timeout=20_000)
@@ -118,7 +118,7 @@ def test_the_widget_plays_in_jupyterlab(notebook):
     frame.get_by_role("button", name="play").wait_for(timeout=60_000)
 
 
-def test_live_players_simulate_when_the_kernel_is_gone(notebook, lab):
+def test_live_players_simulate_without_a_kernel(notebook, lab):
     page, run_cell = notebook
     run_cell(0)
     for k in (4, 5):
@@ -133,4 +133,4 @@ def test_live_players_simulate_when_the_kernel_is_gone(notebook, lab):
         number = player.get_by_role("spinbutton", name="motor speed, number")
         number.fill("2")
         number.press("Enter")
-        player.get_by_text("10 s solved anew").wait_for(timeout=20_000)
+        player.get_by_text("10 s simulated in").wait_for(timeout=20_000)

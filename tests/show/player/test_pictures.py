@@ -1,4 +1,4 @@
-"""Pictures and films: what is drawn is where it must be."""
+"""Pictures and films: everything is drawn in the right place."""
 
 import json
 import re
@@ -18,11 +18,11 @@ from udkjax.show.player.sketch import THEMES, Sketch, view_of
 from udkjax.show.player.symbols import SYMBOLS, symbols_of
 
 INK = np.array([int(THEMES["light"]["ink"][k : k + 2], 16) for k in (1, 3, 5)])
-REACH = 7  # px around a pin's centre within which its ring is
+REACH = 7  # px around the centre of a pin that contain its ring
 
 
 def ring_centre(picture, place):
-    """The centroid of what has the colour of ink near a place (px): the centre of a pin."""
+    """The centroid of the ink near a pixel: the centre of a pin."""
     x, y = np.rint(place).astype(int)
     rows, columns = slice(y - REACH, y + REACH + 1), slice(x - REACH, x + REACH + 1)
     darkness = np.clip(1 - np.abs(np.asarray(picture, float)[rows, columns] - INK).max(axis=2) / 120, 0, 1)
@@ -53,7 +53,7 @@ def test_an_svg_has_its_pins_at_their_places(animation, closed_form, tmp_path):
 
 
 def test_arrows_of_a_picture_are_the_reactions(tmp_path):
-    """A chain of 3 kg and 1 kg hangs: its upper pin holds 4 kg, its lower one 1 kg, upwards on the body below."""
+    """A hanging chain of 3 kg and 1 kg: its upper pin carries 4 kg, its lower pin 1 kg, upwards on the body below."""
     bodies = {"upper": udk.Body(3.0, 0.1, position=[0.0, -0.5]), "lower": udk.Body(1.0, 0.1, position=[0.0, -1.5])}
     ends = [[0.0, -0.5], [0.0, 0.5]]
     joints = {"A": udk.Revolute(["ground", "upper"], [[0.0, 0.0], ends[1]]), "B": udk.Revolute(["upper", "lower"], ends)}
@@ -92,7 +92,7 @@ def test_a_gif_moves_as_long_as_the_run(animation, tmp_path):
         film.seek(10)
         later = np.asarray(film.convert("RGB"), float)
     assert np.abs(first - later).max() > 50
-    assert (later[0] == 255).all()  # the ground is as white as the page that the film is on
+    assert (later[0] == 255).all()  # the background is as white as a page
     with pytest.raises(ValueError, match="more than 1500: give a higher speed"):
         animation.save(tmp_path / "motion.gif", speed=0.001)
 
@@ -115,7 +115,7 @@ def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
 
 
 def painted_by_script(symbols, pose, view, folder):
-    """What the player's script paints: points or a centre, a radius, stroke and fill of each symbol."""
+    """Symbols as painted by the player's script: points or a centre, a radius, stroke and fill of each."""
     if (node := shutil.which("node")) is None:
         pytest.skip("there is no node")
     script = """
@@ -177,14 +177,14 @@ def test_every_kind_of_mark_is_drawn(tmp_path):
 
 
 def test_wrong_names_and_themes(animation, tmp_path):
-    with pytest.raises(ValueError, match=r"motion.bmp: an animation is written as .html"):
+    with pytest.raises(ValueError, match=r"motion.bmp: the suffix must be .html, .gif"):
         animation.save(tmp_path / "motion.bmp")
     with pytest.raises(ValueError, match="theme 'blue'"):
         animation.save(tmp_path / "pose.png", theme="blue")
 
 
 def assert_paths_of_slider_crank(paths, atol):
-    """The crank's pin goes round a circle, the wrist pin to and fro along a line (m)."""
+    """Require that the crank pin moves on a circle, and the wrist pin back and forth on a line (m)."""
     line, circle = sorted(paths, key=lambda path: np.ptp(path[:, 1]))
     np.testing.assert_allclose(np.hypot(*circle.T), 0.5, atol=atol)
     np.testing.assert_allclose([circle.min(axis=0), circle.max(axis=0)], [[-0.5, -0.5], [0.5, 0.5]], atol=1e-3)

@@ -1,4 +1,4 @@
-"""What the player is given, without a browser."""
+"""The data of the player, without a browser."""
 
 import json
 import re
@@ -47,14 +47,14 @@ def test_a_page_of_twenty_seconds_of_the_papers_linkage_is_small():
     sol = udk.simulate(mech, np.linspace(0, 20, 401))
     text = udk.animate(mech, sol, measures={"angle (rad)": np.asarray(sol.q)[:, 0, 2]}).html()
     assert len(text.encode()) < 90_000
-    assert "WebAssembly" not in text  # nothing in it solves
+    assert "WebAssembly" not in text  # the page does not simulate
     assert not re.search(r"(?:src|href|@import|url\()\s*=?\s*[\"']?(?:https?:)?//", text)
 
 
 def test_marks_of_each_kind_of_joint():
     gear = marks(udk.library.planetary_gear(), udk.library.planetary_gear().q0[None])
     wheels = [(m["body"], m["radius"], m["internal"]) for m in gear if m["kind"] == "wheel"]
-    assert wheels[0] == (-1, pytest.approx(0.4), True)  # the ring, behind all others
+    assert wheels[0] == (-1, pytest.approx(0.4), True)  # the ring is in the background
     assert sorted(wheels[1:]) == [(0, 0.2, False), (1, 0.1, False), (2, 0.1, False), (3, 0.1, False)]
     lift = udk.library.scissor_lift()
     found = marks(lift, lift.q0[None])
@@ -64,9 +64,9 @@ def test_marks_of_each_kind_of_joint():
     assert {"motor", "block", "spring", "rail"} <= {m["kind"] for m in marks(crank, crank.q0[None])}
 
 
-def test_a_rail_is_as_long_as_it_is_used(slider_crank, run):
+def test_a_rail_is_as_long_as_its_used_range(slider_crank, run):
     (rail,) = (mark for mark in marks(slider_crank, run.q) if mark["kind"] == "rail")
-    margin = 0.08 * 2.0  # of the size of the mechanism, at its first pose
+    margin = 0.08 * 2.0  # relative to the size of the mechanism in its first pose
     way = run.q[:, 2, 0] - float(slider_crank.joints["guide"].points[0, 0])
     np.testing.assert_allclose(rail["span"], [way.min() - margin, way.max() + margin], rtol=1e-6)
 
@@ -104,7 +104,7 @@ def test_bodies_are_drawn_through_further_points(slider_crank, run):
 
 
 def test_corners_of_plates_and_ends_of_bars():
-    inner = np.array([[0.0, 0], [2, 0], [0.5, 0.4], [0, 2]])  # the third is within the triangle of the others
+    inner = np.array([[0.0, 0], [2, 0], [0.5, 0.4], [0, 2]])  # the third is inside the triangle of the others
     corners, closed = corners_of(inner)
     assert closed and sorted(map(tuple, corners)) == [(0, 0), (0, 2), (2, 0)]
     ends, closed = corners_of(np.array([[1.0, 1], [0, 0], [3, 3]]))
@@ -112,7 +112,7 @@ def test_corners_of_plates_and_ends_of_bars():
     np.testing.assert_allclose(to_ground((1, 0), np.array([[3.0, 4.0, np.pi / 2]])), [[3, 5]], atol=1e-15)
 
 
-def test_points_that_hold_bodies_are_named_once():
+def test_attachments_of_bodies_are_listed_once():
     points = body_points(udk.library.parallelogram())
     np.testing.assert_allclose(points["ground"], [[0, 0], [1, 0], [2, 0]])
     assert len(points["coupler"]) == 3 and len(points["link1"]) == 2
@@ -138,7 +138,7 @@ def test_measures_are_those_of_the_equations(slider_crank, run):
     np.testing.assert_allclose(change.values, total - total[0], atol=1e-12)
     (own,) = measures_of(slider_crank, run, {"torque (N m)": {"a": run.ts, "b": 2 * run.ts}}, "b")
     assert (own.name, own.unit) == ("torque", "N m") and own.values[-1] == 4.0
-    with pytest.raises(ValueError, match="'energie' is not known: take violation, energy, rank"):
+    with pytest.raises(ValueError, match="'energie' is unknown: use violation, energy, rank"):
         measures_of(slider_crank, run, ("energie",), "")
     with pytest.raises(ValueError, match="has shape"):
         measures_of(slider_crank, run, {"torque": run.ts[:3]}, "")
@@ -156,15 +156,15 @@ def test_arrows_are_the_reactions():
     assert arrows["usual"] == pytest.approx(np.linalg.norm(expected))
 
 
-def test_arrows_say_which_forces_redundant_joints_share():
+def test_forces_shared_by_redundant_constraints_are_marked():
     mech = udk.library.parallelogram()
     run = Motion(ts=np.zeros(1), q=np.asarray(mech.q0)[None], v=np.zeros((1, 4, 3)))
-    assert reaction_arrows(mech, run)[2] == [False] * 6  # how the three links share the coupler's weight along them is open
+    assert reaction_arrows(mech, run)[2] == [False] * 6  # how the three links share the coupler's weight is indeterminate
     arrows = udk.animate(mech, run, measures=(), reactions=True).data["runs"][0]["reactions"]
     assert arrows["unique"] == [False] * 6
 
 
-def test_a_run_that_failed_is_shown_as_far_as_it_came(slider_crank, run):
+def test_a_failed_run_is_shown_up_to_its_failure(slider_crank, run):
     q = run.q.copy()
     q[50:] = np.nan
     broken = Motion(ts=run.ts, q=q, v=run.v, cause="not finite at t = 1.25 s")
@@ -172,7 +172,7 @@ def test_a_run_that_failed_is_shown_as_far_as_it_came(slider_crank, run):
     assert len(poses) == record["q"]["rows"] == 50 and "1.25 s" in record["note"]
     with pytest.warns(FailedRunWarning, match="'slow' failed: not finite"):
         assert "slow" in udk.animate(slider_crank, {"slow": broken}, measures=()).failures
-    with pytest.warns(FailedRunWarning, match="no position is known at"):  # of a motion that has no cause
+    with pytest.warns(FailedRunWarning, match="the position is not finite at t ="):  # a motion without a cause
         udk.animate(slider_crank, Motion(ts=run.ts, q=q, v=run.v), measures=())
     with pytest.raises(ValueError, match="has no state to show: not finite"):
         run_record(slider_crank, Motion(ts=run.ts, q=np.nan * q, v=run.v, cause=broken.cause), "", (), False, None)
@@ -186,9 +186,9 @@ def test_long_runs_are_thinned_out_and_stay_exact(slider_crank, closed_form):
         np.testing.assert_allclose(animation.pose(t)[0], closed_form.run([t]).q[0], atol=2e-5)
 
 
-def test_traces_are_pins_that_move_or_those_that_are_named(slider_crank, run):
+def test_traces_are_the_moving_pins_or_named_points(slider_crank, run):
     by_default = udk.animate(slider_crank, run, measures=()).data["runs"][0]["traces"]
-    assert len(by_default) == 2  # P on its circle and B on its line; O stands, and each is on two bodies
+    assert len(by_default) == 2  # P on its circle and B on its line, each on two bodies; O does not move
     named = udk.animate(slider_crank, run, measures=(), traces=("rod", "P")).data["runs"][0]["traces"]
     assert named == [[1, 0.0, 0.0], [1, -0.75, 0.0]]  # a pin is a point of the second body
     with pytest.raises(ValueError, match="trace 'Q': \"Q\" is neither a body nor a pin"):
@@ -196,7 +196,7 @@ def test_traces_are_pins_that_move_or_those_that_are_named(slider_crank, run):
 
 
 def test_a_plate_is_drawn_as_its_polygon_and_its_free_pins_are_traced():
-    """A bell crank has a corner that goes inwards; its end T is a pin of no other link."""
+    """A bell crank has a reentrant corner; its end T is on no other link."""
     corners = {"O": (0, 0), "S": (2, 0.5), "B": (0.5, 0.5), "T": (0.5, 2)}
     bent = udk.Drawing(pins=corners, links={"bent": udk.Link(list(corners), mass=1)}, ground=["O"]).mechanism()
     poses = np.stack([np.asarray(bent.q0), np.asarray(bent.q0)])
@@ -208,8 +208,8 @@ def test_a_plate_is_drawn_as_its_polygon_and_its_free_pins_are_traced():
     assert len(udk.animate(bent, still, measures=()).data["runs"][0]["traces"]) == 4
 
 
-def test_the_line_of_a_contact_is_drawn_where_it_is_hit():
-    """An incline to the left, on which a ball comes down: from the point that is nearest, with what is allowed to its left."""
+def test_the_line_of_a_contact_is_drawn_over_its_used_range():
+    """A ball falls on an incline; the line is drawn around the closest point, with the free side to its left."""
     ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(1.0, 2.0))})
     (event,) = udk.Contact("ball", through=(1.0, 0.0), normal=(1.0, 1.0)).expand(ball)
     assert isinstance(event.condition, Gap)
@@ -222,7 +222,7 @@ def test_the_line_of_a_contact_is_drawn_where_it_is_hit():
     assert floor["span"][0] < 0 < floor["span"][1] < 0.5
 
 
-def test_bounds_hold_every_pose(animation, run):
+def test_bounds_contain_every_pose(animation, run):
     left, bottom, right, top = animation.data["bounds"]
     assert left <= -0.499 and right >= 1.999 and bottom <= -0.499 and top >= 0.499
     assert right - left < 3.2 and top - bottom < 1.5
@@ -239,13 +239,13 @@ def test_several_runs_and_wrong_ones(slider_crank, run, closed_form):
         udk.animate(slider_crank, {})
 
 
-def test_a_mechanism_alone_stands_as_its_scene_says(slider_crank):
+def test_a_mechanism_without_a_run_is_shown_as_in_its_scene(slider_crank):
     animation = udk.animate(slider_crank, measures=())
     np.testing.assert_allclose(animation.pose()[0], slider_crank.q0, atol=2e-5)
     assert animation.data["start"] == animation.data["end"] == 0.0
 
 
-def test_modes_swing_about_their_pose(slider_crank):
+def test_modes_oscillate_about_their_pose(slider_crank):
     q, shapes = np.asarray(slider_crank.q0), np.zeros((2, 3, 3))
     shapes[0, 0, 2], shapes[1, 2, 0] = 7.0, -1e-3
     animation = udk.animate_modes(slider_crank, q, shapes, [0.5, 2.0])
@@ -261,7 +261,7 @@ def test_modes_swing_about_their_pose(slider_crank):
         udk.animate_modes(slider_crank, q, shapes[0])
 
 
-def test_texts_cannot_leave_their_place_in_a_page(hostile):
+def test_texts_cannot_break_out_of_the_page(hostile):
     text = udk.animate(hostile.mechanism, measures=()).html()
     assert text.count("<script") == 2 and text.count("</script>") == 2
     assert "<img" not in text and "\u2028" not in text and "<b on" not in text
@@ -272,12 +272,12 @@ def test_texts_cannot_leave_their_place_in_a_page(hostile):
     assert frame.count("<") == 2 and frame.startswith("<iframe") and frame.endswith("</iframe>")
 
 
-def test_what_is_not_finite_is_no_json(animation):
+def test_numbers_that_are_not_finite_are_refused_as_json(animation):
     with pytest.raises(ValueError, match="not JSON compliant"):
         page(animation.data | {"speed": np.nan})
 
 
-def test_it_shows_itself(animation):
+def test_an_animation_shows_itself(animation):
     assert "2 s" in repr(animation)
     assert animation._repr_html_().startswith("<iframe")
 
@@ -287,7 +287,7 @@ def shown_by_ipython(animation):
 
 
 def test_a_notebook_keeps_the_player(animation):
-    """A cell shows nothing that needs Python again: nbconvert would take that, such as a widget, and leave it empty."""
+    """A cell's output does not need Python: nbconvert would leave a widget empty."""
     data, _ = shown_by_ipython(animation)
     assert set(data) == {"text/plain", "text/html"} and embedded(unescape(data["text/html"]))["runs"]
 

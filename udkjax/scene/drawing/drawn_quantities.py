@@ -14,7 +14,7 @@ from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.fields import vector_as_angle
 from udkjax.scene.joints import Profile
 from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
-from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity
+from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
 
 # Quantities whose units a file may choose, with their SI units, the default.
 QUANTITY_KINDS = {
@@ -104,6 +104,11 @@ class Units:
         return {
             k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
         }
+
+    @staticmethod
+    def sizes(unit: str) -> dict[str, float]:
+        """Return the sizes, in an SI unit, of all single units of its dimension by all their spellings."""
+        return unit_sizes(unit)
 
     def shown(self, unit: str) -> str:
         """Return the unit of the file, or one made of its units, in which numbers of an SI unit are shown."""

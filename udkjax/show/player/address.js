@@ -1,19 +1,19 @@
-// The numbers of a live page in its address, so that whoever opens it sees the same motion.
+// The numbers of a live page in its address, so that everyone who opens it sees the same motion.
 
 export class Address {
   constructor(live) { this.live = live; }
 
-  /** Whether the page has an address of its own: not within another page. */
+  /** True if the page has an address of its own, and is not inside another page. */
   get exists() { return Boolean(this.live.player.options.fill) && location.protocol !== "about:"; }
 
-  /** The numbers that are not those of the scene. */
-  get words() {
+  /** The changed numbers, as the fragment of an address. */
+  get fragment() {
     const {data: {sliders}, values} = this.live, changed = sliders.map((s, k) => [s, values[k]]).filter(([s, x]) => x !== s.value);
     return new URLSearchParams(changed.map(([s, x]) => [s.name, String(x)])).toString();
   }
 
   write() {
-    if (this.exists) history.replaceState(null, "", `#${this.words}`);
+    if (this.exists) history.replaceState(null, "", `#${this.fragment}`);
   }
 
   read() {
@@ -27,13 +27,13 @@ export class Address {
   }
 
   async copy() {
-    const {live, words} = this;
+    const {live, fragment} = this;
     this.write();
     try {
-      await navigator.clipboard.writeText(this.exists ? location.href : `#${words}`);
-      live.say("The address with these numbers is copied.");
+      await navigator.clipboard.writeText(this.exists ? location.href : `#${fragment}`);
+      live.say("A link with these numbers has been copied.");
     } catch {
-      live.say(this.exists ? "The address of this page has these numbers now." : `These numbers: ${words || "as at first"}`);
+      live.say(this.exists ? "The address of this page now contains these numbers." : `Changed numbers: ${fragment || "none"}`);
     }
   }
 }

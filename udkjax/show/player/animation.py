@@ -1,4 +1,4 @@
-"""`animate`: a mechanism in motion, to look at in a notebook or a browser, or to write to a file."""
+"""`animate`: a mechanism in motion, shown in a notebook or a browser, or written to a file."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -37,56 +37,57 @@ from udkjax.show.player.sketch import ForceArrow, TracedPath
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
 
-LIVE_SECONDS, LIVE_INSTANTS = 10.0, 501  # of a live page whose run is not given
-FRAME_HEIGHT = 560  # px, of the player inside another page
+LIVE_SECONDS, LIVE_INSTANTS = 10.0, 501  # duration and output times of a live page without a given run
+FRAME_HEIGHT = 560  # px: height of the player inside another page
 
 
 class FailedRunWarning(UserWarning):
-    """A run that is shown has failed: the message says how."""
+    """A run that is shown has failed; the message gives the cause."""
 
 
 class Animation:
-    """An animation, as `animate` returns it. In a notebook it shows itself, as a page in a frame.
+    """An animation, the result of `animate`. In a notebook it shows itself as a page in a frame.
 
-    So it is still there when the notebook is opened without Python, and in what nbconvert exports. `widget` returns one that
-    Python can steer.
+    The page still works when the notebook is opened without Python, and in exports of nbconvert. `widget` returns a player that
+    Python can control.
 
     Attributes:
         data: data of the player, as JSON.
-        failures: causes of failed runs, by their labels.
+        failures: causes of failed runs by label.
     """
 
     def __init__(self, data: JsonObject, failures: Mapping[str, str] | None = None):
-        self.data, self.failures = data, dict(failures or {})  # causes of failed runs, by their labels
+        self.data, self.failures = data, dict(failures or {})
         self._motions = [motion_of(record) for record in data["runs"]]
         self._arrows = [arrows_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
 
     def html(self, theme: str | None = None, autoplay: bool = False) -> str:
-        """Return one self-contained HTML page. `theme` is "light" or "dark"; by default, what the reader's system prefers."""
+        """Return a self-contained HTML page. `theme` is "light" or "dark"; by default the preference of the reader's system."""
         return page(self.data, {"theme": theme, "autoplay": autoplay})
 
     def widget(self) -> "PlayerWidget":
-        """Return an anywidget with `time` (s) and `playing`, which follow the player and move it; needs the extra `notebook`."""
+        """Return an anywidget whose `time` (s) and `playing` are synchronized with the player; needs the extra `notebook`."""
         from udkjax.show.player.widget import PlayerWidget
 
         return PlayerWidget(data=self.data, time=self.data["start"])
 
     def save(self, path: str | Path, t: float | None = None, **options: Any) -> Path:
-        """Write the animation, in the format that the name ends with.
+        """Write the animation in the format given by the suffix of the path.
 
         Args:
-            path: .html, the player; .gif (extra `plot`) or .mp4 (`video`), the motion; .svg, .png (`plot`), .dxf (`dxf`), a pose.
-            t: time of the pose (s); by default the first.
-            options: of html, `theme` and `autoplay`; of gif and mp4, `fps` (1/s), `width` (px), `theme` and `speed` (seconds of
-                motion in one second; by default that of the player); of svg and png, `width` (px) and `theme`.
+            path: .html for the player; .gif (extra `plot`) or .mp4 (`video`) for the motion; .svg, .png (`plot`) or .dxf (`dxf`)
+                for a pose.
+            t: time of the pose (s); by default the start.
+            options: for .html `theme` and `autoplay`; for .gif and .mp4 `fps` (1/s), `width` (px), `theme` and `speed` (seconds
+                of motion per second, by default that of the player); for .svg and .png `width` (px) and `theme`.
 
         Returns:
             The path.
 
         Raises:
-            ValueError: a name that ends otherwise.
-            ImportError: a package of an extra is missing; says which.
+            ValueError: the path has another suffix.
+            ImportError: a package is missing; the message names the extra that installs it.
         """
         path = Path(path)
         kind = path.suffix.lower()
@@ -97,7 +98,7 @@ class Animation:
         elif kind == ".dxf":
             pictures.save_dxf(self, path, t)
         elif kind in (".gif", ".mp4", ".png"):
-            from udkjax.show.player import films  # needs an extra
+            from udkjax.show.player import films  # imported here because it needs an extra
 
             if kind == ".gif":
                 films.save_gif(self, path, **options)
@@ -106,11 +107,11 @@ class Animation:
             else:
                 films.image(self, t, **options).save(path)
         else:
-            raise ValueError(f"{path.name}: an animation is written as .html, .gif, .mp4, .svg, .png or .dxf")
+            raise ValueError(f"{path.name}: the suffix must be .html, .gif, .mp4, .svg, .png or .dxf")
         return path
 
     def pose(self, t: float | None = None) -> list[Float[np.ndarray, "bodies 3"]]:
-        """Return the coordinates of each run at time t (s; of a mode, the part of a cycle), as the player shows them."""
+        """Return the coordinates of each run at time t (s; for modes the fraction of a cycle), as the player shows them."""
         t = float(self.data["start"] if t is None else t)
         return [motion(t) for motion in self._motions]
 
@@ -121,7 +122,7 @@ class Animation:
         return self._paths
 
     def arrows(self, t: float | None = None) -> list[list[ForceArrow]]:
-        """Return the arrows of the reactions of each run at time t (s); none where they are not shown."""
+        """Return the arrows of the reactions of each run at time t (s); empty if reactions are not shown."""
         t = float(self.data["start"] if t is None else t)
         return [arrows(t) for arrows in self._arrows]
 
@@ -149,36 +150,36 @@ def animate(
     """Show the motion of a mechanism, or several motions side by side and in step.
 
     Args:
-        mechanism: the mechanism that moved; for runs of different mechanisms, one under each run's label.
-        solution: a `Solution`, or anything with ts (T,), q and v (T, bodies, 3); several under their labels,
-            {"projected": one, "not stabilized": other}. By default the mechanism stands as its scene says.
-        measures: curves of a strip over time: any of "violation" (m; radians as an arc of the characteristic length), "energy",
-            "rank" and "effort" (of drivers, N or N m), or {"torque (N m)": array} for values of your own, of several runs
-            {"torque (N m)": {label: array}}.
-        reactions: draw the forces of the joints as arrows, in pictures and films as well; of redundant joints, the shares of
-            least norm, which the page draws dashed and pictures paler.
+        mechanism: the mechanism that moves; for runs of different mechanisms, a mechanism for each label.
+        solution: a `Solution`, or any object with ts (T,), q and v (T, bodies, 3); for several runs a mapping by label, such as
+            {"projected": one, "not stabilized": other}. By default the mechanism is shown at rest, as in its scene.
+        measures: curves over time below the motion: any of "violation" (constraint violation in m, with radians as arcs of the
+            characteristic length), "energy", "rank" (of the constraint Jacobian) and "effort" (driving torques in N m and forces
+            in N), or {"torque (N m)": array} for your own values, and {"torque (N m)": {label: array}} for several runs.
+        reactions: True to draw joint forces as arrows, in pictures and films as well. Forces shared by redundant constraints are
+            not unique: those of least norm are drawn, dashed in the page and paler in pictures.
         traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
-            the pins that move, up to eight.
-        shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
+            the moving pins, up to eight.
+        shapes: further points (n, 2) of bodies by name, in their own frames (m), that the drawn bodies go through.
         title: title; by default the mechanism's name.
-        live: numbers that the page changes by sliders, by their names (`parameters()`), whole or one entry: the motion is closed
-            and solved anew in the page, which a hand can pull at, too. {"pin.B[0]": (0.5, 2.0)} gives a slider its range; True
-            takes every number of the scene. Of several runs a slider changes all that have its number. By default ten
-            seconds. Its measures are violation, energy and effort,
-            which the page finds anew, behind those of your own, which it shows of the first motion alone; "rank" is none.
-        events: of live runs, as `simulate` took them: the page finds anew when each happens. Of actions it knows `Log`, `Stop`
-            and `Impact`, of one contact at a time, and draws the lines of contacts.
+        live: parameters (`parameters()`), or single entries of them, that get sliders in a live page, which closes and simulates
+            the motion again, and lets the reader pull at bodies. {"pin.B[0]": (0.5, 2.0)} sets the range of a slider; True takes
+            all numbers of the scene. A slider acts on all runs that have its parameter. Without `solution`, ten seconds are
+            simulated. A live page updates violation, energy and effort; your own measures are shown for the first motion only,
+            and "rank" is left out.
+        events: events of live runs, as given to `simulate`; the page locates them again. It supports the actions `Log`, `Stop`
+            and `Impact` (one contact at a time), and draws the lines of contacts.
 
     Returns:
         An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
-        A run that failed is shown as far as it came; a `FailedRunWarning` and the page say how it ended.
+        A failed run is shown up to its failure; a `FailedRunWarning` and the page give the cause.
 
     Raises:
-        ValueError: a batch, a name that is not known, a run without any state, or one that cannot be live.
+        ValueError: a batch, an unknown name, a run without any state, or one that cannot be live.
     """
     events = tuple(events) if isinstance(events, Sequence) else (events,)
     if events and not live:
-        raise ValueError("events: only a live page solves them anew, and shows of others what the solution has: leave them out")
+        raise ValueError("events: needed only for a live page; otherwise the events of the solution are shown: leave them out")
     if live:
         solution, measures = _live_runs(mechanism, solution, measures, events)
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
@@ -217,7 +218,7 @@ def _live_runs(
         runs = dict(zip(mechanism, found, strict=True)) if isinstance(mechanism, Mapping) else found[0]
     given: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
     efforts = ["effort"] if any(one.driver_names for one in mechanisms) else []
-    wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # curves that the page computes anew, too
+    wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # the latter are updated by the page
     return runs, {name: given.get(name) for name in wanted if name != "rank"}
 
 
@@ -230,13 +231,13 @@ def animate_modes(
     labels: Sequence[str] | None = None,
     title: str | None = None,
 ) -> Animation:
-    """Show modes of vibration side by side: q + amplitude shape sin(phase), with an amplitude that one can change.
+    """Show vibration modes side by side, q + amplitude shape sin(phase), with an adjustable amplitude.
 
     Args:
-        mechanism: the mechanism that vibrates.
-        q: coordinates (bodies, 3) around which it does (m, m, rad).
-        shapes: a displacement of each body for each mode, of any size; each is scaled to a swing that one sees.
-        frequencies: Hz, said beside each.
+        mechanism: the vibrating mechanism.
+        q: equilibrium coordinates (bodies, 3) (m, m, rad).
+        shapes: mode shapes (modes, bodies, 3), of any magnitude; each is scaled to a visible amplitude.
+        frequencies: natural frequencies (Hz) shown with the labels.
         labels: labels; by default "mode 1", "mode 2", ...
         title: title; by default the mechanism's name.
 
@@ -244,7 +245,7 @@ def animate_modes(
         An `Animation` of all modes.
 
     Raises:
-        ValueError: shapes have the wrong shape, or one is zero.
+        ValueError: `shapes` has the wrong shape, or a mode moves nothing.
     """
     shapes = np.asarray(shapes, float)
     if shapes.shape[1:] != (len(mechanism.bodies), 3) or not len(shapes):
@@ -257,7 +258,7 @@ def animate_modes(
 
 
 class _Still:
-    """A mechanism as its scene says, as a run of one instant."""
+    """A run of one instant: a mechanism in the position of its scene."""
 
     def __init__(self, mechanism: Mechanism):
         self.ts, self.q, self.v = np.zeros(1), np.asarray(mechanism.q0)[None], np.zeros((1, len(mechanism.bodies), 3))

@@ -1,4 +1,4 @@
-// Elements of a page: how they are made, and what is written on them.
+// Elements of a page, and their texts.
 
 export const SPEEDS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
 const ICONS = {
@@ -8,14 +8,14 @@ const ICONS = {
   theme: "M12 3a9 9 0 1 0 0 18zM12 3a9 9 0 0 1 0 18v-2a7 7 0 0 0 0-14z",
 };
 export const HELP = [
-  ["Space", "play, pause"], ["← →", "one frame back, ahead"], ["Shift ← →", "a twentieth back, ahead"], ["Home End", "start, end"],
+  ["Space", "play, pause"], ["← →", "one frame back, forward"], ["Shift ← →", "5 % back, forward"], ["Home End", "start, end"],
   ["+ −", "faster, slower"], ["T", "traces"], ["N", "names"], ["R", "reactions"], ["L", "repeat"], ["D", "dark or light"],
-  ["0", "whole view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
+  ["0", "fit the view"], ["Wheel, pinch", "zoom"], ["Drag", "move the view"],
 ];
 
-export const LIVE_HELP = [["Drag a body", "pull at it"], ["G", "first motion"], ["Backspace", "reset the numbers"]];
+export const LIVE_HELP = [["Drag a body", "pull it"], ["G", "show the first motion"], ["Backspace", "reset the numbers"]];
 
-/** An element with properties and children; texts are texts. */
+/** An element with properties and children; strings become text, never markup. */
 export function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(properties)) {
@@ -33,7 +33,7 @@ export function button(content, title, action, kind = "") {
 
 export const icon = name => svgIcon(ICONS[name]);
 
-/** An icon of a path that is filled, or drawn as a line. */
+/** An icon from an SVG path, filled or stroked. */
 export function svgIcon(shape, isLine = false) {
   const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg"), path = document.createElementNS(svg.namespaceURI, "path");
   svg.setAttribute("viewBox", "0 0 24 24");
@@ -45,7 +45,7 @@ export function svgIcon(shape, isLine = false) {
   return svg;
 }
 
-/** Let a click on a button leave the keys to what is shown: else the space bar would press the button again. */
+/** Move the keyboard focus from clicked buttons to `focused`: otherwise the space bar would press the button again. */
 export function keepKeys(root, focused) {
   root.addEventListener("mousedown", event => {
     if (!event.target.closest("button") || event.target.closest("dialog")) return;

@@ -1,21 +1,21 @@
 // The engine of one mechanism in a page: the data of udkjax/integrate/portable, run by WebAssembly.
 //
-//   const engine = await loadEngine(data)      throws where there is no WebAssembly
+//   const engine = await loadEngine(data)      throws without WebAssembly
 //   engine.parameters                          a list of {name, unit, value}
-//   engine.values                              their values as they are in the scene, in the same order
+//   engine.values                              their values in the scene, in the same order
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
-//   engine.mark(parameters, state)             -> a number for each row of Psi, one where it is independent near a state; or null
+//   engine.mark(parameters, state)             -> for each row of Psi 1 if it is independent near a state, else 0; null if all are
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, events,
 //                                                 held, last}
 //   engine.measure(parameters, run, efforts, forces) -> {kinetic, potential, efforts: {driver: values}, forces}
 //
-// Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q and v have x, y (m), angle (rad)
-// of each body in turn, and their rates; of a run the times come first. All results are the caller's own.
+// Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q has x, y (m), angle (rad) of each
+// body in turn, and v their rates; in a run time is the first axis. Results are not overwritten by later calls.
 
 import {runWithEvents} from "./events.js";
 import {bytesOf} from "./motion.js";
 
-const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes; of memory: a stack is never as deep, and the unit it grows by
+const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes: more than any stack needs, the unit in which memory grows, alignment
 const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed",
   7: "the condition of an event varies too quickly"};
 const EPS = 2 ** -52;
@@ -28,7 +28,7 @@ async function inflate(text) {
   return new Response(stream).arrayBuffer();
 }
 
-/** One module with a memory of its own: constants, stack, and behind them what a call takes, which the next call overwrites. */
+/** A module with its own memory: constants, stack, and then the data of a call, which the next call overwrites. */
 class Instance {
   static async load(module) {
     const found = new Instance();
@@ -44,7 +44,7 @@ class Instance {
 
   begin() { this.end = this.start; }
 
-  /** The address of so many bytes. */
+  /** Reserve bytes of memory and return their address. */
   reserve(size) {
     const place = this.end;
     this.end = Math.ceil((place + size) / LINE) * LINE;
@@ -61,7 +61,7 @@ class Instance {
 
   view(place, count) { return new Float64Array(this.memory.buffer, place, count); }
 
-  /** Call `run` for one member: its inputs are arrays by name, and so are the results, by how many numbers they have. */
+  /** Call `run` for one member: `inputs` are arrays by name, `results` the sizes of the arrays to return. */
   run(inputs, results, counts) {
     this.begin();
     const fields = {members: 1, directions: 0, next: this.put([0]), ...counts}, given = {};
@@ -90,7 +90,7 @@ class Engine {
     this.row = data.sampled.length;
   }
 
-  /** All numbers of the scene; behind them the times where the motion is not smooth. */
+  /** All numbers of the scene, followed by the times at which the motion is not smooth. */
   numbers(parameters) {
     if (!parameters || !this.parameters.length) return this.base.slice();
     const module = this.instances.evaluate;
@@ -105,7 +105,7 @@ class Engine {
     return numbers.subarray(count + knots, count + knots + conditions);
   }
 
-  /** All numbers of the scene with a hand's spring. */
+  /** All numbers of the scene, with the spring that pulls a body. */
   pulled(parameters, pull) {
     const numbers = this.numbers(parameters);
     if (pull) [...pull.point, ...pull.target, pull.stiffness, pull.damping].forEach((x, k) => { numbers[this.data.pulls[pull.body][k]] = x; });
@@ -114,8 +114,8 @@ class Engine {
 
   breaks(numbers) { return numbers.slice(this.data.count, this.data.count + this.data.knots).sort(); }
 
-  /** The numbers of the equations as a module takes them: with marks of rows, if it takes them, two thresholds, and the samples
-   *  that hold at a time. */
+  /** The numbers of the equations in the form that a module takes: with marks of rows (optional), two thresholds, and the samples
+   *  that are valid at a time. */
   dressed(numbers, thresholds, t, marks = null) {
     const {count} = this.data, found = new Float64Array(count + (marks?.length ?? 0) + 2);
     found.set(numbers.subarray(0, count));
@@ -133,10 +133,10 @@ class Engine {
 
   unit = k => (k % 3 === 2 ? 1 : this.data.scales.length);
 
-  /** Close the loops from a guess {t, q, v}, which by default is the scene's: the nearest closed state.
+  /** Find the closed state nearest to a guess {t, q, v}, by default that of the scene.
    *
    *  Returns t, q and v; `violation` of Psi and `rate` of Psi_dot, the largest of their rows in units of the scene; the `rank` of
-   *  Psi_q there; and whether the state is `closed`: if not, it is the best that was found.
+   *  Psi_q; and `closed`, which is false if only an approximately closed state was found.
    */
   close(parameters = null, guess = null) {
     const {data} = this, numbers = this.numbers(parameters), start = {...this.guess(numbers), ...guess}, m = data.rows.length;
@@ -151,7 +151,7 @@ class Engine {
     return {t: start.t, q, v, violation, rate, rank: found.rank[0], closed};
   }
 
-  /** Which rows of Psi are independent near a closed state {t, q, v}: one for each that is, zero for others. Null: all are. */
+  /** The independent rows of Psi near a closed state {t, q, v}: 1 for each of them, 0 for others; null if all are. */
   mark(parameters, state) { return this.markRows(this.numbers(parameters), state); }
 
   markRows(numbers, {t, q, v}) {
@@ -163,16 +163,16 @@ class Engine {
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
   }
 
-  /** Integrate the motion from a closed state {q, v} at times[0]; its `marks` are found where it has none.
+  /** Integrate the motion from a closed state {q, v} at times[0]; missing `marks` of the state are computed.
    *
-   *  `pull` is a hand's spring {body, point, target, stiffness, damping} on a body, by its number: point in its frame, target in
-   *  that of the ground (m), stiffness (N/m) and damping (N s/m). While it pulls no event stops the motion.
-   *  `limit` is the largest number of steps that are tried, by default 20,000; a run that it ends can go on from its `last` state.
-   *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene) of the first `count` of them, to which the
-   *  motion came; whether it is `done`, and else in `words` why; the number of `steps`; the `last` state; its `marks`; and its
-   *  `events`, a list of {t, index, q, v}, of a contact that comes to rest with twice their number added to the index, of one that
-   *  lets go with their number. Where one ends it as it should, `stop` says so, and the last time is that of the event. `held` are
-   *  one more than the event whose contact is at rest at each time, 0 where none is.
+   *  `pull` is a spring {body, point, target, stiffness, damping} that pulls a body (its index): point in its frame and target in
+   *  the ground frame (m), stiffness (N/m) and damping (N s/m). During a pull no event stops the motion.
+   *  `limit` is the largest number of attempted steps, by default 20,000; a run that reaches it can continue from its `last` state.
+   *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene), of which the first `count` are valid;
+   *  `done`, and if it is false the reason in `words`; the number of `steps`; the `last` state; its `marks`; and `events`, a list of
+   *  {t, index, q, v}, where the number of events is added to the index of a contact that lets go, and twice this number if it comes
+   *  to rest. If an event stops the motion, `stop` is the reason, and the last time is that of the event. `held` is, at each time,
+   *  the index of the event whose contact is at rest plus one, or 0.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data} = this, T = times.length;
@@ -183,7 +183,7 @@ class Engine {
     return {...this.piece(this.pulled(parameters, pull), {...data.settings, smallest, omega}, state, Float64Array.from(times), limit), events: []};
   }
 
-  /** Integrate from a state over times; with conditions to `watch`, up to the first that crosses zero, which is in `crossing`. */
+  /** Integrate from a state over times, up to the first zero `crossing` of the conditions in `watch`. */
   piece(numbers, settings, state, ts, limit, watch = []) {
     const {data, size} = this, T = ts.length, breaks = this.breaks(numbers), marks = state.marks ?? this.markRows(numbers, {t: ts[0], ...state});
     const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
@@ -199,8 +199,8 @@ class Engine {
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
 
-  /** The conditions of events at a state: g, their first and second rates, derivatives by t, q and v, and for each impact the
-   *  velocities that a unit impulse along it gives. */
+  /** The conditions of events at a state: g, its first and second rates, derivatives by t, q and v, and for each impact the
+   *  velocities due to a unit impulse along it. */
   conditions(numbers, settings, state) {
     const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
     const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
@@ -218,9 +218,8 @@ class Engine {
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
 
-  /** Energies (J) at the states of a run, and, where wanted, what each driver exerts along its coordinate (N or N m), and the
-   *  forces x, y (N) of the joints of `data.forces`, of all of them for one time after the other: none where rows are redundant,
-   *  whose shares would be a choice. */
+  /** Energies (J) at the states of a run and, if asked for, the force or torque of each driver (N or N m) and the forces x, y (N)
+   *  of the joints of `data.forces`, for all joints time by time; these are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false) {
     if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, marks = null} = run;
@@ -234,7 +233,7 @@ class Engine {
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
       efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
       forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
-    let next = -Infinity;  // until then the constants hold: samples change them
+    let next = -Infinity;  // time of the next sample, which changes the constants
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
         module.view(given, data.count + data.marks + 2).set(this.dressed(numbers, data.thresholds, ts[i], marks));
@@ -254,7 +253,7 @@ class Engine {
     return found;
   }
 
-  /** What `measure` returns of a run in which contacts come to rest: of each part by the engine that holds its contact. */
+  /** `measure` for a run in which contacts come to rest: each part by the engine that holds its contact. */
   measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
     const n = this.size, parts = [];
     for (let from = 0, to = 0; from < count; from = to) {
@@ -270,7 +269,7 @@ class Engine {
       forces: joined(p => (parts.every(({forces}) => forces.length) ? p.forces : []))};
   }
 
-  /** Forces x, y of each joint at the state that was evaluated last. */
+  /** Forces x, y of each joint at the last evaluated state. */
   forces(work, {x0, psi_q}) {
     const sum = terms => terms.reduce((total, [i, j, factor]) => total + work[x0 + i] * (j === null ? 1 : work[psi_q + j]) * factor, 0);
     return this.data.forces.flatMap(({x, y}) => [sum(x), sum(y)]);

@@ -1,10 +1,10 @@
-// Events on the timeline: a tick at the time of each, and the name of the one that has just happened.
+// Events on the timeline: a tick for each, and the name of the one that has just happened.
 
 import {make} from "./elements.js";
 import {contextOf} from "./painter.js";
 
-const THUMB = 8, TICK = 7;  // px: half of the slider's thumb, which is at the ends at the first and the last time; a tick's height
-const SAID = 0.04;  // of the timeline: how long one reads which event has happened
+const THUMB = 8, TICK = 7;  // px: half the width of the slider's thumb, by which the timeline is inset; height of a tick
+const NAME_SHOWN = 0.04;  // fraction of the timeline during which the name of an event is shown
 
 export class EventMarks {
   constructor(player) {
@@ -25,7 +25,7 @@ export class EventMarks {
       context.lineWidth = 2;
       context.strokeStyle = runs.length > 1 ? theme.bodies[k % theme.bodies.length] : theme.force;
       context.stroke();
-      const last = run.events.findLast(event => event.t <= t && event.t >= t - SAID * (end - start));
+      const last = run.events.findLast(event => event.t <= t && event.t >= t - NAME_SHOWN * (end - start));
       const words = last ? `${last.name}, ${+last.t.toPrecision(5)} s` : "";
       if (panels[k].happened.textContent !== words) panels[k].happened.textContent = words;
     });

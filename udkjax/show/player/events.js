@@ -1,8 +1,8 @@
-// Runs with events: machine code runs from one to the next, and what happens there is noted; an impact changes the velocities.
+// Runs with events: machine code integrates from one event to the next; events are recorded, and an impact changes the velocities.
 
-/** The conditions at a state, with their rates, what impulses along them do, and their scales: what a displacement of a length or
- *  a turn of a radian changes in each, which never becomes smaller than `before`. */
-function look(engine, numbers, settings, state, before) {
+/** The conditions at a state, with their rates, the effect of impulses along them, and their scales: the change of each by a
+ *  displacement of one length or a turn of one radian, which never becomes smaller than in `before`. */
+function evaluate(engine, numbers, settings, state, before) {
   const {tolerances: {zero}} = engine.data.events, found = engine.conditions(numbers, settings, state), rate = settings.omega;
   const largest = (slopes, size) => slopes.reduce((most, slope, i) => Math.max(most, Math.abs(slope * size(i)) || 0), 0);
   found.scales = Array.from(found.g, (_, k) => Math.max(Math.abs(found.byT[k]) * Math.max(1 / rate, Math.abs(state.t)),
@@ -12,17 +12,17 @@ function look(engine, numbers, settings, state, before) {
   return found;
 }
 
-/** The velocities behind an impact of contact k by Newton's law, g_dot+ = -e g_dot-, and whether it is over with its rebounds; or
- *  `words` where more happens than that: several contacts that are hit at once are no program of a page. `held` is at rest. */
+/** The velocities after an impact of contact k by Newton's law, g_dot+ = -e g_dot-, whether it `hits`, and whether it then `rests`;
+ *  or, in `words`, why a page cannot compute it, as for several contacts hit at once. The contact `held` is at rest. */
 function hit(engine, numbers, settings, at, watch, k, held) {
   const {events} = engine.data, {tolerances: tol} = events, {omega} = settings, {g, rate, rate2, scales, byQ, directions} = watch;
   const W = along(watch, k, k), unit = j => scales[j] * omega;
   const isHit = j => j !== k && j !== held && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j]
     && rate[j] <= tol.zero_rate * unit(j) && Math.abs(along(watch, j, k)) > tol.coupled * Math.sqrt(along(watch, j, j) * W);
   const other = events.names.findIndex((_, j) => isHit(j)), name = events.names[k];
-  if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which is no program of a page yet`};
+  if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which a live page cannot compute yet`};
   const inverse = engine.inverseMasses(numbers);
-  if (!(W > tol.blocked * byQ[k].reduce((sum, x, i) => sum + x * x * inverse[i], 0))) return {words: `the joints leave ${name} no motion`};
+  if (!(W > tol.blocked * byQ[k].reduce((sum, x, i) => sum + x * x * inverse[i], 0))) return {words: `the joints allow no motion at the contact ${name}`};
   const floor = tol.zero_rate * unit(k), isPressed = acceleration => acceleration < -tol.zero_rate_2 * unit(k) * omega;
   const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
   const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
@@ -32,11 +32,11 @@ function hit(engine, numbers, settings, at, watch, k, held) {
   return {v: rests ? moved(-rate[k] / W) : v, hits, rests};
 }
 
-/** How much a unit impulse along contact j changes the rate of contact i. */
+/** The change of the rate of contact i by a unit impulse along contact j. */
 const along = ({byQ, directions}, i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0);
 
-/** What `Engine.run` returns, of an engine whose runs have events; one that stops the motion does so only where `stops`. While a
- *  contact is at rest, the engine that holds it runs; `numbersOf` an engine are its numbers. */
+/** `Engine.run` for an engine with events; these stop the motion only if `stops`. While a contact is at rest, the engine that holds
+ *  it runs; `numbersOf` returns the numbers of an engine. */
 export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, limit) {
   const {data: {events, scales, drift_tol: driftTol}, size: n} = free, T = ts.length, end = ts[T - 1], E = events.names.length;
   const {zero, zero_rate: zeroRate, zero_rate_2: zeroRate2} = events.tolerances, isImpact = k => events.restitution[k] !== null;
@@ -53,28 +53,28 @@ export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, sto
   const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.held[row] = held + 1; };
   const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch, held}, marks: held < 0 ? at.marks : null, ...more});
   const note = index => found.events.push({t: at.t, index, q: at.q, v: at.v});
-  const stop = words => {  // with the state there as the last output
+  const stop = words => {  // with the current state as the last output
     if (first < T && !(first && ts[first - 1] === at.t)) {
       ts[first] = at.t;
       put(first++, at.q, at.v, violation);
     }
     return finish(words, {stop: stops ? words : null, count: first});
   };
-  /** Goes on with a contact at rest, or with none. */
+  /** Continue with a contact at rest, or with none. */
   const rest = (k, v = at.v) => {
     use(k);
     at = {t: at.t, q: at.q, v};
     const {sides} = watch;
-    watch = Object.assign(look(engine, numbers, settings, at, watch), {sides});
+    watch = Object.assign(evaluate(engine, numbers, settings, at, watch), {sides});
   };
   use(state.held ?? -1);
   if (!watch) {
-    watch = look(engine, numbers, settings, at, null);
+    watch = evaluate(engine, numbers, settings, at, null);
     const beyond = watch.sides.findIndex((side, k) => isImpact(k) && side < 0);
-    if (beyond >= 0) return finish(`it begins beyond ${events.names[beyond]}`);
+    if (beyond >= 0) return finish(`it begins beyond the contact ${events.names[beyond]}`);
     const {rate, rate2, scales: unit, sides} = watch, small = k => zeroRate * unit[k] * omega;
     const falls = k => rate[k] < -small(k) || (Math.abs(rate[k]) <= small(k) && rate2[k] < -zeroRate2 * unit[k] * omega ** 2);
-    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // what is closed, and closes further
+    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // a closed contact that closes further
     watch.sides = sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
   }
   for (;;) {
@@ -106,7 +106,7 @@ export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, sto
       violation = worst;
       if (!(worst <= driftTol)) return finish("the loops do not stay closed");
       event = crossed;
-      watch = look(engine, numbers, settings, at, watch);
+      watch = evaluate(engine, numbers, settings, at, watch);
     }
     if (event === E) {  // the contact would have to pull
       before[held] = 1;
@@ -115,9 +115,9 @@ export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, sto
       rest(-1);
       continue;
     }
-    let lifted = -1;  // by the impact of another
+    let lifted = -1;  // contact lifted by the impact of another
     if (event >= 0 && isImpact(event) && held >= 0) {
-      const bare = look(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
+      const bare = evaluate(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
       if (along(bare, held, event) > events.tolerances.coupled * Math.sqrt(along(bare, held, held) * along(bare, event, event))) {
         lifted = held;
         before[held] = 1;
@@ -134,17 +134,17 @@ export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, sto
         note(2 * E + event);
         const words = `${events.names[event]} has come to rest`;
         if (events.ends_at_rest[event]) return stop(words);
-        if (!free.held[event]) return finish(`${words}, and how it is held is no program of a page`);
-        if (held >= 0) return finish(`${words} beside ${events.names[held]}, and how both are held is no program of a page yet`);
+        if (!free.held[event]) return finish(`${words}, where a live page cannot hold it`);
+        if (held >= 0) return finish(`${words} as well as ${events.names[held]}; a live page cannot hold two contacts at rest yet`);
         before[event] = 1;
         watch.sides = before;
         rest(event);
         continue;
       }
-      watch = look(engine, numbers, settings, at, watch);
+      watch = evaluate(engine, numbers, settings, at, watch);
     }
-    // What is zero keeps its side, and crosses behind the event; so does what velocities change that jump. The event's own
-    // condition is beyond it, or that of a contact on the side where it was.
+    // A condition at zero keeps its side and crosses after the event, as does one that depends on velocities if these jump. The
+    // event's own condition has crossed; that of a contact is back on its side.
     watch.sides = watch.sides.map((side, k) => {
       if (k === event) return jump ? 1 : -before[k];
       if (k === held) return 1;
@@ -154,7 +154,7 @@ export function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, sto
       if (part.done) continue;
       return finish(part.words, {limited: part.limited});
     }
-    if (events.stops[event] && stops) return stop(`${events.names[event]} stops it`);
+    if (events.stops[event] && stops) return stop(`stopped by ${events.names[event]}`);
     if (found.events.length >= events.most) return finish(`more than ${events.most} events`);
   }
 }

@@ -1,10 +1,10 @@
-// A hand that pulls at a body by a spring, through the mechanism's own dynamics and in time.
+// Pulling a body by a spring: the mechanism moves by its own dynamics, in real time.
 
-const SWING = 2 * Math.PI * 1.5;  // rad of the spring's own swing in one second of the screen, with half of all masses on it
-const DAMPING = 0.7;  // of the critical one
-const LONGEST_FRAME = 0.05;  // s of the screen: after a longer one the motion lags
+const SWING = 2 * Math.PI * 1.5;  // rad per second of real time: natural frequency of the spring with half of all masses
+const DAMPING = 0.7;  // damping ratio
+const LONGEST_FRAME = 0.05;  // s of real time: in longer frames the motion lags
 
-/** Pulls while it is held; `live` is the run, which has the engine and shows what comes of it. */
+/** Pulls until it is released; `live` is the run, which has the engine and shows the motion. */
 export class Hand {
   constructor(live, held, target) {
     const {engine, values} = live, numbers = engine.numbers(values), {speed} = live.player;
@@ -30,9 +30,9 @@ export class Hand {
     const run = live.engine.run(live.values, state, [state.t, t], pull), n = live.engine.size;
     if (!run.done) {
       this.isBlocked = true;
-      return live.live.say(`the pull is too much: ${run.words}`, true);
+      return live.live.say(`The pull is too strong: ${run.words}.`, true);
     }
-    if (this.isBlocked) live.live.greet();  // what was said is over
+    if (this.isBlocked) live.live.greet();  // replaces the message
     this.isBlocked = false;
     this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, held: run.last.held};
     live.append(this.state, run.violation[1], run.events);
@@ -47,7 +47,7 @@ export class Hand {
   }
 }
 
-/** The body that is drawn at a place of the screen, the uppermost first, and the point in its frame; null where there is none. */
+/** The topmost body at a pixel, with the point in its frame; null if there is none. */
 export function bodyAt(painter, symbols, [x, y], reach) {
   for (const symbol of [...symbols].reverse()) {
     const {frame} = symbol;

@@ -1,10 +1,10 @@
-// Names in a picture: each beside what it names, where no other name and no pin is. One that has a place keeps it while it is free.
+// Names in a picture: each next to its element, where it covers no other name and no pin. A name keeps its place while that is free.
 
 const SIZE = 12, HIGH = 14;  // px
-const PIN = 7;  // px around the middle of a pin, where no name stands
+const PIN = 7;  // px around the centre of a pin that names keep clear
 const BESIDE = 14;  // px from a bar to its name
 const ROUNDING = 1e-6;  // px2
-const BOLD = 700;  // the weight of signs, and of the names of what is selected
+const BOLD = 700;  // font weight of signs, and of names of selected elements
 const PLACES = [[9, -12, "left"], [9, 14, "left"], [-9, -12, "right"], [-9, 14, "right"], [0, -20, "center"], [0, 22, "center"]];  // around a pin (px)
 
 export class Labels {
@@ -19,8 +19,8 @@ export class Labels {
     this.boxes = Array.from(places, ([x, y]) => [x - PIN, y - PIN, x + PIN, y + PIN]);
   }
 
-  /** Write words at the first free one of some places [x, y, align], or where they cover least of others; `key` names them. A sign
-   *  is never covered: a name that would have to is left out, unless it is bold. */
+  /** Write words at the first free one of several places [x, y, align], or else where they cover least; `key` identifies them. A
+   *  sign is never covered: a name without another place is left out, unless it is bold. */
   put(key, words, places, colour, weight, isSign = false) {
     const {painter, last, boxes, unit, whole} = this, high = HIGH * unit;
     painter.context.font = `${weight} ${SIZE * unit}px system-ui`;
@@ -45,7 +45,7 @@ export class Labels {
 
 export const aroundPin = ([x, y], unit = 1) => PLACES.map(([dx, dy, align]) => [x + unit * dx, y + unit * dy, align]);
 
-/** Beside a bar between two places (px), at its middle or nearer to an end, below it first; or farther from it. */
+/** Places beside a bar between two pixels: at its middle or nearer to an end, below it first, then farther away. */
 export function besideBar([ax, ay], [bx, by]) {
   const length = Math.hypot(bx - ax, by - ay) || 1, turn = Math.sign(bx - ax) || 1;
   const [nx, ny] = [-turn * (by - ay) / length, turn * (bx - ax) / length], found = [];
@@ -60,10 +60,10 @@ export function besideBar([ax, ay], [bx, by]) {
   return found;
 }
 
-/** Within a plate or a disc, at its middle (px) or lines below or above. */
+/** Places within a plate or a disc: at its middle (px), or some lines below or above. */
 export const within = ([x, y], isDisc) => (isDisc ? [17, -17, 31] : [0, 17, -17]).map(dy => [x, y + dy, "center"]);
 
-/** At a place (px) of a body, or around it. */
+/** Places at and around a pixel of a body. */
 export function around([x, y], unit) {
   return [[0, 0], [0, 17], [0, -17], [34, 0], [-34, 0], [0, 34], [0, -34], [44, 17], [-44, 17], [44, -17], [-44, -17], [0, 51], [0, -51]]
     .map(([dx, dy]) => [x + unit * dx, y + unit * dy, "center"]);

@@ -1,11 +1,11 @@
-// A live page: sliders change numbers of the scene, a hand pulls at bodies, and the motions are closed and solved anew.
+// A live page: sliders change numbers of the scene, the pointer pulls bodies, and the motions are closed and simulated again.
 
 import {Address} from "./address.js";
 import {loadEngine} from "./engine.js";
 import {LiveRun} from "./live_run.js";
 import {SliderPanel} from "./sliders.js";
 
-const SETTLED = 150;  // ms without a change until the address says the numbers
+const SETTLED = 150;  // ms without a change before the numbers are written to the address
 
 export class Live {
   constructor(player, data) {
@@ -15,7 +15,7 @@ export class Live {
     this.panel = new SliderPanel(this.data.sliders, (k, value) => this.set(k, value), {
       ghost: {words: "First motion", title: "show the first motion as well (G)", act: () => player.toggle("ghost")},
       reset: {words: "Reset", title: "back to the first motion (Backspace)", act: () => this.reset()},
-      share: {words: "Copy link", title: "copy an address with these numbers", act: () => this.address.copy()},
+      share: {words: "Copy link", title: "copy a link with these numbers", act: () => this.address.copy()},
     });
     player.show.ghost = true;
     player.buttons.ghost = this.panel.buttons.ghost;
@@ -26,11 +26,11 @@ export class Live {
 
   async load() {
     try {
-      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("it has no WebAssembly");
+      if (typeof WebAssembly === "undefined" || typeof DecompressionStream === "undefined") throw new Error("no WebAssembly");
       const engines = await Promise.all(this.data.engines.map(loadEngine));
       for (const run of this.runs) run.use(engines[run.data.engine]);
     } catch (error) {
-      this.say(`This browser cannot simulate (${error.message}): the page plays what was recorded.`, true);
+      this.say(`This browser cannot simulate (${error.message}): the page plays the recorded motion.`, true);
       return false;
     }
     this.isReady = true;
@@ -48,7 +48,7 @@ export class Live {
     return {g: () => this.player.toggle("ghost"), Backspace: () => this.isReady && this.reset()};
   }
 
-  greet() { this.say(`Move a slider, or pull at a body: the ${this.runs.length > 1 ? "motions are" : "motion is"} solved anew.`); }
+  greet() { this.say(`Move a slider or drag a body: the ${this.runs.length > 1 ? "motions are" : "motion is"} simulated again.`); }
 
   say(words, bad = false) { this.panel.say(words, bad); }
 
@@ -61,7 +61,7 @@ export class Live {
     this.settling = setTimeout(() => this.address.write(), SETTLED);
   }
 
-  /** Change numbers by the names of their parameters, and solve at once. */
+  /** Change numbers by the names of their parameters, and simulate at once. */
   change(numbers) {
     this.data.sliders.forEach(({name}, k) => { if (name in numbers) this.values[k] = numbers[name]; });
     this.panel.show(this.values);
@@ -82,11 +82,11 @@ export class Live {
 
   // Motion
 
-  /** Solve before the next picture, once for all changes until then. */
+  /** Simulate before the next frame, once for all changes until then. */
   solveSoon() {
     if (this.dirty) return;
     this.dirty = true;
-    cancelAnimationFrame(this.request);  // what was being solved is of other numbers
+    cancelAnimationFrame(this.request);  // a simulation in progress has the old numbers
     this.request = requestAnimationFrame(() => this.solve());
   }
 
@@ -98,17 +98,17 @@ export class Live {
     this.goOn();
   }
 
-  /** Solve on until the time of one picture is over, and so on until the end. */
+  /** Continue the simulation for one frame, and so on until the end. */
   goOn() {
     this.runs.forEach((run, k) => { if (run.job) this.said[k] = run.goOn(); });
     const several = this.said.length > 1, words = this.said.map((said, k) => (several ? `${this.player.runs[k].label}: ` : "") + said.words);
     this.say(words.join("\n"), this.said.some(said => said.bad));
     if (this.isSolving) this.request = requestAnimationFrame(() => this.goOn());
-    else this.player.setEnd(this.end);  // of a motion that ends early, there
+    else this.player.setEnd(this.end);  // a motion may end early
     this.player.draw();
   }
 
-  /** Solve all that is still to be solved. */
+  /** Complete all simulations at once. */
   finish() {
     if (this.dirty) this.solve();
     cancelAnimationFrame(this.request);
@@ -116,7 +116,7 @@ export class Live {
     cancelAnimationFrame(this.request);
   }
 
-  /** What the whole view shows: all that is drawn of the motions as they are now. */
+  /** Set the bounds of the view to those of the current motions. */
   fit() {
     const {bounds} = this.player.data, all = this.runs.map(run => run.bounds());
     this.firstBounds ??= bounds.slice();

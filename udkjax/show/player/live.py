@@ -1,10 +1,10 @@
-"""The data that a live page has besides: the engines of its mechanisms, sliders, and symbols that follow what they change.
+"""The additional data of a live page: the engines of its mechanisms, sliders, and updates of symbols.
 
 sliders  live_parameters.py
-engines  udkjax/integrate/portable; runs of one mechanism share one
-runs     of each run: engine, its number; sliders: [number of a slider, the value that this mechanism has] for each parameter of
-         the engine; follow (followers.py); start: the state that closing begins with, or null where that is the scene's own
-         guess; times: all of a motion that failed or was stopped, or null
+engines  udkjax/integrate/portable; runs of one mechanism share an engine
+runs     for each run: the index of its engine; sliders: [index of a slider, this mechanism's value] for each parameter of the
+         engine; symbol_updates (symbol_updates.py); start: the state that closure starts from, or null for the scene's own guess;
+         times: all output times of a motion that failed or was stopped, or null
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,28 +20,28 @@ from udkjax.native.base.program import UnsupportedError
 from udkjax.positions.assembly import close
 from udkjax.scene import Mechanism
 from udkjax.scene.requirements import ArgumentError
-from udkjax.show.player.followers import followers
 from udkjax.show.player.live_parameters import Live, Slider, in_sections, names_in, sliders_of
 from udkjax.show.player.measure_curves import ShownMotion
 from udkjax.show.player.player_data import MOST_INSTANTS
+from udkjax.show.player.symbol_updates import symbol_updates
 
-TOLERANCE = 1e-8  # rtol and atol of a run that does not know its own: those of `simulate`
-SAME_STATE = 1e-6  # characteristic lengths, rad, and these over the characteristic time: the scene's own initial state
+TOLERANCE = 1e-8  # rtol and atol of a run without its own: the defaults of `simulate`
+SAME_STATE = 1e-6  # characteristic lengths or rad, per characteristic time: a closer initial state is the scene's own
 
 
 def live_data(
     runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live, events: Sequence[ExpandsToEvents] = ()
 ) -> JsonObject:
-    """Return the further data of a live page of some runs, each with its data for the player.
+    """Return the additional data of a live page.
 
     Args:
-        runs: mechanisms, their motions, and these as the player has them.
-        live: numbers that have sliders.
-        events: of all runs.
+        runs: mechanism, motion and player data of each run.
+        live: parameters that get sliders.
+        events: events of all runs.
 
     Raises:
-        SceneError: no mechanism has a parameter of that name.
-        ArgumentError: a mechanism, or a run, is nothing that a page can solve anew; says why.
+        SceneError: no mechanism has a parameter with a name in `live`.
+        ArgumentError: a page cannot simulate a mechanism or a run; the message gives the reason.
     """
     sliders: dict[str, Slider] = {}
     engines: dict[tuple[int, float, float], int] = {}
@@ -58,9 +58,9 @@ def live_data(
             data["engines"].append(_engine(mechanism, own, rtol, atol, events))
         engine = data["engines"][engines[key]]
         drawn = engine["count"] + engine["knots"] + engine["conditions"]
-        follow = followers(mechanism, record, record["symbols"], drawn)
+        updates = symbol_updates(mechanism, record, record["symbols"], drawn)
         start, times = _start(mechanism, solution), _times(solution)
-        data["runs"].append({"engine": engines[key], "sliders": own, "follow": follow, "start": start, "times": times})
+        data["runs"].append({"engine": engines[key], "sliders": own, "symbol_updates": updates, "start": start, "times": times})
     order = {slider.name: k for k, slider in enumerate(in_sections(sliders.values()))}
     for run in data["runs"]:
         run["sliders"] = [[order[slider.name], slider.value] for slider in run["sliders"]]
@@ -70,13 +70,15 @@ def live_data(
 def _require_solvable(mechanism: Mechanism, solution: ShownMotion, events: Sequence[ExpandsToEvents]):
     happened = getattr(solution, "events", None)
     if happened is not None and not events:
-        raise ArgumentError("live: the run has events, whose conditions a page needs: give `animate` the same `events`, too")
+        raise ArgumentError("live: the run has events, whose conditions the page needs: give `animate` the same `events`")
     names = [event.name for event in expand_events(events, mechanism)] if events else []
     if names and (happened is None or list(happened.names[: len(names)]) != names or len(happened.names) != 3 * len(names)):
-        raise ArgumentError(f"live: the run was not simulated with the events {', '.join(names)}: give `simulate` the same")
+        raise ArgumentError(f"live: the run was not simulated with the events {', '.join(names)}: give them to `simulate`, too")
     stabilization = getattr(solution, "settings", {}).get("stabilization", "Projection")
     if stabilization != "Projection":
-        raise ArgumentError(f"live: a page solves by projection, and the run has stabilization={stabilization}: leave out live")
+        raise ArgumentError(
+            f"live: a page simulates with projection, but the run has stabilization={stabilization}: leave out `live`"
+        )
 
 
 def _engine(
@@ -85,24 +87,24 @@ def _engine(
     try:
         engine = portable_engine(mechanism, [slider.name for slider in sliders], rtol, atol, events=events, drawn=True)
     except UnsupportedError as error:
-        raise ArgumentError(f"live: a page has no instruction for {error}: name the numbers to change, without those") from None
+        raise ArgumentError(f"live: a page cannot compute {error}: choose parameters that do not need it") from None
     if engine.data["why"]:
-        raise ArgumentError(f"live: a page cannot solve the motion anew: {engine.data['why']}")
+        raise ArgumentError(f"live: a page cannot simulate this motion: {engine.data['why']}")
     return engine.data
 
 
 def _times(solution: ShownMotion) -> list[float] | None:
-    """Return all times of a run that failed or was stopped, to whose end other numbers may come; None where it is shown whole."""
+    """Return all output times of a run that ended early, since other numbers may complete it; None for a complete run."""
     ts = np.asarray(solution.ts, float)
     if len(ts) < 2:
-        raise ArgumentError("live: the run has one instant, and no motion to solve anew")
+        raise ArgumentError("live: the run has a single instant, and no motion to simulate")
     if np.isfinite(np.asarray(solution.q)).all():
         return None
     return np.interp(np.linspace(0, len(ts) - 1, min(len(ts), MOST_INSTANTS)), np.arange(len(ts)), ts).tolist()
 
 
 def _start(mechanism: Mechanism, solution: ShownMotion) -> JsonObject | None:
-    """Return the initial state of a run that does not begin where the scene says."""
+    """Return the initial state of a run; None if it is the scene's own."""
     t = float(np.asarray(solution.ts)[0])
     q, v = (np.asarray(x, float)[0] for x in (solution.q, solution.v))
     closed, scales = close(mechanism, t).state, analyse(mechanism).scales

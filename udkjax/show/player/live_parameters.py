@@ -1,4 +1,4 @@
-"""Sliders of a live page: which numbers of a scene they change, what they are called, and from where to where they go."""
+"""Sliders of a live page: their parameters, labels, sections and ranges."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +14,7 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.units import conversion_factor, units_of
 
-# Names of parameters, whole or one entry, by themselves or with the range of their sliders; True: all that a scene has.
+# Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.
 Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]
 
 SECTIONS = {
@@ -29,20 +29,20 @@ SECTIONS = {
     "joint": "Joints",
     "body": "Bodies",
     "link": "Links",
-}  # in their order; all others follow
-PLACES = ("points", "point", "position", "velocity", "vector", "gravity")  # fields of which two entries are x and y
-NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of what is never negative
+}  # in order; further sections follow
+PLACES = ("points", "point", "position", "velocity", "vector", "gravity")  # fields whose two entries are x and y
+NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of quantities that are never negative
 INITIAL = "Initial state"
-INITIAL_FIELDS = ("velocity", "angular_velocity")  # and of bodies their position and angle, which assembly starts from
+INITIAL_FIELDS = ("velocity", "angular_velocity")  # also position and angle of bodies, from which assembly starts
 SIZES = ("length", "radius", "width", "thickness", "radii")  # lengths that are never negative; all others are places
-LEAST_VALUE = 1e-9  # of the scene's units: a number below it stands for zero
+LEAST_VALUE = 1e-9  # relative to the scene's units: smaller values are zero
 LARGEST_GRAVITY = 20.0  # m/s2: twice that of the earth
 
 
 class Slider(NamedTuple):
-    """One number that a page changes: its parameter, what it is called and where, its range.
+    """A slider of a page: its parameter, label, section, unit, value and range.
 
-    Value and range are in SI units; the page shows `per_unit` times as much in the unit of the drawing, `shown`.
+    Value and range are in SI units; the page shows `per_unit` times these numbers in the unit of the drawing, `shown`.
     """
 
     name: str
@@ -62,11 +62,11 @@ class Slider(NamedTuple):
 
 
 def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
-    """Return the sliders of the numbers that are wanted.
+    """Return the sliders of the wanted parameters.
 
     Raises:
-        SceneError: A name is no parameter.
-        ValueError: A range does not hold the value that the number has.
+        SceneError: a name is not a parameter.
+        ValueError: a range does not contain the value of its parameter.
     """
     wanted = None if isinstance(live, bool) else list(live)
     ranges = live if isinstance(live, Mapping) else {}
@@ -75,13 +75,13 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
     found, bound = [], pins_in_line(mechanism)
     written = Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
     for name, value in scalar_parameters(mechanism, wanted).items():
-        if wanted is None and (".profile." in name or _base(name) in bound):  # the outline of a cam is drawn as it was
+        if wanted is None and (".profile." in name or _base(name) in bound):  # the drawn outline of a cam does not change
             continue
         given = ranges.get(name) or ranges.get(_base(name))
         unit = units_of(mechanism, name)
         low, high = given or usual_range(name, unit, value, length, rate)
         if not low <= value <= high or not low < high:
-            raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not hold its value {value:g}")
+            raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not contain its value {value:g}")
         shown = written.shown(unit)
         per_unit = 1.0 / conversion_factor(shown, unit) if shown != unit else 1.0
         found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high), shown, per_unit))
@@ -89,7 +89,7 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
 
 
 def pins_in_line(mechanism: Mechanism) -> set[str]:
-    """Return the parameters of pins of bars that have more than two: one alone cannot move, but the others must stay in line."""
+    """Return the parameters of pins of bars with more than two pins: moving one alone would take it out of line."""
     links = mechanism.drawing.links.values() if isinstance(mechanism.drawing, Drawing) else []
     return {f"pin.{pin}" for link in links if link.kind == "bar" and len(link.pins) > 2 for pin in link.pins}
 
@@ -101,7 +101,7 @@ def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
 
 
 def names_in(mechanism: Mechanism, live: Live) -> Live:
-    """Return the names, of those wanted, that a mechanism has."""
+    """Return those of the wanted names that are parameters of a mechanism."""
     if isinstance(live, bool):
         return live
     known = mechanism.parameters()
@@ -111,7 +111,7 @@ def names_in(mechanism: Mechanism, live: Live) -> Live:
 
 
 def section_of(name: str) -> str:
-    """Return the title below which a slider stands."""
+    """Return the section of a slider."""
     parts = _base(name).split(".")
     section, field = parts[0], parts[-1]
     if field in INITIAL_FIELDS or (section == "body" and field in ("position", "angle")):
@@ -120,7 +120,7 @@ def section_of(name: str) -> str:
 
 
 def label_of(name: str) -> str:
-    """Return a parameter's title: `joint.A.points[1][0]` is "A point 2 x"."""
+    """Return the label of a parameter: that of `joint.A.points[1][0]` is "A point 2 x"."""
     base, indices = _base(name), [int(k) for k in re.findall(r"\[(\d+)\]", name)]
     parts = base.split(".")
     words = parts[1:] if len(parts) > 1 else parts
@@ -130,11 +130,11 @@ def label_of(name: str) -> str:
     in_plane = parts[-1] in PLACES or parts[0] == "pin"
     text += "".join(f" {'xy'[k]}" if in_plane and k < 2 else f" {k + 1}" for k in indices)
     given = text.split(" ")
-    return " ".join(word for k, word in enumerate(given) if k == 0 or word != given[k - 1])  # the speed of a motor called motor
+    return " ".join(word for k, word in enumerate(given) if k == 0 or word != given[k - 1])  # not "motor motor speed"
 
 
 def usual_range(name: str, unit: str, value: float, length: float, rate: float) -> tuple[float, float]:
-    """Return the range of a slider: positions go as far as a mechanism is large, other numbers to a few times their values."""
+    """Return the default range of a slider: the mechanism's size around a position, a few times the value of other numbers."""
     by_unit = {"m/s": length * rate, "rad/s": rate, "m": length, "rad": 1.0}
     size = abs(value) if abs(value) > LEAST_VALUE * by_unit.get(unit, 0.0) else 0.0
     if unit == "m/s2":
@@ -150,5 +150,5 @@ def usual_range(name: str, unit: str, value: float, length: float, rate: float) 
 
 
 def _base(name: str) -> str:
-    """Return the name of the parameter that an entry is of."""
+    """Return the name of the parameter of an entry."""
     return re.sub(r"(\[\d+\])+$", "", name)

@@ -1,34 +1,34 @@
-// One run of a live page: its first motion, and the motion of other numbers, which its engine solves a part at a time.
+// One run of a live page: its first motion, and the motion with changed numbers, which its engine simulates part by part.
 
-import {Follower} from "./follow.js";
 import {Hand, bodyAt} from "./hand.js";
 import {Run, boundsOf, place} from "./motion.js";
+import {SymbolUpdater} from "./symbol_updates.js";
 
-const SMALLEST_POSITIVE = 1e-17;  // m: a violation that is zero, on a logarithmic scale
-const GHOST = 0.28;  // how much one sees of the first motion
-const REACH = {mouse: 6, touch: 16};  // px beside a body where it can be grasped
-// Of code times steps that a processor of today runs in 5 ms, a third of the time of a picture: the same on each machine, so that the
-// same numbers give the same motion.
+const SMALLEST_POSITIVE = 1e-17;  // m: drawn instead of a zero violation on a logarithmic axis
+const GHOST = 0.28;  // opacity of the first motion
+const REACH = {mouse: 6, touch: 16};  // px around a body within which it can be grasped
+// Bytes of code times steps per frame: some 5 ms on a current processor, a third of a frame. It is the same on every machine, so
+// that the same numbers give the same motion.
 const STEP_BYTES = 4e7;
-const USUAL = 0.95;  // of the instants have no force that is larger than the usual one, which sets the arrows' length
+const USUAL = 0.95;  // fraction of the instants without a force above the usual force, which scales the arrows
 
 export class LiveRun {
-  /** `live` is the page's; `run` is shown; `record` is it as data, and `data` what makes it live. */
+  /** `live` is the page; `run` is shown; `record` is its data, and `data` its further data for a live page. */
   constructor(live, run, record, data) {
     const {ts, q, v, measures, frame, reactions, forces, events} = run;
     Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events}});
-    this.times = data.times ? Float64Array.from(data.times) : ts;  // all of them, where the first motion failed, or stopped
-    this.follower = new Follower(run, data.follow);
+    this.times = data.times ? Float64Array.from(data.times) : ts;  // all output times, even if the first motion failed or was stopped
+    this.updater = new SymbolUpdater(run, data.symbol_updates);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
   }
 
   use(engine) {
     this.engine = engine;
-    this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // of one picture
-    this.usual = this.freedoms(this.close(null), null);
+    this.steps = Math.round(STEP_BYTES / engine.data.modules.run.bytes);  // per frame
+    this.firstFreedoms = this.freedoms(this.close(null), null);
   }
 
-  /** The numbers of this run's sliders; those that nobody has moved are its own. */
+  /** The numbers of this run's sliders; sliders that were not moved have the run's own numbers. */
   get values() {
     const {values, data: {sliders}} = this.live;
     return Float64Array.from(this.data.sliders, ([k, own]) => (values[k] === sliders[k].value ? own : values[k]));
@@ -38,7 +38,7 @@ export class LiveRun {
 
   close(values) { return this.engine.close(values, {t: this.times[0], ...this.data.start}); }
 
-  /** The degrees of freedom near a closed state, whose marks are found; null where branches of the motion meet. */
+  /** The degrees of freedom near a closed state, whose marks are set; null where branches of the motion meet. */
   freedoms(state, values) {
     this.marks = state.marks = this.engine.mark(values, state);
     const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
@@ -53,24 +53,24 @@ export class LiveRun {
     this.run.replace(ts, q, v, measures, frame, events);
     this.run.held = null;
     this.showReactions(reactions, forces);
-    this.follower.follow(this.engine.numbers(null));
+    this.updater.update(this.engine.numbers(null));
     this.changed = false;
   }
 
-  // Solving
+  // Simulating
 
-  /** Begin to solve the motion of the numbers as they are; returns words where its loops do not close. */
+  /** Begin to simulate the motion with the current numbers; returns a message if its loops do not close. */
   begin() {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
-    if (!state.closed) return `The loops do not close with these numbers: they stay open by ${this.lengthOf(state.violation)}. The last motion that does is shown.`;
+    if (!state.closed) return `The loops do not close with these numbers: a gap of ${this.lengthOf(state.violation)} remains. The last possible motion is shown.`;
     const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
-    this.follower.follow(engine.numbers(values));
+    this.updater.update(engine.numbers(values));
     return "";
   }
 
-  /** Solve on for as many steps as fit into one picture; returns what is said, and whether it ended too early. */
+  /** Simulate as many steps as fit into one frame; returns the message, with `bad` for a motion that ended too early. */
   goOn() {
     const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
     const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
@@ -87,12 +87,13 @@ export class LiveRun {
     job.tried += part.tried;
     job.state = part.last;
     this.show(run);
-    if (part.limited && job.tried < most) return {words: `Solving: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
+    if (part.limited && job.tried < most) return {words: `Simulating: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
     this.job = null;
     const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
-    const ended = part.done ? `${+span.toPrecision(3)} s solved anew in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
+    const ended = part.done ? `${+span.toPrecision(3)} s simulated in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
       : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
-    const words = job.freedoms === this.usual || job.freedoms === null ? ended : `${ended} ${job.freedoms} degrees of freedom here${this.usual === null ? "" : `, ${this.usual} at first`}.`;
+    const first = this.firstFreedoms === null ? "" : `, ${this.firstFreedoms} in the first motion`;
+    const words = job.freedoms === this.firstFreedoms || job.freedoms === null ? ended : `${ended} Degrees of freedom: ${job.freedoms}${first}.`;
     return {words, bad: !part.done && !part.stop};
   }
 
@@ -115,13 +116,13 @@ export class LiveRun {
     this.changed = true;
   }
 
-  /** Events as they are shown: {t, name}. */
+  /** Events in the form in which they are shown, {t, name}. */
   named(events) {
     const names = this.engine.data.events?.names ?? [], nameOf = k => names[k % names.length] + ["", " lets go", " rests"][Math.floor(k / names.length)];
     return events.map(({t, index}) => ({t, name: nameOf(index)}));
   }
 
-  /** The arrows of forces that the page has found; none where joints are redundant: their shares would be a choice. */
+  /** The arrows of forces computed in the page; null with redundant constraints, since forces are not unique. */
   reactions(forces) {
     const {first: {reactions}} = this, each = 2 * (reactions?.anchors.length ?? 0);
     if (!forces.length || !reactions) return null;
@@ -139,7 +140,7 @@ export class LiveRun {
     if (button) button.disabled = !this.player.runs.some(run => run.reactions);
   }
 
-  /** The measures of a motion that the page finds itself, under the names of those that were recorded. */
+  /** The measures of a motion that the page computes, under the names of the recorded ones. */
   measures(run, found) {
     const {length} = this.engine.data.scales;
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
@@ -149,15 +150,15 @@ export class LiveRun {
     return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
   }
 
-  // The hand
+  // Pulling
 
-  /** The state at the time that is shown. */
+  /** The state at the time shown. */
   stateNow() {
     const t = this.player.t, {q, v} = this.run.state(t);
     return {...this.engine.close(this.values, {t, q, v}), t};
   }
 
-  /** What is on a panel's canvas at a place (px), if a hand can grasp it. */
+  /** The body at a pixel of a panel's canvas, if it can be grasped. */
   bodyAt(canvas, point, pointer = "mouse") {
     if (!this.engine) return null;
     const painter = this.player.painter(canvas);
@@ -187,7 +188,7 @@ export class LiveRun {
     return [(x - view.x) / view.scale, (view.y - y) / view.scale];
   }
 
-  /** Begin a record that a hand goes on with: of what was until now. */
+  /** Begin the record of a pull with the motion up to now. */
   record(state) {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
     const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
@@ -198,7 +199,7 @@ export class LiveRun {
     this.append(state, state.violation, []);
   }
 
-  /** Add one state to the record, and the events before it, and show it. */
+  /** Add a state, and the events before it, to the record, and show it. */
   append({t, q, v, held = -1}, violation, events) {
     const {past} = this;
     this.happened.push(...this.named(events));
@@ -219,7 +220,7 @@ export class LiveRun {
     this.run.events = this.happened;
   }
 
-  /** Solve on from where the hand lets go, for as long as the first motion is. */
+  /** Continue the simulation after a pull, for the duration of the first motion. */
   letGo(state) {
     const {engine, past} = this, n = engine.size, times = this.times.map(t => t - this.times[0] + state.t);
     const run = engine.run(this.values, state, times);
@@ -233,8 +234,8 @@ export class LiveRun {
     this.happened.push(...this.named(run.events));
     this.showPast();
     this.player.setEnd(this.live.end);
-    const ended = `Let go: the motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
-    this.live.say(run.done ? "Let go: the motion goes on by itself." : ended, !run.done && !run.stop);
+    const ended = `Released: the motion ends at ${run.t.toPrecision(4)} s: ${run.words}.`;
+    this.live.say(run.done ? "Released: the motion continues by itself." : ended, !run.done && !run.stop);
     this.player.play();
   }
 
@@ -257,6 +258,6 @@ export class LiveRun {
     painter.circle(to, 6 * painter.pt, {stroke: painter.theme.accent, width: 1.6});
   }
 
-  /** Left, bottom, right, top (m) of all that is drawn of the motion as it is now. */
+  /** Left, bottom, right, top (m) of everything drawn in the current motion. */
   bounds() { return boundsOf(this.run, 0.1 * this.engine.data.scales.length); }
 }

@@ -1,28 +1,7 @@
-"""Marks of a mechanism's picture: a list of plain data that the player in the browser and the writers of pictures share.
+"""Marks of a mechanism's picture: plain data shared by the player in the browser and the writers of pictures.
 
-A mark is a dict with a `kind`. Places are in metres in the frame of a body, which is a number: the body's place in the
-mechanism, or -1 for the ground; an `anchor` is [body, x, y]. How each kind is drawn, symbols.py says.
-
-    link      body, points, closed          a bar through the points that hold a body, or a plate
-    disc      body, at, radius              a body that has no other shape: a disc of its radius of gyration
-    wheel     body, at, radius, internal    a gear's or a pinion's pitch circle
-    outline   body, at, points              a cam's profile; its points are relative to `at`
-    rail      body, at, axis, span, slot    the line of a prismatic joint or a slot, as far as it is used (m along `axis`)
-    rack      body, at, axis, span          a rack's pitch line
-    floor     body, at, axis, span          the line of a contact, as far as it is hit; what is allowed lies to its left
-    block     body, at, axis                what slides on a rail
-    support   body, at                      what holds a pin to the ground
-    pin       body, at, name                a revolute joint or the end of a rod
-    roller    body, at                      what slides in a slot or follows a cam
-    weld      body, at                      no relative motion
-    rod       a, b                          a distance joint, between two anchors
-    spring    a, b, damper, length          a spring, between two anchors, which is usually so long (m)
-    spiral    body, at                      a torsion spring
-    piston    a, b                          a driver of a length
-    motor     body, at                      a driver of an angle
-    friction  body, at                      friction in a revolute joint
-    force     body, at, vector, turns       a force, as it is at time 0, whose direction `turns` with the body or not
-    torque    body, at, sign                a torque, as it is at time 0
+A mark is a dict with a `kind`, whose further fields are listed in mark_kinds.py. Places are in metres in the frame of a body,
+which is given by its index in the mechanism, or -1 for the ground; an `anchor` is [body, x, y]. symbols.py draws the marks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,27 +34,28 @@ from udkjax.scene import (
     Weld,
 )
 from udkjax.scene.held import value_at
+from udkjax.show.player.mark_kinds import MarkKind
 
 Mark = JsonObject
 BodyPoints = Mapping[str, ArrayLike]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # of a cam's outline
-SAME_PLACE = 1e-9  # of the largest coordinate: attachments that are closer are one point
-ROD = 0.01  # of the inertia: how near to that of a uniform rod it must be for one to be drawn
-MARGIN = 0.08  # of the length of a mechanism: how far a rail goes beyond what slides on it
+SAME_PLACE = 1e-9  # fraction of the largest coordinate: attachments that are closer are one point
+ROD = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
+MARGIN = 0.08  # length of a rail beyond the used range, as a fraction of the mechanism's length
 
 
 def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = None, gaps: Sequence[Gap] = ()) -> list[Mark]:
-    """Return the marks of a mechanism, the farthest first.
+    """Return the marks of a mechanism, from back to front.
 
     Args:
         mechanism: mechanism to draw.
-        poses: all those that it will be drawn in.
-        shapes: points (n, 2) of bodies by name, in their own frames (m), through which these are drawn, too.
+        poses: all poses in which it will be drawn.
+        shapes: further points (n, 2) of bodies by name, in their own frames (m), that the drawn bodies go through.
         gaps: conditions of contacts, whose lines are drawn.
 
     Raises:
-        ValueError: `shapes` names what is no body.
+        ValueError: a name in `shapes` is not a body.
     """
     unknown = [name for name in shapes or {} if name not in mechanism.bodies]
     if unknown:
@@ -92,19 +72,19 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = No
 
 
 def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
-    """Return the points at which joints, drivers and springs hold each body, and pins of its own, in its frame (m), each once."""
-    held: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mechanism.bodies, GROUND)}
+    """Return the distinct points of each body (m, in its frame): attachments of joints, drivers and springs, and its own pins."""
+    attached: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mechanism.bodies, GROUND)}
     springs = [force for force in mechanism.forces.values() if isinstance(force, Spring)]
     for element in (*mechanism.constraints.values(), *springs):
         points = getattr(element, "points", None)
         if points is None or getattr(element, "coordinate", "") == "angle":
             continue
         for body, (x, y) in zip(element.bodies, np.asarray(points, float).tolist()):
-            held[body].append((x, y))
+            attached[body].append((x, y))
     if mechanism.drawing is not None:
         for body, place in mechanism.drawing.free_pins().values():
-            held[body].append(tuple(np.asarray(place, float).tolist()))
-    return {body: _distinct(points) for body, points in held.items()}
+            attached[body].append(tuple(np.asarray(place, float).tolist()))
+    return {body: _distinct(points) for body, points in attached.items()}
 
 
 def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"]:
@@ -117,7 +97,7 @@ def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"
 
 
 class _Drawing:
-    """The marks of one mechanism, in the order in which they cover one another."""
+    """The marks of one mechanism, collected by the order in which they cover one another."""
 
     def __init__(self, mechanism: Mechanism, poses: Poses, shapes: BodyPoints):
         self.mechanism, self.poses = mechanism, poses
@@ -135,7 +115,7 @@ class _Drawing:
         self.wheels: list[Mark] = []
         self.elements: list[Mark] = []
         self.pins: list[Mark] = []
-        self.shaped: set[str] = set()  # bodies that something else than a link stands for
+        self.shaped: set[str] = set()  # bodies drawn as something other than a link
         for name, joint in mechanism.joints.items():
             self._joint(name, joint)
         for driver in mechanism.drivers.values():
@@ -144,7 +124,7 @@ class _Drawing:
             self._force(force)
 
     def links(self) -> list[Mark]:
-        """Return a link for each body with several points, and a disc for each that nothing else stands for."""
+        """Return a link for each body with several points, and a disc for each body without any other mark."""
         found: list[Mark] = []
         for body, points in self.points.items():
             if body == GROUND:
@@ -152,16 +132,16 @@ class _Drawing:
             k, single = self.number[body], len(points) == 1
             inertia, mass = (float(getattr(self.mechanism.bodies[body], name)) for name in ("inertia", "mass"))
             reach = float(np.linalg.norm(points[0])) if single else 0.0
-            # A uniform rod of length 2 r has inertia m r^2 / 3: one that is held at its end is drawn to its other end.
+            # A uniform rod of length 2 r has the inertia m r^2 / 3; if attached at one end, it is drawn to its other end.
             rod = single and abs(3 * inertia - mass * reach**2) < ROD * mass * reach**2
             if single and reach > SAME_PLACE * self.size:
                 points = np.concatenate([points, -points if rod else np.zeros((1, 2))])
             if len(points) > 1:
                 corners, closed = corners_of(points, self.polygons.get(body))
-                found.append({"kind": "link", "body": k, "points": corners.tolist(), "closed": closed})
+                found.append({"kind": MarkKind.LINK, "body": k, "points": corners.tolist(), "closed": closed})
             if len(self.points[body]) < 2 and body not in self.shaped and not rod:
                 radius = min(np.sqrt(inertia / mass), self.size / 4)
-                found.append({"kind": "disc", "body": k, "at": [0.0, 0.0], "radius": radius})
+                found.append({"kind": MarkKind.DISC, "body": k, "at": [0.0, 0.0], "radius": radius})
         return found
 
     def _joint(self, name: str, joint: Joint) -> None:
@@ -169,12 +149,12 @@ class _Drawing:
             case Revolute():
                 self._pin(name, self._held(joint.bodies, joint.points))
             case Weld():
-                self.elements.append({"kind": "weld", **self._held(joint.bodies, joint.points)})
+                self.elements.append({"kind": MarkKind.WELD, **self._held(joint.bodies, joint.points)})
             case Prismatic() | Slot():
                 self._rail(joint)
             case Distance():
                 a, b = self._anchors(joint.bodies, joint.points)
-                self.elements.append({"kind": "rod", "a": a, "b": b})
+                self.elements.append({"kind": MarkKind.ROD, "a": a, "b": b})
                 for k, x, y in (a, b):
                     self._pin(name, {"body": int(k), "at": [x, y]})
             case Gear():
@@ -185,23 +165,24 @@ class _Drawing:
                 angle = np.linspace(0.0, 2 * np.pi, PROFILE_POINTS, endpoint=False)
                 radius = np.asarray(jax.vmap(joint.profile)(jax.numpy.asarray(angle)))
                 rim = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-                self.wheels.append({"kind": "outline", **self._at(joint.bodies[0], joint.points[0]), "points": rim.tolist()})
-                self.elements.append({"kind": "roller", **self._at(joint.bodies[1], joint.points[1])})
+                place = self._at(joint.bodies[0], joint.points[0])
+                self.wheels.append({"kind": MarkKind.OUTLINE, **place, "points": rim.tolist()})
+                self.elements.append({"kind": MarkKind.ROLLER, **self._at(joint.bodies[1], joint.points[1])})
                 self.shaped.add(joint.bodies[0])
             case _ if (points := getattr(joint, "points", None)) is not None and len(joint.bodies) == 2:
                 self._pin(name, self._held(joint.bodies, points))
 
     def _pin(self, name: str, place: Mark) -> None:
-        self.pins.append({"kind": "pin", "name": name, **place})
+        self.pins.append({"kind": MarkKind.PIN, "name": name, **place})
         if place["body"] < 0:
-            self.rails.append({"kind": "support", **place})
+            self.rails.append({"kind": MarkKind.SUPPORT, **place})
 
     def _driver(self, driver: Driver) -> None:
         if driver.coordinate == "angle":
-            self.elements.append({"kind": "motor", **self._axle(driver.bodies)})
+            self.elements.append({"kind": MarkKind.MOTOR, **self._axle(driver.bodies)})
         elif driver.coordinate == "distance":
             a, b = self._anchors(driver.bodies, driver.points)
-            self.elements.append({"kind": "piston", "a": a, "b": b})
+            self.elements.append({"kind": MarkKind.PISTON, "a": a, "b": b})
 
     def _force(self, force: ForceElement) -> None:
         match force:
@@ -209,18 +190,19 @@ class _Drawing:
                 a, b = self._anchors(force.bodies, force.points)
                 ends = (self._path(body, point) for body, point in zip(force.bodies, np.asarray(force.points), strict=True))
                 length = float(np.median(np.linalg.norm(np.subtract(*ends), axis=1)))
-                self.elements.append({"kind": "spring", "a": a, "b": b, "damper": force.damping is not None, "length": length})
+                damper = force.damping is not None
+                self.elements.append({"kind": MarkKind.SPRING, "a": a, "b": b, "damper": damper, "length": length})
             case TorsionSpring():
-                self.elements.append({"kind": "spiral", **self._axle(force.bodies)})
+                self.elements.append({"kind": MarkKind.SPIRAL, **self._axle(force.bodies)})
             case Friction():
-                self.elements.append({"kind": "friction", **self._axle(self.mechanism.joints[force.joint].bodies)})
+                self.elements.append({"kind": MarkKind.FRICTION, **self._axle(self.mechanism.joints[force.joint].bodies)})
             case Force():
                 place = self._at(force.body, force.point)
                 vector = np.asarray(value_at(force.vector, 0.0), float).tolist()
-                self.elements.append({"kind": "force", **place, "vector": vector, "turns": force.frame == "body"})
+                self.elements.append({"kind": MarkKind.FORCE, **place, "vector": vector, "turns": force.frame == "body"})
             case Torque():
                 sign = 1 if float(value_at(force.value, 0.0)) >= 0 else -1
-                self.elements.append({"kind": "torque", **self._axle(force.bodies), "sign": sign})
+                self.elements.append({"kind": MarkKind.TORQUE, **self._axle(force.bodies), "sign": sign})
 
     def _rail(self, joint: Prismatic | Slot) -> None:
         one, two = joint.bodies
@@ -229,16 +211,16 @@ class _Drawing:
         start, end = self._travel(one, joint.points[0], axis, two, joint.points[1])
         margin = MARGIN * self.size
         rail = {**self._at(one, joint.points[0]), "axis": axis, "span": [start - margin, end + margin], "slot": slot}
-        self.rails.append({"kind": "rail", **rail})
+        self.rails.append({"kind": MarkKind.RAIL, **rail})
         if slot:
-            self.pins.append({"kind": "roller", **self._at(two, joint.points[1])})
+            self.pins.append({"kind": MarkKind.ROLLER, **self._at(two, joint.points[1])})
         else:
-            block = {"kind": "block", **self._at(two, joint.points[1]), "axis": axis - float(np.asarray(joint.angle))}
+            block = {"kind": MarkKind.BLOCK, **self._at(two, joint.points[1]), "axis": axis - float(np.asarray(joint.angle))}
             self.elements.append(block)
             self.shaped.add(two)
 
     def add_floor(self, gap: Gap) -> None:
-        """Add the line of a contact, from end to end of where its point comes near."""
+        """Add the line of a contact, over the range in which its point comes close."""
         (body, on), margin = gap.bodies, MARGIN * self.size
         nx, ny = np.asarray(gap.normal, float)
         axis = float(np.arctan2(-nx, ny))
@@ -246,13 +228,13 @@ class _Drawing:
         along, gaps = (way[:, 0] * np.cos(a) + way[:, 1] * np.sin(a) for a in (turned, turned + np.pi / 2))
         near = along[gaps <= gaps.min() + margin]
         span = [float(near.min()) - margin, float(near.max()) + margin]
-        self.rails.append({"kind": "floor", **self._at(on, gap.through), "axis": axis, "span": span})
+        self.rails.append({"kind": MarkKind.FLOOR, **self._at(on, gap.through), "axis": axis, "span": span})
 
     def _gear(self, joint: Gear) -> None:
         largest = int(np.argmax(np.asarray(joint.radii)))
         for k, (body, radius) in enumerate(zip(joint.bodies, np.asarray(joint.radii, float).tolist(), strict=True)):
             place = self._held_by(body, joint.carrier)
-            wheel = {"kind": "wheel", **place, "radius": radius, "internal": joint.internal and k == largest}
+            wheel = {"kind": MarkKind.WHEEL, **place, "radius": radius, "internal": joint.internal and k == largest}
             if wheel not in self.wheels:
                 self.wheels.append(wheel)
             self.shaped.add(body)
@@ -264,8 +246,8 @@ class _Drawing:
         right = np.array([np.sin(axis), -np.cos(axis)])
         at = _local(frame, pinion) + radius * right
         start, end = self._travel(one, at, axis, two, (0.0, 0.0))
-        self.rails.append({"kind": "rack", **self._at(one, at), "axis": axis, "span": [start - radius, end + radius]})
-        self.wheels.append({"kind": "wheel", **self._at(two, (0.0, 0.0)), "radius": radius, "internal": False})
+        self.rails.append({"kind": MarkKind.RACK, **self._at(one, at), "axis": axis, "span": [start - radius, end + radius]})
+        self.wheels.append({"kind": MarkKind.WHEEL, **self._at(two, (0.0, 0.0)), "radius": radius, "internal": False})
         self.shaped.add(two)
 
     def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
@@ -285,7 +267,7 @@ class _Drawing:
         return {"body": self.number[body], "at": np.asarray(point, float).tolist()}
 
     def _held(self, bodies: Sequence[str], points: ArrayLike) -> Mark:
-        """Return the place of a joint: on the ground, if it holds something to it, else on its first body."""
+        """Return the place of a joint: on the ground if that is one of its bodies, else on its first body."""
         side = 1 if bodies[1] == GROUND else 0
         return self._at(bodies[side], np.asarray(points)[side])
 
@@ -293,20 +275,20 @@ class _Drawing:
         return [[self.number[body], x, y] for body, (x, y) in zip(bodies, np.asarray(points, float).tolist(), strict=True)]
 
     def _held_by(self, body: str, other: str) -> Mark:
-        """Return the point where a revolute joint holds `body` to `other`, in the frame of `body`; its origin, if none does."""
+        """Return the point of a revolute joint between `body` and `other` in the frame of `body`; without one, its origin."""
         for joint in self.mechanism.joints.values():
             if isinstance(joint, Revolute) and set(joint.bodies) == {body, other}:
                 return self._at(body, joint.points[joint.bodies.index(body)])
         return self._at(body, (0.0, 0.0))
 
     def _axle(self, bodies: Sequence[str]) -> Mark:
-        """Return the point about which two bodies turn: at their revolute joint, else at the second one's centre of mass."""
+        """Return the point about which two bodies turn: their revolute joint, or else the second body's centre of mass."""
         one, two = bodies
         return self._held_by(one if two == GROUND else two, two if two == GROUND else one)
 
 
 def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
-    """Return a point of a body's frame in ground coordinates (m), for each of its coordinates x, y, angle; or points for one."""
+    """Return a point of a body in ground coordinates (m) for each of its frames x, y, angle; or several points for one frame."""
     x, y = np.asarray(point, float).T
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
     return frames[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
@@ -315,9 +297,9 @@ def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.nd
 def corners_of(
     points: Float[np.ndarray, "points 2"], polygon: Float[np.ndarray, "corners 2"] | None = None
 ) -> tuple[Float[np.ndarray, "corners 2"], bool]:
-    """Return the ends of a bar through points that are in line, or else, and True, the corners of the plate that holds them.
+    """Return the ordered points of a bar, and False, if they are in line; else the corners of a plate around them, and True.
 
-    It is the polygon, if there is one and no point lies beyond the corners' convex hull; else the convex hull of the points.
+    The plate is `polygon`, if that contains all corners of the convex hull of the points; else the convex hull.
     """
     from scipy.spatial import ConvexHull  # importing SciPy takes longer than the call
 

@@ -1,4 +1,4 @@
-"""Numbers over time that a strip below the motion shows, and the arrows of reactions on it."""
+"""Curves over time below the motion, and arrows of reactions."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
@@ -24,10 +24,10 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene import GROUND, Mechanism
 from udkjax.study.accuracy import conserves_energy
 
-SMALLEST_POSITIVE = 1e-17  # below any violation (m, rad) or singular value but zero, which has no logarithm: drawn in its place
+SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis: less than any nonzero violation or singular value
 
 
-# Names of measures, or values over time by name; of several runs, by name and then by the run's label.
+# Names of measures, or values over time by name; for several runs, by name and then by label.
 Measures = Sequence[str] | Mapping[str, ArrayLike | Mapping[str, ArrayLike] | None]
 
 
@@ -48,7 +48,7 @@ class ShownMotion(Protocol):
 
 
 class MeasureCurve(NamedTuple):
-    """A number over time: its name, unit, values at the output times, and whether they are drawn over a logarithm."""
+    """A number over time: its name, unit, values at the output times; `log` for a logarithmic axis."""
 
     name: str
     unit: str
@@ -57,19 +57,19 @@ class MeasureCurve(NamedTuple):
 
 
 def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, label: str) -> list[MeasureCurve]:
-    """Return the measures of a run: those of `MEASURES` by their names, or others as {"name" or "name (unit)": values}.
+    """Return the measures of a run: those of `MEASURES` by name, or others as {"name" or "name (unit)": values}.
 
-    Values may be under the labels of the runs that have them.
+    Values may also be mappings by the label of a run.
 
     Raises:
-        ValueError: a name that is not known, or values that are not one number for each output time.
+        ValueError: a name is unknown, or values are not one number per output time.
     """
     found: list[MeasureCurve] = []
     given = wanted if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
     for name, values in given.items():
         if values is None:
             if name not in MEASURES:
-                raise ValueError(f"measure {name!r} is not known: take {', '.join(MEASURES)}, or give its values")
+                raise ValueError(f"measure {name!r} is unknown: use {', '.join(MEASURES)}, or give its values")
             found += MEASURES[name](mechanism, solution)
         elif not isinstance(values, Mapping) or label in values:
             values = values[label] if isinstance(values, Mapping) else values
@@ -89,7 +89,7 @@ def singular_values_over_time(mechanism: Mechanism, solution: ShownMotion) -> Fl
 
 
 def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return the number of singular values above `STATIC_RANK_TOL` times the largest, in each row; NaN if there are none."""
+    """Return the number of singular values in each row above `STATIC_RANK_TOL` times the largest; NaN for rows of NaN."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
     count = (values > determinacy.STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
@@ -103,7 +103,7 @@ def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q:
 
 def _violation(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     psi = np.asarray(violation(mechanism, solution))
-    values = np.abs(psi) * np.asarray(analyse(mechanism).scales.weights)  # radians as an arc of the characteristic length
+    values = np.abs(psi) * np.asarray(analyse(mechanism).scales.weights)  # radians as arcs of the characteristic length
     return [MeasureCurve("violation", "m", np.maximum(values.max(axis=1, initial=0.0), SMALLEST_POSITIVE), log=True)]
 
 
@@ -122,9 +122,9 @@ def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     values = singular_values_over_time(mechanism, solution)
     count = rank_of(values)
     found = [MeasureCurve("rank", "", count)]
-    usual = int(np.nanmax(count, initial=0))
-    if usual:
-        found.append(MeasureCurve(f"singular value {usual}", "", np.maximum(values[:, usual - 1], SMALLEST_POSITIVE), log=True))
+    full = int(np.nanmax(count, initial=0))
+    if full:
+        found.append(MeasureCurve(f"singular value {full}", "", np.maximum(values[:, full - 1], SMALLEST_POSITIVE), log=True))
     return found
 
 
@@ -138,13 +138,13 @@ MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort":
 
 
 def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArrows:
-    """Return the data of arrows of reactions, for each joint and driver that puts a force on a body.
+    """Return the arrows of reactions, for each joint and driver that exerts a force on a body.
 
     Returns:
-        Anchors [body, x, y]; forces (N, ground axes) on the second body, or, where this is the ground, on the first one, of
-        redundant constraints the share of least norm; and whether they are unique throughout the run.
+        Anchors [body, x, y]; forces (N, ground axes) on the second body, or on the first if the second is the ground, of least
+        norm where redundant constraints share them; and True for forces that are unique throughout the run.
     """
-    loads, known = reactions(mechanism, solution), unique_reactions(mechanism, solution)
+    loads, uniqueness = reactions(mechanism, solution), unique_reactions(mechanism, solution)
     bodies = list(mechanism.bodies)
     alive = np.isfinite(np.asarray(solution.q)).all((1, 2))
     anchors, forces, unique = [], [], []
@@ -156,5 +156,5 @@ def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArro
         body, point = constraint.bodies[side], np.asarray(points, float)[side]
         anchors.append([bodies.index(body), *point.tolist()])
         forces.append(np.asarray(loads[name][body])[:, :2])
-        unique.append(bool(np.asarray(known[name][body])[alive, :2].all()))
+        unique.append(bool(np.asarray(uniqueness[name][body])[alive, :2].all()))
     return anchors, np.stack(forces, axis=1) if forces else np.zeros((len(solution.ts), 0, 2)), unique

@@ -1,9 +1,9 @@
-// Motions: packed tables, and where the bodies of a run are at any time.
+// Motions: packed tables, and the positions of the bodies of a run at any time.
 
 export const bytesOf = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
 const floats = text => new Float32Array(bytesOf(text).buffer);
 
-/** A packed table (udkjax/show/player/packing.py), row by row. Sums stay below 2^53: no bit operations, which have 32 bits. */
+/** A packed table (udkjax/show/player/packing.py), row by row. Bit operations have only 32 bits; sums stay below 2^53. */
 function unpack({rows, steps, bytes}) {
   const table = new Float64Array(rows * steps.length), source = bytesOf(bytes);
   let at = 0;
@@ -24,7 +24,7 @@ function unpack({rows, steps, bytes}) {
   return table;
 }
 
-/** 1, 2 or 5 times a power of ten, at least x. */
+/** The smallest 1, 2 or 5 times a power of ten that is at least x. */
 export function nice(x) {
   const power = 10 ** Math.floor(Math.log10(x));
   return power * [1, 2, 5, 10].find(k => k * power >= x * (1 - 1e-9));
@@ -33,7 +33,7 @@ export function nice(x) {
 export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 export const short = x => (x === 0 ? "0" : Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3 ? x.toExponential(2) : String(+x.toPrecision(4))).replace("-", "−");
 
-/** The interval of times that holds t: its ends, its length, and where in it t is, from 0 to 1. */
+/** The interval of times that contains t: the indices of its ends, its length, and the position of t in it from 0 to 1. */
 export function interval(ts, t, count = ts.length) {
   let low = 0, high = count - 1;
   while (high - low > 1) {
@@ -44,7 +44,7 @@ export function interval(ts, t, count = ts.length) {
   return [low, high, h, h > 0 ? clamp((t - ts[low]) / h, 0, 1) : 0];
 }
 
-/** The state {t, q, v} of a run of n coordinates at a time: cubic between its instants, whose rates are known. */
+/** The state {t, q, v} of a run of n coordinates at a time, by cubic Hermite interpolation. */
 export function stateAt({ts, q, v, count, frame = 1}, t, n) {
   const [i, j, h, s] = interval(ts, t, count), r = 1 - s, found = {t, q: new Float64Array(n), v: new Float64Array(n)};
   for (let k = 0; k < n; k++) {
@@ -55,7 +55,7 @@ export function stateAt({ts, q, v, count, frame = 1}, t, n) {
   return found;
 }
 
-/** Where the bodies of one run are at any time: cubic between its instants, whose rates are known; a mode is a sine. */
+/** The positions of the bodies of a run at any time, by cubic Hermite interpolation; a mode is a sine. */
 export class Run {
   constructor(record) {
     Object.assign(this, record);
@@ -68,7 +68,7 @@ export class Run {
     this.measures = record.measures.map(m => ({...m, values: floats(m.values)}));
     this.forces = record.reactions && unpack(record.reactions.force);
     this.paths = null;
-    this.fine = 4;  // points of a path for each instant
+    this.fine = 4;  // points of a path per instant
     this.now = new Float64Array(this.size);
   }
 
@@ -82,7 +82,7 @@ export class Run {
 
   find(t) { return interval(this.ts, t); }
 
-  /** The coordinates x, y, angle of each body in turn; the array is used again by the next call. */
+  /** The coordinates x, y, angle of each body in turn; the next call reuses the array. */
   pose(t, amplitude = 1) {
     const out = this.now;
     if (this.mode) {
@@ -99,13 +99,13 @@ export class Run {
     return out;
   }
 
-  /** Forces x, y of each anchor of reactions. */
+  /** The forces x, y at each anchor of reactions. */
   force(t) {
     const [i, j, , s] = this.find(t), n = 2 * this.reactions.anchors.length;
     return Array.from({length: n}, (_, k) => this.forces[i * n + k] * (1 - s) + this.forces[j * n + k] * s);
   }
 
-  /** The paths of its traces: for each, its points at times that are evenly spaced. */
+  /** The paths of the traced points, through points at equal intervals of time. */
   trace() {
     if (!this.paths) {
       const first = this.ts[0], last = this.ts[this.ts.length - 1];
@@ -120,7 +120,7 @@ export class Run {
   }
 }
 
-/** Where the anchor [body, x, y] is; body -1 is the ground. */
+/** The place of an anchor [body, x, y]; body -1 is the ground. */
 export function place(pose, [body, x, y]) {
   if (body < 0) return [x, y];
   const cos = Math.cos(pose[3 * body + 2]), sin = Math.sin(pose[3 * body + 2]);
@@ -129,9 +129,9 @@ export function place(pose, [body, x, y]) {
 
 export const angleOf = (pose, body) => (body < 0 ? 0 : pose[3 * body + 2]);
 
-const FITTED = 300;  // instants that bounds are of
+const FITTED = 300;  // instants from which bounds are computed
 
-/** Left, bottom, right, top (m) of all that is drawn of a run, at least `least` to each side of its middle. */
+/** Left, bottom, right, top (m) of everything drawn of a run, at least `least` to each side of the middle. */
 export function boundsOf(run, least) {
   const anchors = run.marks.flatMap(m => {
     const [x0, y0] = m.at ?? [0, 0];

@@ -1,18 +1,18 @@
-// The player: shows the motion of planar mechanisms. Modules without dependencies, which page.py joins to
-// one for a page and a notebook.
+// The player: shows the motion of planar mechanisms. Its modules have no dependencies; page.py joins them into one for a page or a
+// notebook.
 //
 //   mount(element, data, {fill, theme, autoplay}) -> {time, playing, play(), pause(), seek(t), ...}     (see `mount`)
 //   default export: {render} for anywidget
 //
-// `data` is what udkjax/show/player/player_data.py describes. All texts go through `textContent` or a canvas: none is markup.
+// `data` is described in udkjax/show/player/player_data.py. All texts go through `textContent` or a canvas, never through markup.
 
 import {Player} from "./player.js";
 
 /** Show `data` in an element.
  *
- *  options: fill (the whole window), theme ("light", "dark"; by default what the system prefers), autoplay.
- *  Returns time, playing, play(), pause(), seek(t), speed, pixel(panel, x, y) -> [x, y] in the panel's canvas (CSS px),
- *  on(listener) and destroy(). The same object is the element's property `player`.
+ *  options: fill (the whole window), theme ("light", "dark"; by default the preference of the system), autoplay.
+ *  Returns an object with time, playing, play(), pause(), seek(t), speed, pixel(panel, x, y) -> [x, y] in the panel's canvas
+ *  (CSS px), on(listener) and destroy(). The same object is the element's property `player`.
  */
 export function mount(element, data, options = {}) {
   const player = new Player(element, data, options);
@@ -33,11 +33,11 @@ export function mount(element, data, options = {}) {
     destroy: () => player.destroy(),
   };
   element.player = handle;
-  element.dataset.lmSuppressShortcuts = "true";  // of JupyterLab, which would take keys away from it
+  element.dataset.lmSuppressShortcuts = "true";  // so that JupyterLab's shortcuts do not intercept keys
   return handle;
 }
 
-/** anywidget: the model has `data`, and `time` (s) and `playing`, which follow the player and move it. */
+/** anywidget: the model has `data`, and `time` (s) and `playing`, which are synchronized with the player. */
 function render({model, el}) {
   const player = mount(el, model.get("data"), {theme: model.get("theme") || null});
   const seek = () => { if (Math.abs(model.get("time") - player.time) > 1e-9) player.seek(model.get("time")); };

@@ -1,8 +1,9 @@
-"""Numbers as short texts: what the player's `unpack` and `floats` read.
+"""Numbers as short texts, which the player's `unpack` and `floats` read.
 
-A table of numbers becomes whole numbers of a stated step; down each column their second differences, which are small where a
-motion is smooth; zigzag (0, -1, 1, -2 ... become 0, 1, 2, 3 ...); bytes of seven bits each, the least first, the eighth bit set
-where another follows (LEB128); base64. Numbers that are read back are within half a step.
+A table of numbers is rounded to integer multiples of a given step. The second differences of each column, which are small for a
+smooth motion, are mapped to unsigned integers (zigzag: 0, -1, 1, -2 ... become 0, 1, 2, 3 ...), written as LEB128 (seven bits per
+byte, the least significant first, the eighth bit set if another byte follows), and encoded as base64. Unpacked numbers are within
+half a step.
 """
 
 import base64
@@ -17,7 +18,7 @@ from udkjax.annotations import JsonObject
 
 
 def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> JsonObject:
-    """Return a table of finite numbers with its shape and the `step` of each column (or of all) as plain data."""
+    """Return a table of finite numbers, rounded to the `step` of each column (or of all), as plain data."""
     table = np.asarray(table, float)
     steps = np.broadcast_to(np.asarray(step, float), table.shape[1:])
     whole = np.rint(table / steps).astype(np.int64)
@@ -27,7 +28,7 @@ def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> JsonObject:
 
 
 def unpack(data: Mapping[str, Any]) -> Float[np.ndarray, "T n"]:
-    """Return the table of `pack`, as the player reads it."""
+    """Return the table that `pack` has packed, as the player reads it."""
     whole, value, shift = [], 0, 0
     for byte in base64.b64decode(data["bytes"]):
         value, shift = value | (byte & 127) << shift, shift + 7
@@ -39,7 +40,7 @@ def unpack(data: Mapping[str, Any]) -> Float[np.ndarray, "T n"]:
 
 
 def floats(values: ArrayLike) -> str:
-    """Return numbers, finite or not, in single precision."""
+    """Return numbers, finite or not, in single precision, as base64."""
     return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 
 

@@ -1,4 +1,4 @@
-"""The player as one page that needs no network."""
+"""The player as a self-contained page."""
 
 import html
 import json
@@ -9,11 +9,11 @@ from string import Template
 
 from udkjax.annotations import JsonObject
 
-# Each after those it imports.
+# Modules of the player; each follows those that it imports.
 SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
-SOLVING = ("events", "engine", "follow", "hand", "sliders", "address", "live_run", "live")  # of a live page alone
+SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "live_run", "live")  # only in a live page
 LAST = ("player", "mount")
-# Within <script> no character of a text may end it, begin markup or break a line of JavaScript.
+# Characters that could end a <script>, begin markup, or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
@@ -29,22 +29,22 @@ def page(data: JsonObject, options: JsonObject | None = None) -> str:
 
 
 def frame(data: JsonObject, height: int) -> str:
-    """Return the page inside an <iframe> of so many pixels, for notebooks and pages that show HTML."""
+    """Return the page inside an <iframe> with a height in pixels, for notebooks and other pages."""
     text, title = (html.escape(words, quote=True) for words in (page(data), data["title"]))
     style = f"width:100%;height:{height}px;border:0;border-radius:8px"
     return f'<iframe title="{title}" style="{style}" sandbox="allow-scripts" srcdoc="{text}"></iframe>'
 
 
 def as_json(data: object) -> str:
-    """Return data as JSON that may stand inside <script>. Numbers that are not finite have no place in it: ValueError."""
+    """Return data as JSON for use inside <script>; raises `ValueError` for numbers that are not finite."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).translate(ESCAPES)
 
 
 @cache
 def module(is_live: bool = True) -> str:
-    """Return the source of the player: its modules, joined to one, without the lines that are comments.
+    """Return the source of the player: its modules joined into one, without comment lines.
 
-    Without those that solve, whose names no page takes but a live one, it is half as long.
+    The modules that only a live page needs are half of it.
     """
     names = (*SHOWING, *(SOLVING if is_live else ()), *LAST)
     *parts, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)

@@ -3,7 +3,7 @@
 import {Labels, around, aroundPin} from "./labels.js";
 import {clamp, nice, place, short} from "./motion.js";
 
-// Okabe and Ito's colours, which everyone tells apart, and one more; on dark grounds, lighter.
+// The Okabe-Ito colours, which colour-blind readers can distinguish, and one more; lighter in the dark theme.
 export const THEMES = {
   light: {
     back: "#ffffff", panel: "#f5f7f9", ink: "#1b2430", soft: "#5a6676", line: "#d5dbe3", grid: "#edf0f4", accent: "#0067b0",
@@ -18,12 +18,12 @@ export const THEMES = {
 };
 
 const FORCES = [[1e6, "MN"], [1e3, "kN"], [1, "N"], [1e-3, "mN"]];
-const NOT_UNIQUE = [1.2, 4.2];  // dashes, in pt, of an arrow whose force redundant joints share in a way that equilibrium leaves open
+const NOT_UNIQUE = [1.2, 4.2];  // pt: dashes of the arrow of a force that is not unique, shared by redundant constraints
 
-const READABLE = 4.5;  // the contrast of small texts that WCAG 2 asks for at level AA
+const READABLE = 4.5;  // the contrast of small text that WCAG 2 requires at level AA
 const part = (hex, k) => parseInt(hex.slice(1 + 2 * k, 3 + 2 * k), 16);
 
-/** The contrast of two colours, 1 to 21, as WCAG 2 defines it. */
+/** The contrast ratio of two colours, from 1 to 21, as defined by WCAG 2. */
 export function contrast(one, two) {
   const linear = x => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
   const light = hex => [0.2126, 0.7152, 0.0722].reduce((sum, share, k) => sum + share * linear(part(hex, k) / 255), 0.05);
@@ -31,19 +31,19 @@ export function contrast(one, two) {
   return Math.max(a, b) / Math.min(a, b);
 }
 
-/** A colour in which texts can be read on all grounds of a theme: nearer to that of its ink, where need be. */
+/** A colour for text that is readable on all backgrounds of a theme: if needed, closer to its ink. */
 export function readable(colour, {back, panel, ink}) {
   let found = colour;
   for (let t = 0; Math.min(contrast(found, back), contrast(found, panel)) < READABLE && t < 1; t += 0.05) found = mix(colour, ink, t);
   return found;
 }
 
-/** A colour on the way to another one: t from 0 to 1. */
+/** The mixture of two colours, with t from 0 to 1. */
 export function mix(one, two, t) {
   return "#" + [0, 1, 2].map(k => Math.round(part(one, k) * (1 - t) + part(two, k) * t).toString(16).padStart(2, "0")).join("");
 }
 
-/** A canvas's context, in CSS pixels, cleared, at the resolution of the screen. */
+/** The cleared context of a canvas, in CSS pixels, at the resolution of the screen. */
 export function contextOf(canvas) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   const wide = Math.round(width * ratio), high = Math.round(height * ratio);
@@ -55,13 +55,13 @@ export function contextOf(canvas) {
   return {context, width, height};
 }
 
-/** Draws at a pose. Lengths of what is a symbol are in `pt`, which grow with the panel. */
+/** Draws at a pose. Sizes of symbols are in the unit `pt`, which grows with the panel. */
 export class Painter {
   constructor(context, view, theme, pt, pose) {
     Object.assign(this, {context, view, theme, pt, pose});
   }
 
-  /** Pixels of a place in metres. */
+  /** The pixel of a place in metres. */
   px([x, y]) {
     return [this.view.x + this.view.scale * x, this.view.y - this.view.scale * y];
   }
@@ -149,7 +149,7 @@ export class Painter {
     return step;
   }
 
-  /** How long one step of the grid is. */
+  /** Draw a scale bar as long as one step of the grid. */
   bar(step, height) {
     const {soft} = this.theme, length = step * this.view.scale, x = 14, y = height - 14;
     this.line([[x, y - 3], [x, y + 3], [x, y], [x + length, y], [x + length, y - 3], [x + length, y + 3]], 1.2 / this.pt, soft);
@@ -180,7 +180,7 @@ export class Painter {
     });
   }
 
-  /** Arrows of forces, and one whose force is told. An arrow that would be longer than three times the usual one is cut. */
+  /** Draw arrows of forces, at most three times as long as the usual one, and a reference arrow with its force. */
   reactions(run, t, width, height) {
     const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
     anchors.forEach((anchor, k) => {
@@ -188,11 +188,11 @@ export class Painter {
       const size = length * Math.min(1, 3 / Math.hypot(fx, fy));
       if (size * Math.hypot(fx, fy) > 1.5 * this.pt) this.arrow([x, y], [x + size * fx, y - size * fy], colour, unique[k] ? [] : NOT_UNIQUE);
     });
-    const told = nice(usual / 2), [unit, name] = FORCES.find(([unit]) => told >= unit) ?? FORCES.at(-1);
-    const y = height - 14, words = `${short(told / unit)} ${name}${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
+    const reference = nice(usual / 2), [unit, name] = FORCES.find(([unit]) => reference >= unit) ?? FORCES.at(-1);
+    const y = height - 14, words = `${short(reference / unit)} ${name}${unique.every(Boolean) ? "" : "; dashed: not unique"}`;
     this.text(words, [width - 14, y], colour, {align: "right", size: 11 / Math.max(1, this.pt)});
     const end = width - 14 - this.context.measureText(words).width - 7;
-    this.arrow([end - length * told / usual, y], [end, y], colour);
+    this.arrow([end - length * reference / usual, y], [end, y], colour);
   }
 
   names(run) {

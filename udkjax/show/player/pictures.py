@@ -1,4 +1,4 @@
-"""A pose of an animation as a drawing: SVG and DXF."""
+"""Vector pictures of a pose of an animation: SVG and DXF."""
 
 import html
 from pathlib import Path
@@ -9,21 +9,22 @@ from jaxtyping import Float
 
 from udkjax.annotations import JsonObject
 from udkjax.extras import OptionalImport
+from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.sketch import THEMES, Circle, ForceArrow, Line, Sketch, TracedPath, View, view_of
 
 DXF_LAYERS = {
-    "pin": "joints",
-    "roller": "joints",
-    "weld": "joints",
-    "rail": "ground",
-    "floor": "ground",
-    "rack": "ground",
-    "support": "ground",
-}  # others: by their kind
+    MarkKind.PIN: "joints",
+    MarkKind.ROLLER: "joints",
+    MarkKind.WELD: "joints",
+    MarkKind.RAIL: "ground",
+    MarkKind.FLOOR: "ground",
+    MarkKind.RACK: "ground",
+    MarkKind.SUPPORT: "ground",
+}  # other layers are named by their kind
 
 
 class Posed(Protocol):
-    """Animation as the writers of pictures need it: the data of the player, and the coordinates of each run at any time."""
+    """The interface of an animation that the writers of pictures use."""
 
     data: JsonObject
 
@@ -41,9 +42,9 @@ class Posed(Protocol):
 
 
 def sketches(animation: Posed, t: float | None, width: int, theme: str, times: int = 1) -> tuple[View, list[Sketch]]:
-    """Return the view of each panel, `width` over all and so many times as large, and the sketch of each run at time t."""
+    """Return the common view of panels that together are `width` px wide, enlarged by `times`, and the sketches at time t."""
     if theme not in THEMES:
-        raise ValueError(f"theme {theme!r} is neither of {', '.join(THEMES)}")
+        raise ValueError(f"theme {theme!r} must be {' or '.join(THEMES)}")
     runs = animation.data["runs"]
     view = view_of(animation.data["bounds"], width // len(runs), times, any(run["reactions"] for run in runs))
     shown = zip(runs, animation.pose(t), animation.paths(), animation.arrows(t), strict=True)
@@ -91,7 +92,7 @@ def save_dxf(animation: Posed, path: Path, t: float | None = None) -> None:
             drawing.layers.add(layer)
         if isinstance(shape, Circle):
             space.add_circle(_metres(view, shape.centre[None])[0], shape.radius / view.scale, dxfattribs={"layer": layer})
-        elif shape.layer != "link" or shape.fill != shape.stroke or not shape.closed:  # the filling of a link is no line of it
+        elif shape.layer != MarkKind.LINK or shape.fill != shape.stroke or not shape.closed:  # not the fill of a link
             space.add_lwpolyline(_metres(view, shape.points), close=shape.closed, dxfattribs={"layer": layer})
     drawing.saveas(path)
 

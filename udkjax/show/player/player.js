@@ -1,4 +1,4 @@
-// The player's elements, what they do, and how they look.
+// The player: its elements, their actions, and the drawing of a frame.
 
 import {HELP, LIVE_HELP, SPEEDS, button, icon, keepKeys, make} from "./elements.js";
 import {EventMarks} from "./event_marks.js";
@@ -72,10 +72,10 @@ export class Player {
     }
     this.root = make("div", {class: "player", tabindex: -1},
       make("header", {}, make("h1", {title: data.title}, data.title),
-        button(icon("theme"), "dark or light (D)", () => this.switchTheme(), "icon"),
-        button("?", "keys", () => this.toggleHelp(), "icon")),
+        button(icon("theme"), "switch between dark and light (D)", () => this.switchTheme(), "icon"),
+        button("?", "keyboard shortcuts (?)", () => this.toggleHelp(), "icon")),
       middle, ...(this.measures.length ? [this.strip()] : []), make("div", {class: "controls"}, ...groups), this.help);
-    this.keys = this.options.fill ? window : this.root;  // a page is nothing else
+    this.keys = this.options.fill ? window : this.root;  // a filled window has no other use of keys
     this.onKey = event => this.key(event);
     this.keys.addEventListener("keydown", this.onKey);
     keepKeys(this.root, this.panels[0].canvas);
@@ -106,6 +106,7 @@ export class Player {
     this.stripCanvas.addEventListener("pointermove", event => { if (event.buttons) seek(event); });
     return make("div", {class: "strip"}, this.stripCanvas, select);
   }
+
   zoomAt(canvas, x, y, factor) {
     const next = clamp(this.zoom.factor * factor, 0.2, 100), ratio = next / this.zoom.factor;
     const cx = canvas.clientWidth / 2, cy = canvas.clientHeight / 2;
@@ -120,13 +121,13 @@ export class Player {
     this.draw();
   }
 
-  // What happens
+  // Actions
 
   on(listener) {
     this.listeners.push(listener);
   }
 
-  tell() {
+  notify() {
     for (const listener of this.listeners) listener(this);
   }
 
@@ -166,10 +167,10 @@ export class Player {
       this.request = requestAnimationFrame(frame);
     };
     this.request = requestAnimationFrame(frame);
-    this.tell();
+    this.notify();
   }
 
-  /** The end of the timeline. */
+  /** Set the end of the timeline. */
   setEnd(end) {
     this.data.end = end;
     this.t = Math.min(this.t, end);
@@ -188,13 +189,13 @@ export class Player {
     if (!this.playing) return;
     cancelAnimationFrame(this.request);
     this.setPlaying(false);
-    this.tell();
+    this.notify();
   }
 
   seek(t) {
     this.t = clamp(t, this.data.start, this.data.end);
     this.draw();
-    this.tell();
+    this.notify();
   }
 
   switchTheme() {
@@ -238,7 +239,7 @@ export class Player {
     action();
   }
 
-  // How it looks
+  // Drawing
 
   layout() {
     const width = this.root.clientWidth;
@@ -253,7 +254,7 @@ export class Player {
     this.draw();
   }
 
-  /** Pixels of a place in metres in a panel: x + scale X, y - scale Y. */
+  /** The view of a panel: a place (X, Y) in metres is at the pixel (x + scale X, y - scale Y). */
   view(width, height) {
     const [left, bottom, right, top] = this.data.bounds;
     const margin = Math.min(44, 0.12 * Math.min(width, height));
@@ -262,7 +263,7 @@ export class Player {
     return {scale, x: width / 2 - scale * (left + right) / 2 + this.zoom.x, y: height / 2 + scale * (bottom + top) / 2 + this.zoom.y};
   }
 
-  /** What paints on a panel's canvas. */
+  /** The painter of a panel's canvas. */
   painter(canvas, context = null) {
     const {clientWidth: width, clientHeight: height} = canvas, pt = clamp(Math.min(width, height) / 420, 0.75, 1.5);
     return new SymbolPainter(context, this.view(width, height), this.theme, pt, null);
@@ -273,7 +274,7 @@ export class Player {
     const {data, t, theme, show} = this;
     this.panels.forEach(({run, canvas, note}, k) => {
       const live = this.live?.runs[k];
-      note.hidden = Boolean(live?.changed);  // it is of the first motion
+      note.hidden = Boolean(live?.changed);  // the note is about the first motion
       const {context, width, height} = contextOf(canvas);
       if (!width || !height) return;
       const painter = this.painter(canvas, context), step = painter.grid(width, height);

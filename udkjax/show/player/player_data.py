@@ -1,24 +1,25 @@
-"""Everything that the player shows, as plain data: runs, modes, measures, arrows, and how much of the plane they take.
+"""The data of the player: runs, modes, measures, arrows, and their bounds in the plane.
 
 format     1
 title      text
 unit       of the timeline: "s", or "" for modes, which go through one cycle from 0 to 1
 start, end of the timeline
-speed      at which it plays: seconds of the timeline in one second
+speed      of playing: seconds of the timeline per second
 length     the characteristic length of the mechanism (m)
-bounds     [left, bottom, right, top] of all that is drawn (m)
+bounds     [left, bottom, right, top] of everything drawn (m)
 runs       a list of
     label, note    texts
     bodies         names
-    marks          what is drawn (marks.py)
-    symbols        how it is drawn (symbols.py)
+    marks          elements to draw (marks.py)
+    symbols        their lines and circles (symbols.py)
     traces         a list of [body, x, y] whose paths are drawn
     time, q, v     packed (packing.py) tables of T rows: time; coordinates x, y, angle of each body; their rates times `frame`
     frame          s, the typical time between two instants
-    mode           instead of these: {q: numbers, shape: numbers, frequency: Hz or null}
+    mode           instead of time, q, v: {q: numbers, shape: numbers, frequency: Hz or null}
     measures       a list of {name, unit, log, values: single precision}
-    events         a list of {t, name}: what happened, and when
-    reactions      {anchors, usual (N), unique: booleans, force: packed table of T rows, x and y of each anchor}, or null
+    events         a list of {t, name}
+    reactions      {anchors, usual: force of an arrow of usual length (N), unique: booleans, force: packed table of T rows with x
+                   and y of each anchor}, or null
 """
 
 from collections.abc import Callable, Sequence
@@ -33,6 +34,7 @@ from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
 from udkjax.positions.channels import locate
 from udkjax.scene import Mechanism
+from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.marks import BodyPoints, body_points, marks, to_ground
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import floats, pack, unpack
@@ -41,18 +43,17 @@ from udkjax.show.player.symbols import symbols_of
 
 Record = JsonObject
 Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
-# Of positions, in characteristic lengths, and of angles, in rad: a hundredth of a pixel on a screen of a thousand.
-PRECISION = 1e-5
-TIME_PRECISION = 1e-9  # of the timeline
-FORCE_PRECISION = 1e-3  # of the usual force
-USUAL_FORCE_QUANTILE = 0.95  # of the instants: at these no joint's force is larger than the usual one, which sets arrows' length
-MOST_INSTANTS = 2400  # of one run; a longer one is thinned out evenly, and interpolated by its velocities
+PRECISION = 1e-5  # of positions in characteristic lengths, and of angles in rad: a hundredth of a pixel on 1000 pixels
+TIME_PRECISION = 1e-9  # as a fraction of the timeline
+FORCE_PRECISION = 1e-3  # as a fraction of the usual force
+USUAL_FORCE_QUANTILE = 0.95  # fraction of the instants at which no joint force exceeds the usual force, which scales the arrows
+MOST_INSTANTS = 2400  # per run; a longer run is thinned out evenly, and interpolated with its velocities
 MOST_TRACES = 8  # more would hide the mechanism
-COMFORTABLE_DURATIONS = (4.0, 40.0)  # s: how long it takes to play something at the speed that is chosen for it
+COMFORTABLE_DURATIONS = (4.0, 40.0)  # s: range of the playing time at the default speed
 SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-MODE_PERIOD = 2.0  # s: how long one cycle of a mode takes
-MODE_AMPLITUDE = 0.12  # of the characteristic length, or rad: how far a mode is shown to move
-PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # of a path: for each instant of its run, and in all
+MODE_PERIOD = 2.0  # s: playing time of one cycle of a mode
+MODE_AMPLITUDE = 0.12  # amplitude of a shown mode, in characteristic lengths or rad
+PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # points of a path per instant of its run, and at most
 SMALLEST_PATH = 1e-6  # characteristic lengths: points that move less have no path
 
 
@@ -66,7 +67,7 @@ def run_record(
     shapes: BodyPoints | None = None,
     gaps: Sequence[Gap] = (),
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
-    """Return one run as plain data, and its poses; a run that failed is shown as far as it came."""
+    """Return a run as plain data, and its poses; a failed run is shown up to its failure."""
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
     count = int(np.argmin(alive)) if not alive.all() else len(ts)
@@ -110,7 +111,7 @@ def run_record(
 def mode_record(
     mechanism: Mechanism, q: ArrayLike, shape: ArrayLike, frequency: float | None, label: str
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
-    """Return a mode q + amplitude shape sin(phase) as plain data, its shape scaled to a swing that one sees, and its poses."""
+    """Return a mode q + amplitude shape sin(phase) as plain data, with its shape scaled to a visible amplitude, and its poses."""
     q, shape = np.asarray(q, float), np.asarray(shape, float).reshape(np.shape(q))
     length = float(analyse(mechanism).length)
     largest = np.max(np.abs(shape) / [length, length, 1.0])
@@ -134,7 +135,7 @@ def mode_record(
 
 
 def _events_of(solution: ShownMotion) -> list[JsonObject]:
-    """Return the events of a run in their order."""
+    """Return the events of a run in order of time."""
     events = getattr(solution, "events", None)
     if events is None:
         return []
@@ -143,7 +144,7 @@ def _events_of(solution: ShownMotion) -> list[JsonObject]:
 
 
 def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]]:
-    """Return the coordinates of a run as a function of time, as the player shows them: cubic between instants, or a sine."""
+    """Return the coordinates of a run as a function of time, as in the player: cubic between instants; for a mode a sine."""
     shape = len(record["bodies"]), 3
     if record["mode"]:
         q, swing = (np.reshape(record["mode"][name], shape) for name in ("q", "shape"))
@@ -160,7 +161,7 @@ def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]
 
 
 def _place_in(ts: Float[np.ndarray, "T"], t: float) -> tuple[int, int, float]:
-    """Return the instants that a time lies between, and the part of the way from one to the other."""
+    """Return the indices of the instants around a time, and the fraction of the way from one to the other."""
     j = int(np.clip(np.searchsorted(ts, t, side="right"), 1, max(len(ts) - 1, 1)))
     i, j = j - 1, min(j, len(ts) - 1)
     h = ts[j] - ts[i]
@@ -168,7 +169,7 @@ def _place_in(ts: Float[np.ndarray, "T"], t: float) -> tuple[int, int, float]:
 
 
 def arrows_of(record: Record) -> Callable[[float], list[ForceArrow]]:
-    """Return the arrows of a run's reactions as a function of time, as the player shows them: linear between instants."""
+    """Return the arrows of a run's reactions as a function of time, as in the player: linear between instants."""
     if not record["reactions"]:
         return lambda t: []
     shown, ts = record["reactions"], unpack(record["time"])[:, 0]
@@ -184,7 +185,7 @@ def arrows_of(record: Record) -> Callable[[float], list[ForceArrow]]:
 
 
 def paths_of(record: Record) -> list[TracedPath]:
-    """Return the paths of the traced points of a run, through points that are evenly spaced in time."""
+    """Return the paths of the traced points of a run, through points at equal intervals of time."""
     if not record["traces"]:
         return []
     ts = unpack(record["time"])[:, 0]
@@ -218,10 +219,10 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
 def trace_anchors(
     mechanism: Mechanism, poses: Float[np.ndarray, "T bodies 3"], wanted: Traces | None, length: float
 ) -> list[list[float]]:
-    """Return the anchors whose paths are drawn: those of the joints and bodies that are named, or of the pins that move.
+    """Return the anchors whose paths are drawn: those of the named joints and bodies, or of the moving pins.
 
     Raises:
-        ValueError: a name of neither a body nor a pin.
+        ValueError: a name is neither a body nor a pin.
     """
     bodies = list(mechanism.bodies)
     if wanted is not None:
@@ -247,12 +248,12 @@ def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, Ar
     except ValueError as error:
         raise ValueError(f"trace {name!r}: {error}") from None
     if body not in bodies:
-        raise ValueError(f"trace {name!r}: it does not move")
+        raise ValueError(f"trace {name!r}: the point does not move")
     return [bodies.index(body), *np.asarray(local, float).tolist()]
 
 
 def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodies 3"]) -> list[float]:
-    """Return the rectangle that holds everything that is drawn in any pose: left, bottom, right, top (m)."""
+    """Return the rectangle around everything drawn in any pose: left, bottom, right, top (m)."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
 
     def hold(body: int, at: ArrayLike, radius: float = 0.0) -> None:
@@ -261,7 +262,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
         low, high = np.minimum(low, path.min(axis=0) - radius), np.maximum(high, path.max(axis=0) + radius)
 
     for mark in record["marks"]:
-        if mark["kind"] in ("rail", "rack", "floor"):
+        if mark["kind"] in (MarkKind.RAIL, MarkKind.RACK, MarkKind.FLOOR):
             direction = np.array([np.cos(mark["axis"]), np.sin(mark["axis"])])
             for s in mark["span"]:
                 hold(mark["body"], np.asarray(mark["at"]) + s * direction)
@@ -273,7 +274,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
             hold(int(k), (x, y))
     for body, *at in [*record["traces"], *([k, 0.0, 0.0] for k in range(len(mechanism.bodies)))]:
         hold(int(body), at)
-    least = 0.1 * float(analyse(mechanism).length)  # a single bar on a line has no height
+    least = 0.1 * float(analyse(mechanism).length)  # a bar that moves along its own line has no height
     grow = np.maximum(0.0, least - (high - low) / 2)
     return [*(low - grow).tolist(), *(high + grow).tolist()]
 
@@ -284,7 +285,7 @@ def _ends(record: Record) -> tuple[float, float]:
 
 
 def _speed(duration: float) -> float:
-    """Return the natural speed where that is comfortable, else the nearest that is."""
+    """Return speed 1 if its playing time is comfortable, else the nearest comfortable speed."""
     shortest, longest = COMFORTABLE_DURATIONS
     if duration <= 0 or shortest <= duration <= longest:
         return 1.0
@@ -294,11 +295,11 @@ def _speed(duration: float) -> float:
 
 
 def failure_of(solution: ShownMotion) -> str:
-    """Return the cause of a failed run, whatever of it can be shown; an empty text of others."""
+    """Return the cause of a failed run; an empty string for other runs."""
     result, cause = getattr(solution, "result", None), getattr(solution, "cause", "")
     if isinstance(result, Result):
         return "" if result.is_success else cause
-    known = np.isfinite(np.asarray(solution.q)).all((1, 2))
-    if known.all():
+    finite = np.isfinite(np.asarray(solution.q)).all((1, 2))
+    if finite.all():
         return ""
-    return cause or f"no position is known at {float(np.asarray(solution.ts)[np.argmin(known)]):g}: it is shown up to there"
+    return cause or f"the position is not finite at t = {float(np.asarray(solution.ts)[np.argmin(finite)]):g} s; shown until then"

@@ -1,10 +1,10 @@
 // Fingers, mouse and wheel on a canvas.
 
-/** Drag moves the view, or pulls at the body that is there, where the canvas shows the run of a live page;
- *  two fingers and the wheel zoom, a tap plays or pauses, a double tap shows all. */
+/** Dragging moves the view or, in a live page, pulls the body under the pointer; two fingers and the wheel zoom, a tap plays or
+ *  pauses, a double tap fits the view. */
 export function followPointers(player, canvas, liveRun) {
   const down = new Map();
-  let moved = 0, hand = null;  // the pointer that pulls
+  let moved = 0, hand = null;  // distance moved, and the pointer that pulls
   const point = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   canvas.addEventListener("pointerdown", event => {
     if (event.button > 1) return;

@@ -1,4 +1,4 @@
-"""Runs that `udkjax simulate` or `Solution.to_xarray` wrote, read again to be shown."""
+"""Runs written by `udkjax simulate` or `Solution.to_xarray`, read again to be shown."""
 
 import warnings
 from pathlib import Path
@@ -15,23 +15,23 @@ with OptionalImport():
 
 
 class RunFile(NamedTuple):
-    """A run from a file, and the mechanism whose text is inside it."""
+    """A run from a file, with the mechanism whose text the file contains."""
 
     mechanism: Mechanism
     ts: np.ndarray
     q: np.ndarray
     v: np.ndarray
-    result: Result | None  # None: the file does not say
-    cause: str  # its end, in words
-    others: dict[str, np.ndarray]  # further numbers over time, "name (unit)": they are measures
+    result: Result | None  # None if the file has none
+    cause: str  # the reason of an early end
+    others: dict[str, np.ndarray]  # further numbers over time, by "name (unit)", shown as measures
 
 
 def read_run(path: Path) -> RunFile:
     """Read a run (NetCDF).
 
     Raises:
-        ValueError: the file holds no run, or no text of a scene.
-        OSError: it cannot be read.
+        ValueError: the file contains no run, or not the text of its scene.
+        OSError: the file cannot be read.
     """
     with xarray.open_dataset(path, engine="h5netcdf") as data:
         missing = [name for name in ("q", "v", "time") if name not in data.variables]
@@ -40,12 +40,12 @@ def read_run(path: Path) -> RunFile:
                 f"{path} has no {' and no '.join(missing or ['text of a scene'])}: it is not a run of `udkjax simulate`"
             )
         try:
-            with warnings.catch_warnings(action="ignore", category=MjcfWarning):  # it was said when the run was made
+            with warnings.catch_warnings(action="ignore", category=MjcfWarning):  # the user was warned when the run was made
                 mechanism = loads(data.attrs["scene"])
-        except SceneError as error:  # classes of the user's own are not in the format
+        except SceneError as error:  # classes defined by users are not in the format
             raise ValueError(f"{path}: its scene cannot be read, use `udkjax.animate` in Python: {error}") from error
         if data["q"].dims != ("time", "body", "coordinate"):
-            raise ValueError(f"{path}: q is over {data['q'].dims}, not one run over time, body and coordinate")
+            raise ValueError(f"{path}: q has dimensions {data['q'].dims}, not time, body and coordinate of a single run")
         if list(data["body"].values) != list(mechanism.bodies):
             raise ValueError(f"{path}: its bodies are not those of its scene")
         others = {_label(data[name]): np.asarray(data[name], float) for name in data.data_vars if data[name].dims == ("time",)}

@@ -1,4 +1,4 @@
-"""Marks at a pose as lines and circles, in pixels, y downwards: what an SVG, a DXF or the frame of a film is made of.
+"""Marks at a pose as lines and circles in pixels, y downwards, for an SVG, a DXF or the frame of a film.
 
 They are the symbols (symbols.py) that the player moves, in the same colours and proportions.
 """
@@ -24,12 +24,12 @@ THEMES: dict[str, dict[str, Any]] = {
         "bodies": ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
     },
 }  # fmt: skip
-POINT = 420.0  # px: of pictures whose shorter side is this long a symbol's unit is one pixel
+POINT = 420.0  # px: shorter side of a picture in which the unit of symbols is one pixel
 MARGIN = 44.0  # px
-ARROW, LONGEST_ARROW = 70.0, 3.0  # units of a symbol, of the usual force; and the longest arrow, in usual ones
-HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # units of a symbol, rad
-NOT_UNIQUE_TINT = 0.5  # of the way from the colour of a force to the background
-PATH_WIDTH, PATH_TINT = 1.2, 0.4  # units of a symbol; of the way from the colour of a body to the background
+ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow in multiples of it
+HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # in units of symbols; the angle in rad
+NOT_UNIQUE_TINT = 0.5  # fraction of the background in the colour of a force
+PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background in the colour of a body
 
 
 class TracedPath(NamedTuple):
@@ -40,7 +40,7 @@ class TracedPath(NamedTuple):
 
 
 class ForceArrow(NamedTuple):
-    """A force on a point (m) of a body: x and y in parts of the usual force, and whether equilibrium alone determines it."""
+    """A force on a point (m) of a body: x and y relative to the usual force, and True if it is unique."""
 
     body: int
     at: tuple[float, float]
@@ -49,7 +49,7 @@ class ForceArrow(NamedTuple):
 
 
 class View(NamedTuple):
-    """Metres to pixels: (x + scale X, y - scale Y), in a picture of so many pixels; `pt` is the unit of symbols (px)."""
+    """Metres to pixels, (x + scale X, y - scale Y), in a picture of width x height px; `pt` is the unit of symbols (px)."""
 
     scale: float
     x: float
@@ -60,7 +60,7 @@ class View(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A line through points, closed or not, filled or not; of no width where there is only a filling."""
+    """A line through points, open or closed, filled or not; its width is zero if only its fill is drawn."""
 
     layer: str
     points: np.ndarray
@@ -82,9 +82,9 @@ class Circle(NamedTuple):
 
 
 def view_of(bounds: Sequence[float], width: int, times: int = 1, has_arrows: bool = False) -> View:
-    """Return the view of a picture of this width that holds `bounds` (left, bottom, right, top, in m), so many times as large.
+    """Return the view of a picture that contains `bounds` (left, bottom, right, top, in m), enlarged by `times`.
 
-    Around them there is room for the usual arrow of a force, if it has some.
+    With `has_arrows` the margin has room for the arrow of the usual force.
     """
     left, bottom, right, top = bounds
     margin = min(MARGIN + ARROW, 0.24 * width) if has_arrows else min(MARGIN, 0.12 * width)
@@ -102,7 +102,7 @@ def mix(one: str, two: str, t: float) -> str:
 
 
 class Sketch:
-    """Paths and the symbols of a mechanism's marks at one pose, in the order in which they cover one another."""
+    """The paths and symbols of a mechanism's marks at one pose, from back to front."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class Sketch:
         return Line("path", points, PATH_WIDTH * self.view.pt, colour)
 
     def _arrow(self, arrow: ForceArrow) -> list[Line]:
-        """Return the shaft and the head of an arrow; nothing where it is too short to be seen."""
+        """Return the shaft and the head of an arrow; nothing if it is too short to be seen."""
         force, pt = np.array(arrow.force), self.view.pt
         size = float(np.hypot(*force))
         length = ARROW * pt * min(size, LONGEST_ARROW)
@@ -151,7 +151,7 @@ class Sketch:
         return Line(symbol["layer"], origin + local @ np.array([way * [1, -1], -way[::-1]]), *look, symbol["closed"])
 
     def _frame(self, frame: list) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return a frame's origin (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length."""
+        """Return the origin of a frame (px), the cosine and sine of the angle of its x axis, and its unit of length (px)."""
         if len(frame) == 2:
             start, end = (self._anchor(*anchor) for anchor in frame)
             way = (end - start) * [1, -1]

@@ -1,11 +1,11 @@
-// The panel of a live page: sliders in sections, what is said about the motion, and what one can do with it.
+// The panel of a live page: sliders in sections, a message about the motion, and buttons.
 
 import {make} from "./elements.js";
 
-const STEPS = 500;  // of a slider by keys
-const DIGITS = 5;  // of a number beside it
+const STEPS = 500;  // key presses over the range of a slider
+const DIGITS = 5;  // significant digits of a number
 
-/** Builds the panel of some sliders; `changed(k, value)` is called while one moves, and actions by their names. */
+/** The panel of sliders and buttons; `changed(k, value)` is called while slider k moves, and an action when its button is pressed. */
 export class SliderPanel {
   constructor(sliders, changed, actions) {
     this.sliders = sliders;
@@ -35,7 +35,7 @@ export class SliderPanel {
       range.setAttribute("aria-valuetext", `${number.value} ${unit}`);
     };
     range.addEventListener("input", () => { set(+range.value); changed(+range.value); });
-    let taken = null;  // what was typed last
+    let taken = null;  // the last text that was taken
     const take = () => {
       if (!Number.isFinite(number.valueAsNumber)) return set(+range.value);
       if (number.value === taken) return undefined;
@@ -46,7 +46,7 @@ export class SliderPanel {
     };
     number.addEventListener("focus", () => { taken = number.value; });
     number.addEventListener("change", take);
-    number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // which a notebook keeps to itself
+    number.addEventListener("keydown", event => { if (event.key === "Enter") take(); });  // a notebook keeps Enter from causing a change event
     range.addEventListener("dblclick", () => { set(slider.value); changed(slider.value); });
     const words = unit.replaceAll("m2", "m²").replaceAll("s2", "s²").replaceAll("m3", "m³").replaceAll(" ", "·");
     const element = make("div", {class: "slider", title: slider.name},

@@ -3,12 +3,12 @@
 import {clamp, short} from "./motion.js";
 import {Painter, readable} from "./painter.js";
 
-const LEFT = 12, RIGHT = 68;  // px beside the curves; at the right stand the least and the largest value
+const LEFT = 12, RIGHT = 68;  // px at the sides of the curves; the smallest and the largest value are at the right
 
-/** The part of the timeline at x (px) in a strip of some width, from 0 to 1. */
+/** The position on the timeline, from 0 to 1, of x (px) in a strip with a width. */
 export const stripPart = (x, width) => clamp((x - LEFT) / (width - LEFT - RIGHT), 0, 1);
 
-/** Curves of one measure of all runs over the timeline, and a line at the time that is shown. */
+/** Draw one measure of all runs over the timeline, and a line at the time shown. */
 export function drawStrip(context, width, height, runs, name, start, end, t, theme, taken) {
   const left = LEFT, right = width - RIGHT, top = 40, bottom = height - 10;
   const found = runs.map(run => run.measures.find(m => m.name === name));
@@ -19,7 +19,7 @@ export function drawStrip(context, width, height, runs, name, start, end, t, the
     if (Number.isFinite(y)) { low = Math.min(low, scaled(y)); high = Math.max(high, scaled(y)); }
   }
   const painter = new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null);
-  if (!(high >= low)) return painter.text("no values of this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
+  if (!(high >= low)) return painter.text("no values for this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   const least = log ? 3 : 1e-12 * Math.max(Math.abs(low), Math.abs(high)) || 1;
   if (high - low < least) { low -= least / 2; high += least / 2; }
   const x = time => left + (right - left) * (time - start) / (end - start || 1);
@@ -43,7 +43,7 @@ export function drawStrip(context, width, height, runs, name, start, end, t, the
   const ends = {size: 11, halo: false}, back = value => (log ? 10 ** value : value);
   painter.text(short(back(high)), [right + 7, top], theme.soft, ends);
   painter.text(short(back(low)), [right + 7, bottom - 1], theme.soft, ends);
-  // Values at this time, from the right: one for each run, in its colour; without the runs' names where there is no room.
+  // Values at this time, from the right: one per run, in its colour, with the run's name if there is room.
   const now = runs.map((run, k) => {
     const [i, j, , s] = run.find(t), value = found[k]?.values[s < 0.5 ? i : j];
     return {value, words: found[k] ? `${Number.isFinite(value) ? short(value) : "–"}${found[k].unit && " " + found[k].unit}` : ""};

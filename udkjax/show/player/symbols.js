@@ -3,7 +3,7 @@
 import {angleOf, clamp} from "./motion.js";
 import {Painter, mix} from "./painter.js";
 
-/** Tell whether a point is within a closed line, or nearer to a line than `reach`. */
+/** True if a point is inside a closed line, or closer to a line than `reach`. */
 export function isNear([x, y], corners, closed, reach) {
   const ends = closed ? [...corners, corners[0]] : corners;
   let inside = false;
@@ -26,7 +26,7 @@ export class SymbolPainter extends Painter {
     }
   }
 
-  /** Where a symbol is (px): the centre and the radius of a circle, or the corners of a line. */
+  /** The outline of a symbol (px): the centre and the radius of a circle, or the corners of a line. */
   outline({frame, radius, points}) {
     const [[x0, y0], cos, sin, scale] = this.axes(frame), {pt} = this;
     if (radius) {
@@ -40,14 +40,14 @@ export class SymbolPainter extends Painter {
     return {corners};
   }
 
-  /** Whether a symbol is at a place (px), or nearer than `reach`. */
+  /** True if a symbol is at a pixel, or closer to it than `reach`. */
   holds(symbol, x, y, reach) {
     const {centre, size, corners} = this.outline(symbol);
     if (centre) return Math.hypot(x - centre[0], y - centre[1]) <= size + reach;
     return isNear([x, y], corners, symbol.closed, symbol.width * this.pt / 2 + reach);
   }
 
-  /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and the pixels of its unit of length. */
+  /** The origin of a frame (px), the cosine and sine of the angle of its x axis, and its unit of length (px). */
   axes(frame) {
     if (frame.length === 2) {
       const [[x0, y0], [x1, y1]] = frame.map(anchor => this.anchor(anchor)), length = Math.hypot(x1 - x0, y1 - y0);

@@ -1,11 +1,12 @@
-"""Symbols of marks as lines and circles in frames that move: what the player and the writers of pictures paint alike.
+"""Symbols of marks as lines and circles in moving frames, painted alike by the player and the writers of pictures.
 
     symbol   layer, frame, stroke, width, fill, and points (a line, `closed` or not) or a radius (a circle about its origin)
 
-A frame is [body, x, y, angle, turns]: at a place (m) of a body, its x axis at an angle (rad) to the body's, or to the ground's
-where it does not turn; or two anchors [[body, x, y], [body, x, y]], its x axis from one to the other. A point is [x, y, px, py]:
-x and y in m, or in distances of the anchors; px and py in the unit of symbols, which does not grow with the scene; these two may
-be left out. A radius is [m, units, least units]. Colours are names of a theme, or "edge:3", "tint:3", "spoke:3" of a body.
+A frame is [body, x, y, angle, turns]: its origin is a place (m) of a body, and its x axis is at an angle (rad) to the body's, or
+to the ground's if `turns` is 0. Or it is two anchors [[body, x, y], [body, x, y]], with its x axis from one to the other. A point
+is [x, y, px, py]: x and y in m, or in distances of the anchors; px and py, which may be left out, in the unit of symbols, which
+does not grow with the scene. A radius is [m, units, least units]. Colours are names of a theme, or "edge:3", "tint:3", "spoke:3"
+of a body.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,20 +14,21 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.marks import Mark
 
 Symbol = Mark
-ROUND = 48  # corners of a circle that is drawn as a line
-COIL_LENGTH = 11.0  # units: of a spring that is as long as usual
-STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # units at each end of it, but not more than this part of its length
+ROUND = 48  # vertices of a circle drawn as a polyline
+COIL_LENGTH = 11.0  # units per coil of a spring of usual length
+STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # straight ends of a spring in units, and at most as a fraction of its length
 
 
 def symbols_of(marks: Sequence[Mark], unit: float) -> list[Symbol]:
-    """Return the symbols of marks, the farthest first.
+    """Return the symbols of marks, from back to front.
 
     Args:
-        marks: of one mechanism.
-        unit: the unit of symbols (m) in the whole view: teeth and strokes along rails are that far apart.
+        marks: marks of one mechanism.
+        unit: the unit of symbols (m) when the view is not zoomed, which sets the spacing of teeth and of strokes along rails.
     """
     return [{"layer": mark["kind"]} | symbol for mark in marks for symbol in SYMBOLS[mark["kind"]](mark, unit)]
 
@@ -41,7 +43,7 @@ def _circle(frame: list, radius: Sequence[float], fill: str = "", stroke: str = 
 
 
 def _offsets(points: ArrayLike) -> np.ndarray:
-    """Return points in the unit of symbols alone."""
+    """Return points given only in the unit of symbols."""
     points = np.asarray(points, float)
     return np.hstack([np.zeros_like(points), points])
 
@@ -63,7 +65,7 @@ def _tint(body: int) -> str:
 
 
 def _hatch(frame: list, places: ArrayLike, y: float, in_units: bool = False) -> Iterator[Symbol]:
-    """Short strokes to the lower left of a line at height y: what does not move."""
+    """Draw the hatching of the ground: short strokes to the lower left of a line at height y."""
     for x in np.asarray(places, float):
         start = [0.0, 0.0, x, y] if in_units else [x, 0.0, 0.0, y]
         yield _line(frame, [start, np.add(start, [0, 0, -5, -5])], "soft", 1)
@@ -77,7 +79,7 @@ def _link(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 def _disc(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _circle(_at(mark), (mark["radius"], 0, 7), _tint(mark["body"]), _edge(mark["body"]))
-    yield _circle(_at(mark), (0, 4.5), "back", "ink", 1)  # the sign of a centre of mass, which shows how a body turns
+    yield _circle(_at(mark), (0, 4.5), "back", "ink", 1)  # the symbol of a centre of mass, which shows the rotation of the body
     for start in (0, np.pi):
         yield _line(_at(mark), _offsets([(0, 0), *(4.5 * _round(start - np.linspace(0, np.pi / 2, 9)))]), "", 0, "ink", True)
 
@@ -194,7 +196,7 @@ def _piston(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 
 def _turn(mark: Mark, radius: float, sign: int) -> Iterator[Symbol]:
-    """Draw a round arrow: sign 1 is anticlockwise."""
+    """Draw a circular arrow; sign 1 is anticlockwise."""
     frame, flip = _at(mark, turns=False), np.array([1, sign])
     line, direction = radius * _round(np.linspace(-0.5, 3.5, ROUND)), np.array([-np.sin(3.5), np.cos(3.5)])
     yield _line(frame, _offsets(flip * line), "accent", 1.8)
@@ -202,7 +204,6 @@ def _turn(mark: Mark, radius: float, sign: int) -> Iterator[Symbol]:
 
 
 def _head(frame: list, tip: np.ndarray, direction: np.ndarray) -> Symbol:
-    """Return the head of an arrow."""
     side, back = np.array([-direction[1], direction[0]]), tip - 7.5 * np.cos(0.42) * direction
     corners = [tip, back + 7.5 * np.sin(0.42) * side, back - 7.5 * np.sin(0.42) * side]
     return _line(frame, _offsets(corners), "", 0, "accent", True)
@@ -230,22 +231,25 @@ def _force(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _head(frame, np.array([42.0, 0.0]), np.array([1.0, 0.0]))
 
 
-_PARTS = (
-    _link,
-    _disc,
-    _wheel,
-    _outline,
-    _rail,
-    _floor,
-    _rack,
-    _block,
-    _support,
-    _pin,
-    _roller,
-    _weld,
-    _rod,
-    _spring,
-    _spiral,
-    _piston,
-)
-SYMBOLS = {draw.__name__[1:]: draw for draw in (*_PARTS, _motor, _torque, _friction, _force)}
+SYMBOLS = {
+    MarkKind.LINK: _link,
+    MarkKind.DISC: _disc,
+    MarkKind.WHEEL: _wheel,
+    MarkKind.OUTLINE: _outline,
+    MarkKind.RAIL: _rail,
+    MarkKind.FLOOR: _floor,
+    MarkKind.RACK: _rack,
+    MarkKind.BLOCK: _block,
+    MarkKind.SUPPORT: _support,
+    MarkKind.PIN: _pin,
+    MarkKind.ROLLER: _roller,
+    MarkKind.WELD: _weld,
+    MarkKind.ROD: _rod,
+    MarkKind.SPRING: _spring,
+    MarkKind.SPIRAL: _spiral,
+    MarkKind.PISTON: _piston,
+    MarkKind.MOTOR: _motor,
+    MarkKind.TORQUE: _torque,
+    MarkKind.FRICTION: _friction,
+    MarkKind.FORCE: _force,
+}

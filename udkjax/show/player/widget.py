@@ -1,4 +1,4 @@
-"""The player as a widget of notebooks (Jupyter, Marimo, VS Code, Colab)."""
+"""The player as a notebook widget (Jupyter, Marimo, VS Code, Colab)."""
 
 from udkjax.extras import OptionalImport
 from udkjax.show.player.page import module
@@ -11,7 +11,7 @@ with OptionalImport():
 class PlayerWidget(anywidget.AnyWidget):
     """A widget that shows `data` (player_data.py).
 
-    `time` (s) and `playing` follow the player when it stops or is moved, and move it when set.
+    `time` (s) and `playing` are updated when the player stops or is moved, and move the player when set.
     """
 
     _esm = module()

@@ -1,6 +1,6 @@
-// What the drawing tools make: each takes a document and targets, and returns {document, select} or {problem}.
+// Actions of the drawing tools: each takes a document and targets, and returns {document, select} or {problem}.
 //
-// A target is where a gesture begins or ends: {place} in metres, with the `pin` or the `link` (its index) that is there.
+// A target is the beginning or the end of a gesture: {place} in metres, with the `pin` or the `link` (its index) under it.
 
 import {addPin, freshName, groundOf, list, members, nameOf, placeOf, project, movePin, withElement, withEntry, withKey, toggleGround} from "./document.js";
 import {centrePin, corners, linkShape} from "./shapes.js";
@@ -9,7 +9,7 @@ import {angleUnit, lengthUnit, niceBelow, tidy, written} from "./units.js";
 const STEEL = {density: 7850};  // kg/m^3
 const PIXELS_PER_NEWTON = 5;
 const TEETH = 20;
-const LIFT = 0.4, CAM_POINTS = 12;  // of the radius where the follower stands
+const LIFT = 0.4, CAM_POINTS = 12;  // lift of a new cam as a fraction of the radius at its follower, and knots of its profile
 
 const last = (document, section) => ({kind: section, index: list(document, section).length - 1});
 
@@ -20,7 +20,7 @@ function pinFor(document, {pin, link, place}) {
   return addPin(document, place);
 }
 
-/** The document with a pin more on a link: on the line of a bar, in the order of a plate's corners. */
+/** The document with one more pin on a link: on the line of a bar, or between the corners of a plate. */
 export function addPinToLink(document, index, place) {
   const link = list(document, "link")[index], shape = linkShape(document, link), pins = [...link.pins];
   let at = pins.length, foot = place;
@@ -42,7 +42,7 @@ export function addPinToLink(document, index, place) {
   return [withKey(found, "link", index, "pins", pins), name];
 }
 
-/** Width and thickness of a new link: those of the last one, or what suits the view. */
+/** Width and thickness of a new link: those of the last one, or sizes that suit the view. */
 function section(document, size) {
   const old = list(document, "link").filter(link => link.density !== undefined && link.thickness !== undefined && link.pins.length > 1).at(-1);
   const unit = lengthUnit(document), width = old?.width ?? tidy(niceBelow(size) / unit);
@@ -54,9 +54,9 @@ const isApart = (document, a, b) => { const [p, q] = [a, b].map(pin => placeOf(d
 export function drawLink(document, from, to, {size}) {
   let [found, a] = pinFor(document, from), b;
   [found, b] = pinFor(found, to);
-  if (a === b || !isApart(found, a, b)) return {problem: "a link needs two pins: drag from one place to another"};
+  if (a === b || !isApart(found, a, b)) return {problem: "a link needs two pins: drag from one point to another"};
   if (list(document, "link").some(link => link.pins.length === 2 && link.pins.includes(a) && link.pins.includes(b))) {
-    return {problem: `there is a link between ${a} and ${b} already`};
+    return {problem: `a link already joins ${a} and ${b}`};
   }
   found = withElement(found, "link", {name: freshName(found, "link"), pins: [a, b], ...section(document, size)});
   return {document: found, select: [last(found, "link")]};
@@ -69,7 +69,7 @@ export function drawPlate(document, targets, {size}) {
     [found, pin] = pinFor(found, target);
     if (!pins.includes(pin)) pins.push(pin);
   }
-  if (pins.length < 3 || !corners(pins.map(name => placeOf(found, name)))[1]) return {problem: "a plate needs three pins that are not in line"};
+  if (pins.length < 3 || !corners(pins.map(name => placeOf(found, name)))[1]) return {problem: "a plate needs at least three pins that are not in line"};
   const {width, ...rest} = section(document, size);
   found = withElement(found, "link", {name: freshName(found, "link"), pins, ...rest});
   return {document: found, select: [last(found, "link")]};
@@ -85,17 +85,19 @@ export function drawDisc(document, from, to, {size}) {
 
 export function drawGround(document, {pin, link, place}) {
   if (pin === undefined || pin === null) {
-    if (link === undefined || link === null) return {problem: "the ground holds pins: click one"};
+    if (link === undefined || link === null) return {problem: "click a pin to fix it to the ground, or to free it"};
     const [found, name] = addPinToLink(document, link, place);
     return {document: toggleGround(found, name), select: [{kind: "pin", name}]};
   }
   return {document: toggleGround(document, pin), select: [{kind: "pin", name: pin}]};
 }
 
-/** The two members that an element at a pin is between, as `of`; a problem where there are fewer than two. */
+/** The two members between which an element at a pin acts, as `of`; a problem if there are fewer than two. */
 function pairAt(document, pin, what) {
   const met = members(document, pin);
-  if (met.length < 2) return {problem: `${what} acts between two links, or a link and the ground; at ${pin} there is ${met[0] ?? "nothing"} alone: ground the pin (G)`};
+  if (met.length < 2) {
+    return {problem: `${what} acts between two links, or between a link and the ground, but ${met.length ? `only ${met[0]}` : "nothing"} is at ${pin}: fix the pin to the ground (G)`};
+  }
   return met.length > 2 ? {of: met.slice(0, 2)} : {};
 }
 
@@ -107,7 +109,7 @@ export function drawMotor(document, {pin, link, place}) {
     const made = withElement(document, "motor", {slide: nameOf(document, "slide", moved), speed: "0.1 m/s"});
     return {document: made, select: [last(made, "motor")]};
   }
-  if (!pin) return {problem: "a motor turns at a pin: click one"};
+  if (!pin) return {problem: "a motor turns a link at a pin, or moves a slide: click one of these"};
   const present = list(document, "motor").findIndex(motor => motor.pin === pin);
   if (present >= 0) return {document, select: [{kind: "motor", index: present}]};
   const pair = pairAt(document, pin, "a motor");
@@ -117,7 +119,7 @@ export function drawMotor(document, {pin, link, place}) {
 }
 
 const vector = angle => [Math.cos(angle), Math.sin(angle)].map(x => tidy(Math.round(x * 1e9) / 1e9));
-const wayOf = (from, to) => {
+const directionOf = (from, to) => {
   const dx = to.place[0] - from.place[0], dy = to.place[1] - from.place[1];
   if (Math.hypot(dx, dy) === 0) return [1, 0];
   const angle = Math.round(Math.atan2(dy, dx) / (Math.PI / 36)) * (Math.PI / 36);  // five degrees
@@ -135,16 +137,16 @@ export function drawSlide(document, from, to, {size}) {
       found = withElement(found, "link", {name, pins: [from.pin], mass: "0.5 kg", width: tidy(niceBelow(3 * size) / lengthUnit(document))});
     }
   }
-  if (!name) return {problem: "a slide guides a link: drag from a pin or a link along the line"};
-  if (list(document, "slide").some(slide => slide.link === name)) return {problem: `${name} slides already`};
+  if (!name) return {problem: "a slide guides a link along a line: drag from a pin or a link in that direction"};
+  if (list(document, "slide").some(slide => slide.link === name)) return {problem: `${name} already has a slide`};
   const on = to.link !== undefined && to.link !== null && links[to.link].name !== name ? links[to.link] : null;
-  const line = on && on.pins.length > 1 ? {along: [on.pins[0], on.pins.at(-1)], on: on.name} : {direction: wayOf(from, to)};
+  const line = on && on.pins.length > 1 ? {along: [on.pins[0], on.pins.at(-1)], on: on.name} : {direction: directionOf(from, to)};
   found = withElement(found, "slide", {name: freshName(found, "slide"), link: name, ...line});
   return {document: found, select: [last(found, "slide")]};
 }
 
 export function drawSlot(document, from, to) {
-  if (!from.pin) return {problem: "a slot guides a pin: drag from one along the line, or onto the link that has the slot"};
+  if (!from.pin) return {problem: "a slot guides a pin along a line: drag from a pin in that direction, or onto the link with the slot"};
   const on = to.link !== undefined && to.link !== null ? list(document, "link")[to.link] : null;
   let found = document, line;
   const own = members(document, from.pin).filter(name => name !== "ground");
@@ -152,9 +154,9 @@ export function drawSlot(document, from, to) {
     const along = [on.pins[0], on.pins.at(-1)], ends = along.map(pin => placeOf(document, pin));
     if (own.some(name => list(document, "link").find(l => l.name === name)?.pins.length)) found = movePin(found, from.pin, project(placeOf(document, from.pin), ...ends));
     line = {along, on: on.name};
-  } else line = {direction: wayOf(from, to)};
-  if (!own.length) return {problem: `a slot guides a pin of a link; ${from.pin} is on none`};
-  if (groundOf(document).includes(from.pin) && !line.on) return {problem: `${from.pin} is fixed: free it first (G)`};
+  } else line = {direction: directionOf(from, to)};
+  if (!own.length) return {problem: `a slot guides a pin of a link, but no link goes through ${from.pin}`};
+  if (groundOf(document).includes(from.pin) && !line.on) return {problem: `${from.pin} is fixed to the ground: free it first (G)`};
   found = withElement(found, "slot", {pin: from.pin, ...line});
   return {document: found, select: [last(found, "slot")]};
 }
@@ -163,10 +165,10 @@ export function drawGear(document, from, to) {
   const links = list(document, "link");
   const pick = target => links[target.link]?.name ?? (target.pin ? wheelAt(document, target.pin) : undefined);
   const names = [pick(from), pick(to)];
-  if (!names[0] || !names[1] || names[0] === names[1]) return {problem: "gears join two links that turn on the ground: drag from one to the other"};
+  if (!names[0] || !names[1] || names[0] === names[1]) return {problem: "gears join two links that turn about pins on the ground: drag from one to the other"};
   const pins = names.map(name => centrePin(document, name));
-  const loose = names.find((_, k) => pins[k] === null);
-  if (loose) return {problem: `${loose} must turn on the ground at one pin, its centre`};
+  const centreless = names.find((_, k) => pins[k] === null);
+  if (centreless) return {problem: `${centreless} must be joined to the ground by one pin, its centre`};
   const widths = names.map(name => parseFloat(links.find(link => link.name === name).width));
   const discs = names.every(name => links.find(link => link.name === name).pins.length === 1) && widths.every(w => w > 0);
   const teeth = discs ? [TEETH, Math.max(4, Math.round(TEETH * widths[1] / widths[0]))] : [TEETH, TEETH];
@@ -183,28 +185,28 @@ function wheelAt(document, pin) {
 export function drawCam(document, from, to) {
   const links = list(document, "link");
   const centre = from.pin ?? (links[from.link]?.pins.length === 1 ? links[from.link].pins[0] : undefined);
-  if (!centre || !to.pin || centre === to.pin) return {problem: "a cam turns at a pin and lifts another one: drag from its centre to the follower's pin"};
+  if (!centre || !to.pin || centre === to.pin) return {problem: "a cam turns about one pin and lifts another: drag from its centre to the follower's pin"};
   const cam = wheelAt(document, centre), follower = members(document, to.pin).filter(name => name !== "ground");
-  if (!cam) return {problem: `at ${centre} there must be the cam's own link: draw a disc there (B)`};
-  if (!follower.length || follower.includes(cam)) return {problem: `${to.pin} must be a pin of the link that follows`};
+  if (!cam) return {problem: `the cam needs a link of its own at ${centre}: draw a disc there (B)`};
+  if (!follower.length || follower.includes(cam)) return {problem: `${to.pin} must be a pin of the follower, not of the cam`};
   const [c, p] = [placeOf(document, centre), placeOf(document, to.pin)], pins = links.find(link => link.name === cam).pins;
   const [a, b] = pins.map(pin => placeOf(document, pin)), turned = b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : 0;
-  const radius = Math.hypot(p[0] - c[0], p[1] - c[1]), stands = Math.atan2(p[1] - c[1], p[0] - c[0]) - turned;
+  const radius = Math.hypot(p[0] - c[0], p[1] - c[1]), phase = Math.atan2(p[1] - c[1], p[0] - c[0]) - turned;
   const angles = Array.from({length: CAM_POINTS}, (_, k) => 2 * Math.PI * k / CAM_POINTS);
-  const first = ((stands % (2 * Math.PI)) + 2 * Math.PI) % (2 * Math.PI) % (2 * Math.PI / CAM_POINTS);  // the follower stands at a knot
+  const first = ((phase % (2 * Math.PI)) + 2 * Math.PI) % (2 * Math.PI) % (2 * Math.PI / CAM_POINTS);  // so that the follower is at a knot
   const profile = {
     angle: angles.map(x => tidy(Math.round((x + first) / angleUnit(document) * 1e9) / 1e9)),
-    radius: angles.map(x => written(radius * (1 + LIFT * (1 - Math.cos(x + first - stands)) / 2), document)),
+    radius: angles.map(x => written(radius * (1 + LIFT * (1 - Math.cos(x + first - phase)) / 2), document)),
   };
   const many = follower.length > 1 || members(document, centre).filter(name => name !== "ground").length > 1;
   const made = withElement(document, "cam", {pins: [centre, to.pin], profile, ...(many ? {links: [cam, follower[0]]} : {})});
   return {document: made, select: [last(made, "cam")]};
 }
 
-/** A spring or a damper between two pins; at one pin it turns. A pin that is made here is fixed. */
+/** A spring or a damper between two pins, or a torsional one at a single pin. New pins are fixed to the ground. */
 function drawBetween(document, from, to, kind, law, turning) {
   if (from.pin && (to.pin === from.pin || to.isClick)) {
-    const pair = pairAt(document, from.pin, `a ${kind} that turns`);
+    const pair = pairAt(document, from.pin, `a torsion ${kind}`);
     if (pair.problem) return pair;
     const made = withElement(document, kind, {pin: from.pin, ...pair, ...turning});
     return {document: made, select: [last(made, kind)]};
@@ -217,7 +219,7 @@ function drawBetween(document, from, to, kind, law, turning) {
     if (isNew) found = toggleGround(found, pin);
     between.push(pin);
   }
-  if (between[0] === between[1] || !isApart(found, ...between)) return {problem: `a ${kind} needs two pins: drag from one place to another`};
+  if (between[0] === between[1] || !isApart(found, ...between)) return {problem: `a ${kind} needs two pins: drag from one point to another`};
   const shared = members(found, between[0]).filter(name => members(found, between[1]).includes(name));
   if (shared.length) return {problem: `both ends are on ${shared[0]}: their distance never changes`};
   found = withElement(found, kind, {between, ...law});
@@ -235,11 +237,11 @@ export function drawLoad(document, from, to, {scale}) {
   else if (from.link !== undefined && from.link !== null) {
     const [made, pin] = addPinToLink(document, from.link, from.place);
     [found, target] = [made, {pin}];
-  } else return {problem: "a load pulls at a pin or a link: drag from one in the direction of the force"};
-  if (!members(found, target.pin).some(name => name !== "ground")) return {problem: `no link is at ${target.pin}`};
+  } else return {problem: "a load acts on a pin or a link: drag from it in the direction of the force"};
+  if (!members(found, target.pin).some(name => name !== "ground")) return {problem: `there is no link at ${target.pin}`};
   found = withElement(found, "load", {...target, force: force.map(x => `${x} N`)});
   return {document: found, select: [last(found, "load")]};
 }
 
-/** The document with the order of two links that a motor turns reversed. */
+/** The document with the two links of an element at a pin swapped. */
 export const swapPair = (document, section, index) => withEntry(document, section, index, entry => ({...entry, of: [...entry.of].reverse()}));

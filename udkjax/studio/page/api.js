@@ -1,12 +1,12 @@
-// Requests to the studio's server, which carry the token that stands in the fragment of the page's address.
+// Requests to the studio's server, with the token from the fragment of the page's address.
 
 const fragment = new URLSearchParams(location.hash.slice(1));
 const token = fragment.get("t") ?? "";
 
-/** The file that the address asks for. */
+/** The file named in the address. */
 export const askedFile = fragment.get("f") ?? "";
 
-/** A request that was not served: `status` and `details` are those of the answer. */
+/** A request that failed or was refused; `status` and `details` come from the answer. */
 export class RequestError extends Error {
   constructor(status, details) {
     super(details.problem ?? `the server answered ${status}`);
@@ -14,7 +14,7 @@ export class RequestError extends Error {
   }
 }
 
-/** Ask one of the routes list, open, save, compile, diagnose. */
+/** Send a request to one of the routes list, open, save, compile, diagnose. */
 export async function ask(route, request = {}, signal = undefined) {
   let answer;
   try {

@@ -1,8 +1,8 @@
-// The drawing on its canvas: grid, picture, paths, symbols, marks of what is selected or redundant, names, and gestures under way.
+// The drawing on its canvas: grid, picture, paths, symbols, marks of selected and redundant elements, names, and the current gesture.
 
 import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {middle, symbolsOf} from "./drawn_symbols.js";
-import {carry} from "./mover.js";
+import {carry} from "./page_engine.js";
 import {linkShape} from "./shapes.js";
 import {Labels, aroundPin, besideBar, within} from "./player/labels.js";
 import {THEMES, contextOf} from "./player/painter.js";
@@ -10,9 +10,9 @@ import {SymbolPainter} from "./player/symbols.js";
 import {angleUnit, lengthUnit, shown} from "./units.js";
 import {toPixels} from "./view.js";
 
-const HALO = 7;  // px around what is selected
+const HALO = 7;  // px around a selected element
 const LABEL = 12;  // px
-const SIGN_PLACES = [[13, 11, "left"], [13, -11, "left"], [-13, 11, "right"], [-13, -11, "right"]];  // px, of what a mark says
+const SIGN_PLACES = [[13, 11, "left"], [13, -11, "left"], [-13, 11, "right"], [-13, -11, "right"]];  // px: offsets of the letter of a mark
 
 export class DrawingCanvas {
   constructor(element) {
@@ -33,7 +33,7 @@ export class DrawingCanvas {
     return this.carriers.found.get(pin) ?? -1;
   }
 
-  /** The pixels of all pins, except some. */
+  /** Positions (px) of all pins but those in `except`. */
   placesOf(document, except = []) {
     const {view, motions} = this.studio, found = new Map();
     for (const name of Object.keys(pinsOf(document))) {
@@ -75,7 +75,7 @@ export class DrawingCanvas {
     c.globalAlpha = 1;
   }
 
-  /** A symbol in pixels, to be picked. */
+  /** The outline of a symbol in pixels, for picking. */
   outline(symbol, painter) {
     const {centre, size, corners} = painter.outline(symbol), {of, closed, width} = symbol;
     return {of, closed, width, points: corners ?? [centre], radius: size};
@@ -102,7 +102,7 @@ export class DrawingCanvas {
     for (const [items, alpha] of [[hovered ? [hovered] : [], 0.22], [selection, 0.5]]) {
       painter.context.globalAlpha = alpha;
       for (const {of, points, radius, closed, width} of this.outlines) {
-        if (of.kind === "pin" && radius === undefined) continue;  // its support
+        if (of.kind === "pin" && radius === undefined) continue;  // the support of the pin
         if (!items.some(item => item.kind === of.kind && item.index === of.index && item.name === of.name)) continue;
         if (radius !== undefined) painter.circle(points[0], radius + HALO / 2, {stroke: theme.accent, width: HALO});
         else painter.line(points, width + HALO, theme.accent, {closed});
@@ -111,7 +111,7 @@ export class DrawingCanvas {
     }
   }
 
-  /** What the findings speak of: pins of redundant sets, each with a sign. */
+  /** Marks of the findings: pins with redundant constraints, each with a letter. */
   marks({marked, preview}, painter, theme) {
     for (const [name, {sign, strong}] of marked) {
       const place = this.places.get(name);
@@ -133,7 +133,7 @@ export class DrawingCanvas {
       if (show.names || chosen) names.put(`pin ${name}`, name, aroundPin(place), theme.ink, chosen ? 700 : 400);
     }
     list(document, "link").forEach((link, k) => {
-      const chosen = isChosen("link", undefined, k), places = this.placesOfName(link, k, document, painter, motions);
+      const chosen = isChosen("link", undefined, k), places = this.namePlaces(link, k, document, painter, motions);
       if (places && (chosen || (show.names && link.pins?.length > 1))) names.put(`link ${k}`, link.name ?? "", places, painter.textColour(k), chosen ? 700 : 500);
     });
     for (const section of ["motor", "spring", "damper", "load", "gear", "cam"]) {
@@ -144,8 +144,8 @@ export class DrawingCanvas {
     }
   }
 
-  /** Where the name of a link may stand: within a plate, or beside a bar. */
-  placesOfName(link, k, document, painter, motions) {
+  /** Candidate positions of a link's name: within a plate, or beside a bar. */
+  namePlaces(link, k, document, painter, motions) {
     const pixel = place => toPixels(painter.view, carry(motions, k, place)), shape = linkShape(document, link), centre = middle(link, document);
     if (!shape || !centre) return null;
     return shape.kind === "line" ? besideBar(pixel(shape.points[0]), pixel(shape.points.at(-1))) : within(pixel(centre), shape.kind === "disc");

@@ -1,4 +1,4 @@
-// What a document must be before the page can draw it: its tables are tables, and its lists are lists. The server says all else.
+// Checks that the page can draw a document: its tables are tables, and its lists are lists. The server checks everything else.
 
 import {LISTS} from "./document.js";
 
@@ -7,7 +7,7 @@ const TABLES = ["pins", "units", "velocities"], NAMES = ["pins", "along", "betwe
 const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
 const isNames = value => Array.isArray(value) && value.every(name => typeof name === "string");
 
-/** Why the page cannot draw a document, in words; an empty text where it can. */
+/** The reason why the page cannot draw a document; empty if it can. */
 export function shapeProblem(document) {
   const table = TABLES.find(key => key in document && !isTable(document[key]));
   if (table) return `${table}: must be a table`;
@@ -24,12 +24,12 @@ export function shapeProblem(document) {
 }
 
 function entryProblem(section, entry) {
-  if ("name" in entry && typeof entry.name !== "string") return "name: must be a text";
-  if (section === "link" && !("pins" in entry)) return "pins: missing: a link goes through pins";
+  if ("name" in entry && typeof entry.name !== "string") return "name: must be a string";
+  if (section === "link" && !("pins" in entry)) return "pins: missing; a link needs a list of pins, such as [\"A\", \"B\"]";
   const names = NAMES.find(key => key in entry && !isNames(entry[key])), numbers = NUMBERS.find(key => key in entry && !Array.isArray(entry[key]));
   if (names) return `${names}: must be a list of names, such as A, B`;
   if (numbers) return `${numbers}: must be a list, such as [1, 2]`;
   if (!("profile" in entry)) return "";
   const isProfile = isTable(entry.profile) && ["angle", "radius"].every(key => !(key in entry.profile) || Array.isArray(entry.profile[key]));
-  return isProfile ? "" : "profile: its angles and radii must be lists";
+  return isProfile ? "" : "profile: angle and radius must be lists";
 }

@@ -1,23 +1,27 @@
-// Panels of curves below the drawing, which scrub it. Kinematics: positions, speeds, angles between links, how far motors turn;
-// dynamics: energies and efforts by the engine in the page, forces at pins by the server; statics: where it rests, and what holds it.
+// Panels of curves below the drawing; dragging along a curve moves the mechanism. Kinematics: positions, speeds, angles between
+// links, travel of motors. Dynamics: energies, driving torques and forces from the engine in the page, forces at pins from the
+// server. Statics: the equilibrium, and holding torques and forces of motors.
 
 import {ask} from "./api.js";
 import {list, members, nameOf, pinsOf, placeOf} from "./document.js";
-import {carry} from "./mover.js";
+import {carry} from "./page_engine.js";
 import {lengthName, lengthUnit} from "./units.js";
 import {button, make} from "./player/elements.js";
 import {interval} from "./player/motion.js";
 import {Painter, THEMES, contextOf} from "./player/painter.js";
 import {drawStrip, stripPart} from "./player/strip.js";
 
-const ROUNDING = 1e-10;  // of the scale of a quantity
+const ROUNDING = 1e-10;  // relative to the scale of a quantity: values that vary less are constant
+const VIOLATION = "constraint violation";
 
-// Of each panel what the server is asked for: the words on its button, and what it does.
+// The requests that each panel offers: subject, label of the button, tooltip.
 const PANELS = {
-  kinematics: {title: "Kinematics", words: "positions, speeds, angles, travel", actions: []},
-  dynamics: {title: "Dynamics", words: "energies, efforts, forces", actions: [["dynamics", "Forces at pins", "compute forces at pins, and powers of motors"]]},
-  statics: {title: "Statics", words: "rest, and what holds it", actions: [["rest", "At rest", "find the position of rest next to the drawn one, and its frequencies"],
-    ["holding", "Held by motors", "compute efforts and forces where motors hold the mechanism still, in each position of the motion"]]},
+  kinematics: {title: "Kinematics", words: "positions, speeds, angles, travel of motors", actions: []},
+  dynamics: {title: "Dynamics", words: "energies, driving torques and forces, forces at pins",
+    actions: [["dynamics", "Forces at pins", "compute forces at pins and the power of motors"]]},
+  statics: {title: "Statics", words: "equilibrium, holding torques and forces",
+    actions: [["rest", "Equilibrium", "find the stable equilibrium next to the drawn position, and its natural frequencies"],
+      ["holding", "Holding torques", "compute the holding torques and forces of the motors at rest in each position of the motion, and the forces at pins"]]},
 };
 
 export class CurvesPanel {
@@ -66,17 +70,17 @@ export class CurvesPanel {
       if (met.length === 2) found.push(`${pin}: angle between ${met[0]} and ${met[1]}${transmits ? " (transmission angle)" : ""}`);
     }
     for (const link of list(document, "link")) found.push(`${link.name}: angle`, `${link.name}: angular velocity`);
-    return motion.run.violation.length ? [...found, "violation of the loops"] : found;
+    return motion.run.violation.length ? [...found, VIOLATION] : found;
   }
 
   dynamic() {
-    const {energies} = this.studio.motion;
+    const {energies, pageEngine} = this.studio.motion;
     if (!energies) return [];
-    const efforts = Object.entries(energies.efforts).filter(([, values]) => values.some(Number.isFinite)).map(([driver]) => `${driver}: effort`);
-    return [...efforts, "kinetic energy", "potential energy", "energy"];
+    const known = pageEngine.scene.drivers.filter(({name}) => energies.efforts[name]?.some(Number.isFinite));
+    return [...known.map(({effort}) => effort), "kinetic energy", "potential energy", "energy"];
   }
 
-  /** What the server found for the panel that is open, while it is of this drawing. */
+  /** The server's answer for the open panel, if it is about this drawing. */
   servedFor() {
     const found = this.served[this.panel];
     return found?.document === this.studio.document ? found : null;
@@ -84,14 +88,14 @@ export class CurvesPanel {
 
   servedCurves() { return this.servedFor()?.curves ?? []; }
 
-  /** Show a curve of what is selected now, where there is one. */
+  /** Show a curve of the selected element, if it has one. */
   follow() {
     const first = this.names().find(name => name.startsWith(this.selectedName()));
     if (first && !this.name.startsWith(this.selectedName())) this.chosen[this.panel] = first;
     this.select.value = this.name;
   }
 
-  /** Offer the curves that there are. */
+  /** Offer the available curves. */
   list() {
     const names = this.names(), groups = names.filter(name => name.startsWith(this.selectedName()));
     if (!names.includes(this.name)) this.chosen[this.panel] = groups[0] ?? names[0] ?? "";
@@ -108,26 +112,27 @@ export class CurvesPanel {
 
   /** The values of a curve, and their unit. */
   values(name) {
-    const {document, motion} = this.studio, {run, energies, mover} = motion, {size} = mover, unit = lengthUnit(document), long = lengthName(document);
+    const {document, motion} = this.studio, {run, energies, pageEngine} = motion, {size} = pageEngine, unit = lengthUnit(document), long = lengthName(document);
     const served = this.servedCurves().find(curve => shownName(curve) === name);
     if (served && !(this.panel === "dynamics" && this.dynamic().includes(name))) return {unit: served.unit, ts: this.servedFor().times, values: served.values.map(x => x ?? NaN)};
-    if (name === "violation of the loops") return {unit: "", log: true, values: Array.from(run.violation, x => Math.max(x, 1e-17))};
+    if (name === VIOLATION) return {unit: "", log: true, values: Array.from(run.violation, x => Math.max(x, 1e-17))};
     if (name === "energy") return {unit: "J", values: Array.from(energies.kinetic, (x, k) => x + energies.potential[k])};
     if (name.endsWith(" energy")) return {unit: "J", values: energies[name.split(" ")[0]]};
     const at = name.lastIndexOf(": "), owner = name.slice(0, at), quantity = name.slice(at + 2), link = list(document, "link").findIndex(l => l.name === owner);
-    if (quantity === "effort" && owner in energies.efforts) return {unit: "N m", values: energies.efforts[owner]};
-    const each = action => Array.from({length: run.count}, (_, i) => action(i * size, mover.motions(run.q.slice(i * size, (i + 1) * size))));
+    const driver = pageEngine.scene.drivers.find(({effort}) => effort === name);
+    if (driver) return {unit: driver.unit, values: energies.efforts[driver.name]};
+    const each = action => Array.from({length: run.count}, (_, i) => action(i * size, pageEngine.motions(run.q.slice(i * size, (i + 1) * size))));
     const still = (scale, values) => withoutRounding(values, scale);
-    if (quantity === "angle" && link >= 0) return {unit: "°", values: still(180, each(i => run.q[i + 3 * mover.order[link] + 2] * 180 / Math.PI))};
-    if (quantity === "angular velocity") return {unit: "rad/s", values: each(i => run.v[i + 3 * mover.order[link] + 2])};
+    if (quantity === "angle" && link >= 0) return {unit: "°", values: still(180, each(i => run.q[i + 3 * pageEngine.order[link] + 2] * 180 / Math.PI))};
+    if (quantity === "angular velocity") return {unit: "rad/s", values: each(i => run.v[i + 3 * pageEngine.order[link] + 2])};
     const place = placeOf(document, owner), carrier = this.studio.canvas.carrier(document, owner);
     if (quantity.startsWith("angle between ")) return {unit: "°", values: this.angles(owner, each)};
     if (quantity === "speed") return {unit: `${long}/s`, values: each((i, motions) => this.speed(i, motions, carrier, place) / unit)};
-    return {unit: long, values: still(mover.scene.length / unit, each((_, motions) => carry(motions, carrier, place)[quantity === "x" ? 0 : 1] / unit))};
+    return {unit: long, values: still(pageEngine.scene.length / unit, each((_, motions) => carry(motions, carrier, place)[quantity === "x" ? 0 : 1] / unit))};
   }
 
   speed(i, motions, link, place) {
-    const {run, mover} = this.studio.motion, k = i + 3 * mover.order[link], at = carry(motions, link, place), w = run.v[k + 2];
+    const {run, pageEngine} = this.studio.motion, k = i + 3 * pageEngine.order[link], at = carry(motions, link, place), w = run.v[k + 2];
     return Math.hypot(run.v[k] - w * (at[1] - run.q[k + 1]), run.v[k + 1] + w * (at[0] - run.q[k]));
   }
 
@@ -143,7 +148,7 @@ export class CurvesPanel {
     });
   }
 
-  /** Ask the server for what a button says. */
+  /** Ask the server for the subject of a button. */
   async ask(about) {
     const {studio} = this, {document} = studio, {panel} = this;
     this.busy = about;
@@ -166,10 +171,10 @@ export class CurvesPanel {
   showRest({q, kind, frequencies}, document) {
     if (document === this.studio.document && q) this.studio.motion.pose(Float64Array.from(q));
     const rates = frequencies.map(x => `${+x.toPrecision(4)} Hz`).join(", ");
-    this.facts.statics = {document, words: q ? `at rest: ${kind}${rates ? `, frequencies ${rates}` : ""}` : "no position of rest was found"};
+    this.facts.statics = {document, words: q ? `${kind} equilibrium${rates ? `, natural frequencies ${rates}` : ""}` : "no equilibrium was found"};
   }
 
-  /** The buttons of the panel that is open, and what it says. */
+  /** The buttons of the open panel, and its status text. */
   showBar() {
     const {studio} = this, {motion} = studio, moves = motion.run?.count > 1, fact = this.facts[this.panel];
     for (const {panel, name, button} of this.actions) {
@@ -198,14 +203,14 @@ export class CurvesPanel {
 
   drawNothing(context, theme, width, height) {
     const moves = this.studio.motion.run?.count > 1;
-    const words = moves ? "Press a button above: the server computes what there is to see." : "Curves of the motion stand here as soon as there is one.";
+    const words = moves ? "Press a button above to compute curves." : "Curves appear here once the mechanism moves.";
     new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null).text(words, [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   }
 }
 
 const shownName = curve => `${curve.name}${curve.unique ? "" : " (not unique)"}`;
 
-/** Values, or their first one throughout where they differ by rounding alone. */
+/** The values, or all equal to the first one if they differ only by rounding. */
 function withoutRounding(values, scale) {
   const spread = values.reduce((most, x) => Math.max(most, Math.abs(x - values[0])), 0);
   return spread <= ROUNDING * scale ? values.map(() => values[0]) : values;

@@ -1,5 +1,5 @@
-// Drawings as plain data, the tables of their file, and the changes that the editor makes to them. A document is never changed:
-// each function returns a new one that shares what stays.
+// Drawings as plain data (the tables of their file), and the editor's changes to them. A document is immutable: each function
+// returns a new one that shares the unchanged parts.
 
 import {length, point, written} from "./units.js";
 
@@ -7,8 +7,8 @@ export const LISTS = ["link", "slide", "slot", "gear", "cam", "motor", "spring",
 // Keys of tables that name pins and links.
 const PIN_KEYS = ["pin", "pins", "along", "between"], LINK_KEYS = ["link", "on", "links", "of", "carrier", "bodies", "body"];
 const GROUND = "ground";
-const OFF_LINE = 1e-9;  // of the length of a line: a pin that is nearer lies on it
-const INNER = 0.05;  // of a bar: how near to its ends a pin between them comes
+const OFF_LINE = 1e-9;  // fraction of a line's length: a pin closer to the line lies on it
+const INNER = 0.05;  // fraction of a bar's length that its inner pins keep from its ends
 
 export const EMPTY = {format: 2, units: {length: "mm", angle: "deg"}, ground: [], pins: {}};
 
@@ -20,7 +20,7 @@ export const placeOf = (document, pin) => point(pinsOf(document)[pin], document)
 /** The name of an element: its own, or the section's with its number. */
 export const nameOf = (document, section, index) => list(document, section)[index]?.name ?? `${section}${index + 1}`;
 
-/** The document with a section in place of the old one; an empty one is left out. */
+/** The document with a section replaced; an empty section is left out. */
 function withSection(document, section, entries) {
   const {[section]: _, ...rest} = document;
   const order = Object.keys(document);
@@ -28,7 +28,7 @@ function withSection(document, section, entries) {
   return order.includes(section) ? {...document, [section]: entries} : {...rest, [section]: entries};
 }
 
-/** The document with one key of an element changed, or left out where the value is undefined. */
+/** The document with one key of an element changed, or removed if the value is undefined. */
 export function withKey(document, section, index, key, value) {
   return withEntry(document, section, index, entry => {
     const {[key]: _, ...rest} = entry;
@@ -40,16 +40,16 @@ export function withEntry(document, section, index, change) {
   return withSection(document, section, list(document, section).map((entry, k) => (k === index ? change(entry) : entry)));
 }
 
-/** The document with an element more. */
+/** The document with one more element. */
 export const withElement = (document, section, entry) => withSection(document, section, [...list(document, section), entry]);
 
-/** The members of a pin: the ground where it is fixed, and the names of the links that share it. */
+/** The members of a pin: the ground if it is fixed, and the names of the links that share it. */
 export function members(document, pin) {
   const links = list(document, "link").filter(link => link.pins?.includes(pin)).map(link => link.name);
   return groundOf(document).includes(pin) ? [GROUND, ...links] : links;
 }
 
-/** A name that no pin has: A, B, ..., Z, A1, ... */
+/** An unused name for a pin: A, B, ..., Z, A1, ... */
 function freshPin(document) {
   const taken = new Set([...Object.keys(pinsOf(document)), ...LISTS.flatMap(s => list(document, s).map((_, k) => nameOf(document, s, k)))]);
   for (let k = 0; ; k++) {
@@ -58,13 +58,13 @@ function freshPin(document) {
   }
 }
 
-/** A name that no element has: link1, link2, ... */
+/** An unused name for an element: link1, link2, ... */
 export function freshName(document, base) {
   const taken = new Set([...Object.keys(pinsOf(document)), ...LISTS.flatMap(s => list(document, s).map((_, k) => nameOf(document, s, k)))]);
   for (let k = 1; ; k++) if (!taken.has(`${base}${k}`)) return `${base}${k}`;
 }
 
-/** The document with a pin more at a place (m), and the pin's name. */
+/** The document with a new pin at a place (m), and the pin's name. */
 export function addPin(document, place) {
   const name = freshPin(document);
   return [movePin(document, name, place), name];
@@ -76,7 +76,7 @@ export function movePin(document, name, place) {
   return {...document, pins: {...pinsOf(document), [name]: value}};
 }
 
-/** The document whose pins are moved by (dx, dy) metres; slots with lines through pins keep their pins on these. */
+/** The document with some pins moved by (dx, dy) metres. */
 export function shiftPins(document, names, dx, dy) {
   let found = document;
   for (const name of names) {
@@ -86,7 +86,7 @@ export function shiftPins(document, names, dx, dy) {
   return found;
 }
 
-/** The document with pins put onto the lines that hold them: those between the ends of bars, and those of slots through two pins. */
+/** The document with pins moved onto their lines: inner pins of bars, and pins in slots along two pins. */
 export function settle(document) {
   let found = document;
   for (const {pins = [], width, inertia, outline} of list(document, "link")) {
@@ -99,7 +99,7 @@ export function settle(document) {
   return found;
 }
 
-/** The document with a pin on the line through two others, and between them where it must be. */
+/** The document with a pin moved onto the line through two others and, if asked, between them. */
 function ontoLine(document, pin, along, between = false) {
   const ends = along.map(name => placeOf(document, name)), at = placeOf(document, pin);
   if (!ends.every(Boolean) || !at) return document;
@@ -121,7 +121,7 @@ export function project(p, a, b) {
   return [a[0] + s * dx, a[1] + s * dy];
 }
 
-/** A value whose names are changed; a list loses those that become the same. */
+/** A value with its names replaced; a list loses duplicates. */
 function renamed(value, names) {
   if (Array.isArray(value)) return [...new Set(value.map(x => names.get(x) ?? x))];
   return names.get(value) ?? value;
@@ -139,7 +139,7 @@ function renameKeys(document, keys, names) {
   return found;
 }
 
-/** The document with a pin under another name; a name that is taken, or none, changes nothing. */
+/** The document with a pin renamed; a taken or empty name changes nothing. */
 export function renamePin(document, old, name) {
   if (!name || name === old || Object.hasOwn(pinsOf(document), name)) return document;
   const swap = key => (key === old ? name : key), again = table => Object.fromEntries(Object.entries(table).map(([k, v]) => [swap(k), v]));
@@ -148,7 +148,7 @@ export function renamePin(document, old, name) {
   return renameKeys(found, PIN_KEYS, new Map([[old, name]]));
 }
 
-/** The document with an element under another name; links keep what refers to them. */
+/** The document with an element renamed, and all references to it. */
 export function renameElement(document, section, index, name) {
   const old = nameOf(document, section, index), taken = list(document, section).some((_, k) => nameOf(document, section, k) === name);
   if (!name || name === old || taken) return document;
@@ -157,7 +157,7 @@ export function renameElement(document, section, index, name) {
   return renameKeys(found, keys, new Map([[old, name]]));
 }
 
-/** The document with one pin in place of two: all that was at the first is at the second. Links that lose their length go. */
+/** The document with two pins merged: everything at `from` moves to `into`. Links left with a single pin are removed. */
 export function mergePins(document, from, into) {
   if (from === into) return document;
   const {[from]: _, ...pins} = pinsOf(document);
@@ -168,13 +168,13 @@ export function mergePins(document, from, into) {
   return removeElements(merged, gone.map(index => ({kind: "link", index})));
 }
 
-/** The document with the ground at a pin, or without it. */
+/** The document with a pin fixed to the ground, or freed. */
 export function toggleGround(document, pin) {
   const ground = groundOf(document);
   return {...document, ground: ground.includes(pin) ? ground.filter(name => name !== pin) : [...ground, pin]};
 }
 
-/** The document without pins and elements {kind: "pin", name} or {kind: section, index}, and without what hangs on them. */
+/** The document without some items, {kind: "pin", name} or {kind: section, index}, and without elements that need them. */
 export function removeElements(document, items) {
   const names = new Set(items.filter(item => item.kind === "pin").map(item => item.name));
   let found = document;
@@ -198,13 +198,13 @@ export function removeElements(document, items) {
   for (const section of LISTS) {
     if (gone[section].size) found = withSection(found, section, list(found, section).filter((_, k) => !gone[section].has(k)));
   }
-  found = dropAlone(document, found);
+  found = dropUnsupported(document, found);
   const before = usedPins(document), after = usedPins(found);
   return dropPins(found, pin => names.has(pin) || (before.has(pin) && !after.has(pin)));
 }
 
-/** The document without what turned or pulled at pins where, other than before, no two members meet, or no link is. */
-function dropAlone(before, document) {
+/** The document without motors, springs, dampers and loads at pins that have lost the members they acted on. */
+function dropUnsupported(before, document) {
   let found = document;
   for (const section of ["motor", "spring", "damper", "load"]) {
     const least = section === "load" ? 1 : 2, met = (doc, pin) => members(doc, pin).filter(name => least === 2 || name !== GROUND).length;
@@ -224,13 +224,13 @@ function dropPins(document, isDropped) {
   return found;
 }
 
-/** The pins of what is selected. */
+/** The pins of items. */
 export function pinsOfItems(document, items) {
   return [...new Set(items.flatMap(item => (item.kind === "pin" ? [item.name]
     : item.kind === "link" ? list(document, "link")[item.index]?.pins ?? [] : [])))];
 }
 
-/** The document with copies of links and of what lies between them, (dx, dy) metres away; and the copies. */
+/** The document with copies of links and their pins, (dx, dy) metres away; and the copies. */
 export function duplicate(document, items, dx, dy) {
   const links = items.filter(item => item.kind === "link").map(item => item.index);
   let found = document;

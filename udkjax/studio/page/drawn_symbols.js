@@ -1,13 +1,13 @@
-// The symbols of a drawing, as the player paints them (player/symbols.js): lines and circles in the frames of its links. The frame
-// of a link is that of the ground while it stands as drawn. Each symbol says what it belongs to, so that it can be picked.
+// The symbols of a drawing, as the player paints them (player/symbols.js): lines and circles in the frames of its links. In the
+// drawn position each link's frame coincides with the ground's. `of` names the element of a symbol, so that it can be picked.
 
 import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {camOutline, extent, gearWheels, lineAngle, linkShape} from "./shapes.js";
 import {length} from "./units.js";
 
-const ROUND = 48;  // corners of a circle that is drawn as a line
-const MOST_STROKES = 200;  // of one line: a view may be far inside of it
-const RAIL = 0.25;  // of the extent: half of a rail's length
+const ROUND = 48;  // vertices of a circle drawn as a polyline
+const MOST_STROKES = 200;  // hatching strokes of one line, which may extend far beyond the view
+const RAIL = 0.25;  // half of a rail's length, as a fraction of the drawing's extent
 const edge = body => `edge:${body}`, tint = body => `tint:${body}`;
 const offsets = points => points.map(([x, y]) => [0, 0, x, y]);
 const arc = (radius, from, to, count = ROUND) => Array.from({length: count}, (_, k) => {
@@ -26,10 +26,10 @@ function* hatch(frame, from, to, step, y, metres = 0) {
   }
 }
 
-/** The symbols of a document, the farthest first.
+/** The symbols of a document, from back to front.
  *
- *  `unit` is the unit of symbols (m) in the view: strokes are so far apart. `paths` are those of pins, {name, line: [x, y, ...]}
- *  in metres, where they are known: rails are as long as they are used.
+ *  `unit` is the size (m) of one unit of symbols in the view, which sets the spacing of strokes. `paths` are the known paths of
+ *  pins, {name, line: [x, y, ...]} in metres: a rail is as long as its pin travels.
  */
 export function symbolsOf(document, unit, paths = []) {
   const draft = new Draft(document, unit, paths);
@@ -56,7 +56,7 @@ class Draft {
   body(name) { return this.number.get(name) ?? -1; }
   place(pin) { return placeOf(this.document, pin); }
 
-  /** The number of the last link of a pin, or -1: that of the ground. */
+  /** The index of the last link of a pin, or -1 for the ground. */
   bodyOf(pin) {
     const names = members(this.document, pin);
     return names[0] === "ground" ? -1 : this.body(names.at(-1));
@@ -66,7 +66,7 @@ class Draft {
     const shape = linkShape(this.document, link), of = {kind: "link", index: k};
     if (!shape) return;
     if (shape.kind === "disc") {
-      if (this.blocks.has(link.name)) return;  // a block stands for it
+      if (this.blocks.has(link.name)) return;  // drawn as a block
       const frame = at(k, shape.at);
       this.plates.push({...circle(frame, [shape.radius, 0, 8], tint(k), edge(k)), of});
       const reach = Math.max(0.85 * shape.radius, 0);
@@ -102,7 +102,7 @@ class Draft {
     this.put("elements", [line(at(k, place, angle), offsets([[-15, -9], [15, -9], [15, 9], [-15, 9]]), edge(k), 1.5, tint(k), true)]);
   }
 
-  /** How far along a line from a place (m) a pin goes: to the ends of its path, and a little farther. */
+  /** The range along a line, from a place (m), over which a pin travels, with a margin at both ends. */
   span(pin, [x, y], angle, on) {
     const path = on < 0 ? this.paths.find(({name}) => name === pin)?.line : null;
     if (!path) return [-RAIL * this.size, RAIL * this.size];
@@ -238,7 +238,7 @@ class Draft {
   }
 }
 
-/** The middle of a link's pins, or its centre where that is given (m). */
+/** The given centre of a link, or else the middle of its pins (m). */
 export function middle(link, document) {
   if (Array.isArray(link.centre)) return link.centre.map(x => length(x, document));
   const places = (link.pins ?? []).map(pin => placeOf(document, pin)).filter(Boolean);

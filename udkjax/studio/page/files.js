@@ -1,11 +1,12 @@
-// Files: new, open, save, export. What changed on disk meanwhile is never overwritten unasked.
+// Files: new, open, save, export. A file that has changed on disk is never overwritten without asking.
 
 import {ask} from "./api.js";
 import {shapeProblem} from "./checks.js";
 import {EMPTY} from "./document.js";
 import {make} from "./player/elements.js";
 
-const EXPORTS = {html: "page that simulates, offline", svg: "picture", png: "picture in pixels", gif: "film", dxf: "drawing for CAD", csv: "table of the motion", py: "Python script"};
+const EXPORTS = {html: "live page, simulates offline", svg: "vector picture", png: "bitmap picture", gif: "animated picture", dxf: "drawing for CAD",
+  csv: "table of the motion", py: "Python script"};
 
 export class FileActions {
   constructor(studio) {
@@ -18,7 +19,7 @@ export class FileActions {
   showTitle() {
     const name = this.path || "untitled";
     this.studio.parts.title.textContent = (this.isChanged ? "● " : "") + name;
-    this.studio.parts.title.title = this.isChanged ? `${name}: not saved yet` : name;
+    this.studio.parts.title.title = this.isChanged ? `${name}: unsaved changes` : name;
     document.title = `${this.isChanged ? "● " : ""}${name} – udkjax studio`;
   }
 
@@ -39,11 +40,11 @@ export class FileActions {
     }}, words)));
   }
 
-  /** Go on, after asking where something is not saved. */
+  /** Run an action, after asking about unsaved changes. */
   unlessChanged(action) {
     if (!this.isChanged) return action();
-    return this.dialog("Not saved yet", make("p", {}, `${this.path || "This drawing"} has changes that are not saved.`),
-      this.buttons(["Cancel"], ["Discard them", action], ["Save", async () => { if (await this.save(false)) action(); }, "strong"]));
+    return this.dialog("Unsaved changes", make("p", {}, `${this.path || "This drawing"} has unsaved changes.`),
+      this.buttons(["Cancel"], ["Discard changes", action], ["Save", async () => { if (await this.save(false)) action(); }, "strong"]));
   }
 
   fail(error) { this.studio.say(error.message, true); }
@@ -70,7 +71,7 @@ export class FileActions {
         const entry = (words, action) => make("li", {}, make("button", {type: "button", class: "link", onclick: () => { this.studio.parts.dialog.close(); action(); }}, words));
         this.dialog("Open",
           make("div", {class: "columns"},
-            make("section", {}, make("h3", {}, `Files in ${folder}`), files.length ? make("ul", {}, ...files.map(name => entry(name, () => this.openFile(name)))) : make("p", {}, "none yet")),
+            make("section", {}, make("h3", {}, `Files in ${folder}`), files.length ? make("ul", {}, ...files.map(name => entry(name, () => this.openFile(name)))) : make("p", {}, "no scene files yet")),
             make("section", {}, make("h3", {}, "Templates"), make("ul", {}, ...templates.map(({name, title}) => entry(title, () => this.openTemplate(name)))))),
           this.buttons(["Cancel"]));
       } catch (error) { this.fail(error); }
@@ -82,7 +83,7 @@ export class FileActions {
       if (!mayBeNew || error.status !== 404) return this.fail(error);
       Object.assign(this, {path, revision: null});
       this.showStart();
-      return this.studio.say(`${path} is new: it is made when you save`);
+      return this.studio.say(`${path} does not exist yet: saving creates it`);
     });
   }
 
@@ -95,12 +96,12 @@ export class FileActions {
       const problems = document ? [shapeProblem(document)].filter(Boolean) : said;
       if (!document || problems.length) {
         this.studio.say(problems.join("; "), true);
-        this.dialog(`${path} cannot be drawn`, make("ul", {class: "problems"}, ...problems.map(problem => make("li", {}, problem))), this.buttons(["Close"]));
+        this.dialog(`Cannot draw ${path || request.template}`, make("ul", {class: "problems"}, ...problems.map(problem => make("li", {}, problem))), this.buttons(["Close"]));
         return;
       }
       Object.assign(this, {path: drawn ? "" : path, revision: drawn ? null : revision, saved: path && !drawn ? {document, text} : {document, text}});
       this.studio.load({document, text});
-      this.studio.say(drawn && path ? `${path} has bodies and joints: it is drawn anew, and saved under another name` : "");
+      this.studio.say(drawn && path ? `${path} is a scene of bodies and joints: it was converted into a drawing, which needs a new file name` : "");
     } catch (error) { failed(error); }
   }
 
@@ -114,7 +115,7 @@ export class FileActions {
   askName(title, suggested, action, ...content) {
     return new Promise(done => {
       const input = make("input", {type: "text", value: suggested, "aria-label": "file name", spellcheck: "false"});
-      const form = make("form", {method: "dialog"}, ...content, make("label", {class: "field wide"}, make("span", {}, "in this folder"), input),
+      const form = make("form", {method: "dialog"}, ...content, make("label", {class: "field wide"}, make("span", {}, "file in this folder"), input),
         make("div", {class: "group end"}, make("button", {type: "button", onclick: () => { this.studio.parts.dialog.close(); done(false); }}, "Cancel"), make("button", {class: "strong"}, "Save")));
       form.addEventListener("submit", () => { if (input.value.trim()) done(action(input.value.trim())); else done(false); });
       this.dialog(title, form);
@@ -124,11 +125,11 @@ export class FileActions {
     });
   }
 
-  /** The text of the present state, as soon as it is known. */
+  /** The text of the current state, once it is known. */
   async text() {
     const {studio} = this;
     if (studio.source.timer) await studio.source.take();
-    if (studio.source.isBroken) throw new Error("the text beside the drawing cannot be read: mend it, or go back to that of the drawing");
+    if (studio.source.isBroken) throw new Error("the edited text cannot be read: correct it, or go back to the text of the drawing");
     if (studio.state.text === null) {
       const found = await ask("compile", {text: studio.state.base ?? "", document: studio.state.document});
       Object.assign(studio.state, {text: found.text});
@@ -157,16 +158,16 @@ export class FileActions {
     return new Promise(done => {
       const {revision} = error.details;
       this.dialog("Changed on disk", make("p", {}, `${error.message}.`),
-        this.buttons(["Cancel", () => done(false)], ["Open what is there", () => { this.openFile(path); done(false); }],
+        this.buttons(["Cancel", () => done(false)], ["Open the file on disk", () => { this.openFile(path); done(false); }],
           ["Overwrite it", () => done(this.write(path, revision ?? null)), "strong"]));
     });
   }
 
   showExport() {
-    const select = make("select", {"aria-label": "form"}, ...Object.entries(EXPORTS).map(([end, words]) => make("option", {value: end}, `.${end}: ${words}`)));
+    const select = make("select", {"aria-label": "format"}, ...Object.entries(EXPORTS).map(([end, words]) => make("option", {value: end}, `.${end}: ${words}`)));
     select.addEventListener("change", () => { this.nameInput.value = this.nameInput.value.replace(/\.\w+$/, `.${select.value}`); });
     const base = (this.path || fileName(this.studio.document.name)).replace(/\.toml$/, "");
-    return this.askName("Export", `${base}.html`, path => this.export(path, null), make("label", {class: "field wide"}, make("span", {}, "form"), select));
+    return this.askName("Export", `${base}.html`, path => this.export(path, null), make("label", {class: "field wide"}, make("span", {}, "format"), select));
   }
 
   async export(path, revision) {
@@ -178,7 +179,7 @@ export class FileActions {
     } catch (error) {
       if (error.status !== 409) return void this.fail(error);
       return new Promise(done => {
-        this.dialog("There is such a file", make("p", {}, `${path} is there already.`), this.buttons(["Cancel", () => done(false)], ["Overwrite it", () => done(this.export(path, error.details.revision)), "strong"]));
+        this.dialog("The file exists", make("p", {}, `${path} already exists.`), this.buttons(["Cancel", () => done(false)], ["Overwrite it", () => done(this.export(path, error.details.revision)), "strong"]));
       });
     }
   }

@@ -1,21 +1,26 @@
-// What is found about the drawing, always in view: mistakes; freedoms; redundant constraints with what frees them; what moves it or
-// why nothing does; which reactions are unique; how far motors turn.
+// Findings about the drawing, always in view: mistakes; degrees of freedom; redundant constraints and their fixes; what moves the
+// mechanism, or why it cannot move; which reactions are unique; the travel of motors.
 
 import {list, nameOf, LISTS, pinsOf} from "./document.js";
 import {applyFix} from "./fixes.js";
 import {make} from "./player/elements.js";
 
 const COMPONENTS = ["x", "y", "torque"];
+const MOST_PROBLEMS = 30;
+const HINTS = {
+  freedom: "independent motions that the joints leave",
+  redundant: "a constraint that the others imply already: removing it changes no motion, and makes reactions unique",
+};
 
 export class FindingsPanel {
   constructor(studio, element) {
     Object.assign(this, {studio, element, travel: null, structure: null});
   }
 
-  /** What stands here is of an earlier drawing, until it is looked at anew. */
+  /** Fade the findings: they describe an earlier drawing until new ones arrive. */
   markStale() { this.element.classList.add("stale"); }
 
-  /** Show other contents, which are of this drawing. */
+  /** Show new contents, for the current drawing. */
   replace(...rows) {
     this.element.classList.remove("stale");
     this.element.replaceChildren(...rows);
@@ -24,7 +29,7 @@ export class FindingsPanel {
   showFailure(words) {
     this.structure = this.travel = null;
     this.mark([]);
-    this.replace(make("p", {class: "lead bad"}, "The studio could not look at it"), make("p", {}, words));
+    this.replace(make("p", {class: "lead bad"}, "The drawing could not be checked"), make("p", {}, words));
     this.studio.say(words, true);
   }
 
@@ -38,16 +43,16 @@ export class FindingsPanel {
     this.mark([]);
     this.replace(
       make("p", {class: "lead"}, "Nothing is drawn yet"),
-      make("p", {}, "Freedoms, redundant constraints and what moves the mechanism are said here while you draw."));
+      make("p", {}, "As you draw, this panel shows the degrees of freedom, the redundant constraints, and what moves the mechanism or prevents it from moving."));
   }
 
-  /** Mistakes, as the reader of files names them; each leads to its element. */
+  /** Show mistakes in the words of the file reader; a click on one selects its element. */
   showProblems(problems) {
     if (!problems.length) return;
     this.structure = this.travel = null;
     this.mark([]);
-    this.replace(make("p", {class: "lead"}, problems.length === 1 ? "One thing is missing before it can move" : `${problems.length} things are missing before it can move`),
-      make("ul", {class: "problems"}, ...problems.slice(0, 30).map(problem => {
+    this.replace(make("p", {class: "lead"}, `${plural(problems.length, "problem")} to solve before it can move`), make("p", {}, "Click a line to go to the element."),
+      make("ul", {class: "problems"}, ...problems.slice(0, MOST_PROBLEMS).map(problem => {
         const item = itemOf(this.studio.document, problem);
         return make("li", {}, item ? make("button", {type: "button", class: "link", onclick: () => this.studio.select([item])}, problem) : problem);
       })));
@@ -67,67 +72,69 @@ export class FindingsPanel {
   }
 
   show() {
-    const {structure: s} = this, pins = pinsOf(this.studio.document), plural = (n, word) => `${n} ${word}${n === 1 ? "" : "s"}`;
+    const {structure: s} = this, pins = pinsOf(this.studio.document);
     if (!s) return;
-    const driven = s.joint_freedoms !== s.freedoms ? `, ${s.freedoms} with its motors held` : "";
-    const rows = [make("p", {class: "lead"}, make("b", {}, plural(s.joint_freedoms, "freedom")), driven, " · ",
-      make("b", {class: s.redundant ? "bad" : ""}, s.redundant ? plural(s.redundant, "redundant constraint") : "nothing redundant")),
-    make("p", {}, s.motion, "."), ...(s.singular ? [make("p", {class: "warn"}, "It stands in a singular position: branches of its motion meet here, or it gives way to first order only.")] : [])];
+    const driven = s.joint_mobility !== s.degrees_of_freedom ? `, ${s.degrees_of_freedom} with motors held` : "";
+    const rows = [make("p", {class: "lead"}, make("b", {title: HINTS.freedom}, `${s.joint_mobility} ${s.joint_mobility === 1 ? "degree" : "degrees"} of freedom`), driven, " · ",
+      make("b", {class: s.redundant ? "bad" : "", title: HINTS.redundant}, s.redundant ? plural(s.redundant, "redundant constraint") : "no redundant constraints")),
+    make("p", {}, s.motion, "."), ...(s.singular ? [make("p", {class: "warn"}, "The drawn position is singular: either branches of the motion meet here, or the mechanism moves only infinitesimally.")] : [])];
     for (const one of this.travel ?? []) rows.push(make("p", {class: one.ends.length || one.lost.length ? "warn" : ""}, travelWords(one)));
     for (const set of s.sets) rows.push(this.set(set, pins));
-    const loose = Object.entries(s.loose);
-    rows.push(make("p", {}, make("b", {}, "Reactions: "), loose.length
-      ? `not unique at ${loose.map(([name, {components}]) => `${name} (${components.flatMap((known, k) => (known ? [] : [COMPONENTS[k] ?? k])).join(", ")})`).join(", ")}: redundant constraints share them as their stiffness decides`
+    const shared = Object.entries(s.not_unique);
+    rows.push(make("p", {}, make("b", {}, "Reactions: "), shared.length
+      ? `not unique at ${shared.map(([name, {components}]) => `${name} (${components.flatMap((isUnique, k) => (isUnique ? [] : [COMPONENTS[k] ?? k])).join(", ")})`).join(", ")}: how these forces are shared depends on the stiffness of the parts`
       : "all unique"));
-    rows.push(make("details", {class: "more"}, make("summary", {}, "The diagnosis in full"), make("pre", {}, s.text)));
+    rows.push(make("details", {class: "more"}, make("summary", {}, "Full diagnosis"), make("pre", {}, s.text)));
     const again = this.element.querySelector("details.more")?.open;
     this.replace(...rows);
     this.element.querySelector("details.more").open = Boolean(again);
     this.mark(s.sets.flatMap(set => set.constraints.map(pinOf(pins)).filter(Boolean).map(pin => [pin, {sign: "R", strong: false}])));
   }
 
-  /** How far motors turn, in words; nothing while it is not known of this drawing. */
+  /** The travel of motors, in words; empty until it is known for the current drawing. */
   travelWords() {
     if (!this.travel || this.element.classList.contains("stale")) return "";
     return this.travel.map(travelWords).join(" ");
   }
 
-  /** A button that makes a fix, where the drawing has something for it. */
-  freeing(fix) {
-    const {studio} = this, {mover} = studio.motion, changed = () => applyFix(studio.document, fix, mover.bodies());
+  /** A button that applies a fix, if the drawing can express it. */
+  fixButton(fix) {
+    const {studio} = this, {pageEngine} = studio.motion, changed = () => applyFix(studio.document, fix, pageEngine.bodies());
     const isStale = () => this.element.classList.contains("stale");
-    return mover && changed() ? [make("button", {type: "button", class: "small", "aria-label": `free ${fix.constraint}`,
-      onclick: () => (isStale() ? studio.say("the drawing has changed: wait until it is looked at anew") : studio.commit(changed(), []))}, "Do it")] : [];
+    return pageEngine && changed() ? [make("button", {type: "button", class: "small", "aria-label": `apply the change at ${fix.constraint}`,
+      onclick: () => (isStale() ? studio.say("the drawing has changed: wait for its new findings") : studio.commit(changed(), []))}, "Apply")] : [];
   }
 
   set({constraints, count, permanent, fixes}, pins) {
-    const toPin = pinOf(pins), names = constraints.join(", ");
+    const toPin = pinOf(pins), names = constraints.join(", "), it = count === 1 ? "it" : "at least one of them";
     return make("div", {class: "set"},
-      make("p", {}, make("b", {class: "bad"}, "R "), `${names}: ${count} redundant row${count === 1 ? "" : "s"}, ${permanent ? "everywhere" : "in this position only"}.`,
-        fixes.length ? " One of these mends it:" : permanent ? " No single change of a joint was found that mends it." : ""),
+      make("p", {}, make("b", {class: "bad"}, "R "), `${names}: ${plural(count, "redundant constraint")} in ${permanent ? "every position" : "this position only"}.`,
+        fixes.length ? ` Any one of these changes removes ${it}:` : permanent ? ` No change of a single joint was found that removes ${it}.` : ""),
       make("ul", {}, ...fixes.map(fix => make("li", {}, make("button", {type: "button", class: "link",
         onclick: () => this.studio.select([itemNamed(this.studio.document, fix.constraint)].filter(Boolean)),
         onmouseenter: () => this.mark([...constraints.map(toPin).filter(Boolean).map(pin => [pin, {sign: "R", strong: pin === toPin(fix.constraint)}])]),
-      }, make("b", {}, fix.constraint), `: ${changeWords(fix)}`), ...this.freeing(fix)))));
+      }, make("b", {}, fix.constraint), `: ${changeWords(fix)}`), ...this.fixButton(fix)))));
   }
 }
+
+const plural = (n, word) => `${n} ${word}${n === 1 ? "" : "s"}`;
 
 const pinOf = pins => name => (Object.hasOwn(pins, name) ? name : Object.keys(pins).find(pin => name.startsWith(`${pin}-`)));
 
 function changeWords({change, drawn}) {
   const of = name => (name === "ground" ? "the ground" : name);
-  return drawn?.kind === "slot" ? `make it a slot of ${of(drawn.on)} that guides the pin of ${of(drawn.link)}` : change;
+  return drawn?.kind === "slot" ? `make it a slot in ${of(drawn.on)} for the pin of ${of(drawn.link)}` : change;
 }
 
 function travelWords({motor, unit, ends, lost}) {
   const value = x => (unit === "rad" ? `${(x * 180 / Math.PI).toFixed(1)}°` : `${+(1e3 * x).toPrecision(4)} mm`).replace("-", "−");
-  const unknown = lost.length ? ` How far it goes ${lost.join(" and ")} could not be found.` : "";
+  const unknown = lost.length ? ` Its ${lost.join(" and ")} limit${lost.length > 1 ? "s" : ""} could not be found.` : "";
   if (!ends.length) return unknown ? `${motor}:${unknown.toLowerCase()}` : `${motor} ${unit === "rad" ? "turns all the way round" : "has no limits"}.`;
-  const line = triples => (triples.length ? `: ${triples.map(names => names.join(", ")).join("; ")} in line` : "");
-  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(", and at ")}.${unknown}`;
+  const line = triples => (triples.length ? ` (${triples.map(names => names.join(", ")).join("; ")} in line)` : "");
+  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(" and at ")}, measured from the drawn position.${unknown}`;
 }
 
-/** The pin or the element that a constraint is of, by its name; undefined where there is none. */
+/** The pin or element of a constraint, by its name; undefined if there is none. */
 function itemNamed(document, name) {
   const pin = pinOf(pinsOf(document))(name);
   if (pin !== undefined) return {kind: "pin", name: pin};
@@ -135,7 +142,7 @@ function itemNamed(document, name) {
     .find(({kind, index}) => nameOf(document, kind, index) === name);
 }
 
-/** The element that a mistake is about. */
+/** The element of a mistake; null if it names none. */
 function itemOf(document, problem) {
   const pin = /^pins\.([^:]+?)(?:\[\d+\])?:/.exec(problem)?.[1];
   if (pin !== undefined && Object.hasOwn(pinsOf(document), pin)) return {kind: "pin", name: pin};

@@ -1,11 +1,11 @@
-// Changes that take redundancy away, as changes of the drawing: an element goes, or a pin becomes a slot of one of its two links.
+// Fixes of redundant constraints as changes of the drawing: an element is removed, or a pin becomes a slot in one of its two links.
 
 import {LISTS, list, members, nameOf, pinsOf, removeElements, toggleGround, withElement, withEntry} from "./document.js";
 import {lengthUnit, tidy} from "./units.js";
 
-/** The document after a fix {constraint, drawn}, or null where the drawing has nothing for it.
+/** The document after a fix {constraint, drawn}, or null if the drawing cannot express it.
  *
- *  A link that loses the pin keeps its mass, inertia and centre, which are written out: `scene` says what they are.
+ *  A link that loses the pin keeps its mass, inertia and centre: they become numbers in the file, taken from `scene`.
  */
 export function applyFix(document, {constraint, drawn}, scene) {
   if (drawn?.kind === "remove") {
@@ -23,7 +23,7 @@ export function applyFix(document, {constraint, drawn}, scene) {
   return freed && withElement(freed, "slot", slot);
 }
 
-/** The document whose link gives up a pin, and remains the same body. */
+/** The document with a link that has lost a pin but is the same body. */
 function keepBody(document, index, scene, pin) {
   const {pins, density, thickness, width, outline, mass, inertia, centre, ...rest} = list(document, "link")[index];
   const k = scene.bodies.indexOf(rest.name), left = pins.filter(name => name !== pin);

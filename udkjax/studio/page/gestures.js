@@ -1,16 +1,16 @@
-// Mouse, pen and fingers on the drawing. A gesture makes at most one entry of undo, and none where nothing moved; one that is
-// taken away (another finger, Esc, a lost pointer) leaves the drawing as it was.
+// Mouse, pen and fingers on the drawing. A gesture adds at most one undo step, and none if nothing moved; a cancelled gesture
+// (another finger, Esc, a lost pointer) leaves the drawing as it was.
 
 import {mergePins, movePin, placeOf, pinsOfItems, settle, shiftPins} from "./document.js";
 import {itemAt, itemsWithin, pinAt, same} from "./picking.js";
 import {toolOf} from "./tools.js";
 import {toMetres, zoomAt, ZOOM_STEP} from "./view.js";
 
-const CLICK = 4;  // px: what moves less is a click
+const CLICK = 4;  // px: a gesture that moves less is a click
 const WHEEL_LINE = 100;  // px of one notch
 
 export class Gestures {
-  /** `studio` has document, selection, tool, view, snap(place, event), canvas with places and outlines, and what happens. */
+  /** `studio` has document, selection, tool, view, snap(place, event), and canvas with places and outlines. */
   constructor(studio, element) {
     Object.assign(this, {studio, element, pointers: new Map(), now: null, corners: [], start: null});
     const on = (name, action, options) => element.addEventListener(name, action, options);
@@ -29,7 +29,7 @@ export class Gestures {
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  /** Where a pointer is, and what is there. */
+  /** The position of a pointer, and the pin or link under it. */
   target(event, except = null) {
     const {studio} = this, pixel = this.pixel(event), touch = event.pointerType === "touch";
     const pin = pinAt(studio.canvas.places, pixel, touch, except);
@@ -42,8 +42,8 @@ export class Gestures {
     if (event.button > 1) return undefined;
     const pixel = this.pixel(event);
     this.element.setPointerCapture(event.pointerId);
-    this.element.focus({preventScroll: true, focusVisible: false});  // now, so that a field gives what is typed in it before the gesture begins
-    if (this.studio.source.timer) return this.studio.say("the text is being read: try again");
+    this.element.focus({preventScroll: true, focusVisible: false});  // now, so that a field commits its text before the gesture begins
+    if (this.studio.source.timer) return this.studio.say("the edited text is still being read: try again");
     this.studio.draw();
     this.pointers.set(event.pointerId, pixel);
     if (this.pointers.size > 1) return this.cancel();
@@ -63,7 +63,7 @@ export class Gestures {
     if (tool.kind === "points" && !this.start) this.studio.preview = {from: target, to: target};
   }
 
-  /** A press with the tools that select and pull. */
+  /** A press with the select or pull tool. */
   grasp(event) {
     const {studio} = this, touch = event.pointerType === "touch", pixel = this.pixel(event);
     const item = itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch);
@@ -108,7 +108,7 @@ export class Gestures {
     return undefined;
   }
 
-  /** Move the pins that are dragged; the drawing follows, and what hangs on lines stays on them. */
+  /** Move the dragged pins; pins that belong on lines are moved back onto them. */
   drag(event, pixel) {
     const {studio, now} = this, at = toMetres(studio.view, pixel), {pins, before} = now;
     if (!pins.length) return;
@@ -160,12 +160,12 @@ export class Gestures {
     } else studio.commit(studio.document);
   }
 
-  /** A pull ends; one that moved nothing was a click, and what played goes on. */
+  /** End a pull. One that moved nothing was a click, after which a running motion continues. */
   letGo({goesOn}) {
     if (this.moved) this.studio.motion.endPull(); else if (goesOn) this.studio.motion.play();
   }
 
-  /** A release with a drawing tool: one click of several, or all of it. */
+  /** A release with a drawing tool: one click of several, or the end of the whole gesture. */
   release({tool, target}, end) {
     const {studio} = this, context = {size: studio.usualSize(), scale: studio.view.scale};
     if (tool.kind === "click") return studio.apply(tool.make(studio.document, target, context));
@@ -194,7 +194,7 @@ export class Gestures {
     return undefined;
   }
 
-  /** Finish a plate without its first corner: by Enter or a double click. */
+  /** Finish a plate by Enter or a double click, without a click on its first corner. */
   finish() {
     const tool = toolOf(this.studio.tool);
     if (tool.kind !== "corners" || this.corners.length < 3) return;
@@ -220,7 +220,7 @@ export class Gestures {
     this.cancel();
   }
 
-  /** Take the gesture away: the drawing is as before it. */
+  /** Cancel the gesture and restore the drawing; returns whether there was one. */
   cancel() {
     const {studio, now} = this, was = Boolean(now || this.start || this.corners.length);
     if (now?.kind === "drag") studio.propose(now.before);

@@ -1,4 +1,4 @@
-// Undo and redo. A state is never changed, so an entry is the state itself: what comes back is what was there, to the bit.
+// Undo and redo. States are immutable, so each entry is the state itself and is restored to the bit.
 
 const MOST_ENTRIES = 1000;
 
@@ -14,7 +14,7 @@ export class History {
   get canUndo() { return this.at > 0; }
   get canRedo() { return this.at < this.states.length - 1; }
 
-  /** Add a state; what was undone before is forgotten. A state that says the same adds nothing. */
+  /** Add a state and drop the undone ones; returns false, and adds nothing, if it equals the current state. */
   push(state, same = (a, b) => a === b) {
     if (same(state, this.state)) return false;
     this.states = [...this.states.slice(Math.max(0, this.at + 2 - MOST_ENTRIES), this.at + 1), state];

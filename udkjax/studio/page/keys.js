@@ -1,10 +1,10 @@
-// The keyboard: what users of drawing programs expect.
+// Keyboard shortcuts, as in other drawing programs.
 
 import {duplicate, pinsOfItems, removeElements, settle, shiftPins} from "./document.js";
 import {TOOLS} from "./tools.js";
 
-const TIME_STEPS = 100;  // of an arrow, in a run
-const COPY_PIXELS = 24;  // between what is duplicated and its copy
+const TIME_STEPS = 100;  // presses of an arrow key through a whole run
+const COPY_PIXELS = 24;  // between the original and its copy
 const typing = target => ["INPUT", "TEXTAREA", "SELECT"].includes(target.tagName) && target.type !== "range" && target.type !== "checkbox";
 
 export function followKeys(studio) {
@@ -46,7 +46,7 @@ const plain = studio => ({
   ...Object.fromEntries(TOOLS.map(tool => [tool.key, () => studio.setTool(tool.name)])),
 });
 
-/** Move what is selected by a step of the grid; without it, or away from the drawing, the arrows go through time. */
+/** Move the selection by one grid step. Without a selection, or away from the drawn position, step through time. */
 function nudge(studio, x, y) {
   const pins = pinsOfItems(studio.document, studio.selection), step = studio.gridUnit();
   if (pins.length && !studio.isMoved) return studio.commit(settle(shiftPins(studio.document, pins, x * step, y * step)));

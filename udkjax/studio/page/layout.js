@@ -1,4 +1,4 @@
-// The page: its bars, the drawing, and the panels beside it.
+// The page: its bars, the drawing, and the panels around it.
 
 import {KEYS, TOOLS} from "./tools.js";
 import {button, icon, keepKeys, make, svgIcon} from "./player/elements.js";
@@ -8,7 +8,7 @@ const ICONS = {
   fit: "M4 4h6v2H6v4H4zM14 4h6v6h-2V6h-4zM4 14h2v4h4v2H4zM18 14h2v6h-6v-2h4z", home: "M6 5h2.5v14H6zM19 5v14L9 12z",
 };
 
-// Templates that an empty page offers.
+// Templates offered by an empty page.
 const FIRST = [["four_bar", "Four-bar"], ["slider_crank", "Slider-crank"], ["parallelogram", "Five-bar"]];
 
 /** Build the page in an element; returns its parts by name. */
@@ -27,7 +27,7 @@ export function buildPage(studio, root) {
     button("Save", "save (Ctrl+S)", () => studio.files.save(false)), button("Export", "export as page, picture, film, table or script", () => studio.files.showExport()));
   const header = make("header", {}, parts.title, files, make("div", {class: "group"}, parts.undo, parts.redo,
     button(svgIcon(ICONS.fit), "fit (F)", () => studio.fit(), "icon")), make("div", {class: "group end"},
-    button(icon("theme"), "dark or light", () => studio.switchTheme(), "icon"), button("?", "keys (?)", () => studio.showHelp(), "icon")));
+    button(icon("theme"), "switch between dark and light", () => studio.switchTheme(), "icon"), button("?", "keyboard shortcuts (?)", () => studio.showHelp(), "icon")));
   parts.tools = TOOLS.map(tool => {
     const found = button(make("span", {}, tool.name), `${tool.title} (${tool.key.toUpperCase()})`, () => studio.setTool(tool.name), "tool");
     found.dataset.tool = tool.name;
@@ -36,7 +36,7 @@ export function buildPage(studio, root) {
   });
   parts.canvas = make("canvas", {tabindex: 0, role: "application", "aria-label": "drawing"});
   parts.status = make("p", {class: "status", role: "status"});
-  const toggles = [["grid", "grid"], ["snap", "snap to the grid (Alt: not)"], ["names", "names"], ["paths", "paths of pins"]].map(([name, title]) => {
+  const toggles = [["grid", "grid"], ["snap", "snap points to the grid (hold Alt to place them freely)"], ["names", "names"], ["paths", "paths of pins"]].map(([name, title]) => {
     const found = button(name, title, () => {
       studio.show[name] = !studio.show[name];
       found.setAttribute("aria-pressed", studio.show[name]);
@@ -51,16 +51,16 @@ export function buildPage(studio, root) {
   narrow.addEventListener("change", unfold);
   unfold();
   parts.welcome = make("div", {class: "welcome"}, make("h2", {}, "Draw a mechanism"),
-    make("ol", {}, ...[["link", "Drag links from pin to pin"], ["ground", "Fix pins to the ground"], ["motor", "Put a motor on one, and press play"]].map(([name, words]) => {
+    make("ol", {}, ...[["link", "Drag links from pin to pin"], ["ground", "Fix pins to the ground"], ["motor", "Put a motor on a pin and press play"]].map(([name, words]) => {
       const tool = TOOLS.find(one => one.name === name);
       return make("li", {}, button(svgIcon(tool.icon, tool.stroke), `${tool.title} (${tool.key.toUpperCase()})`, () => studio.setTool(name), "icon"),
         make("span", {}, words, " ", make("kbd", {}, tool.key.toUpperCase())));
-    })), make("p", {}, "or start from one that moves"),
-    make("div", {class: "group"}, ...FIRST.map(([name, words]) => button(words, `a drawing to start from: ${words}`, () => studio.files.openTemplate(name))),
+    })), make("p", {}, "or start from an example"),
+    make("div", {class: "group"}, ...FIRST.map(([name, words]) => button(words, `start from this example: ${words}`, () => studio.files.openTemplate(name))),
       button("More …", "open a file or a template (Ctrl+O)", () => studio.files.showOpen())));
   const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status);
   parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
-  parts.home = button(svgIcon(ICONS.home), "as drawn (Home)", () => studio.rewind(), "icon");
+  parts.home = button(svgIcon(ICONS.home), "back to the drawn position (Home)", () => studio.rewind(), "icon");
   parts.scrub = make("input", {type: "range", min: 0, max: 10000, step: 1, "aria-label": "time", oninput: () => {
     studio.motion.pause();
     studio.motion.seek(studio.motion.end * parts.scrub.value / 10000);
@@ -73,7 +73,7 @@ export function buildPage(studio, root) {
   parts.strip = make("section", {class: "strip", "aria-label": "curves"});
   const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.scrub, parts.speed, parts.loops);
   const side = make("aside", {}, section("Findings", "findings"), section("Selection", "properties"), section("Text (TOML)", "source"));
-  parts.help = make("dialog", {class: "help", "aria-label": "keys"}, make("h2", {}, "Keys"),
+  parts.help = make("dialog", {class: "help", "aria-label": "keyboard shortcuts"}, make("h2", {}, "Keyboard shortcuts"),
     make("dl", {}, ...KEYS.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])),
     make("form", {method: "dialog"}, make("button", {class: "strong"}, "Close")));
   parts.dialog = make("dialog", {class: "sheet"});

@@ -1,26 +1,26 @@
-// Time: the run of the drawing, playing and scrubbing it, and the hand that pulls the mechanism while its loops stay closed.
+// Time: the run of the drawing, playing and scrubbing it, and pulling the mechanism while its loops stay closed.
 
 import {list, members, pinsOf, placeOf} from "./document.js";
 import {middle} from "./drawn_symbols.js";
-import {carry} from "./mover.js";
+import {carry} from "./page_engine.js";
 import {shown} from "./units.js";
 import {icon} from "./player/elements.js";
 
-const LONGEST_FRAME = 0.1;  // s that the motion goes on in one frame
+const LONGEST_FRAME = 0.1;  // s: the motion advances by at most this much per frame
 
 export class Motion {
   constructor(studio) {
-    Object.assign(this, {studio, mover: null, run: null, energies: null, t: 0, playing: false, posed: null, speed: 1, loop: true, why: ""});
+    Object.assign(this, {studio, pageEngine: null, run: null, energies: null, t: 0, playing: false, posed: null, speed: 1, loop: true, why: ""});
     this.motions = new Float64Array(0);
   }
 
   get isMoved() { return this.t > 0 || this.playing || this.posed !== null; }
   get end() { return this.run?.count > 1 ? this.run.ts[this.run.count - 1] : 0; }
 
-  /** There is no motion of this drawing, or not yet. */
+  /** Drop the motion: the drawing has none, or none yet. */
   forget() {
     this.pause();
-    Object.assign(this, {mover: null, run: null, energies: null, t: 0, posed: null, why: ""});
+    Object.assign(this, {pageEngine: null, run: null, energies: null, t: 0, posed: null, why: ""});
     this.studio.paths = [];
     this.studio.parts.loops.textContent = "";
     this.still();
@@ -29,39 +29,39 @@ export class Motion {
 
   showWaiting() { this.studio.parts.loops.textContent = "compiling the motion …"; }
 
-  use(mover, why) {
-    Object.assign(this, {mover, why});
-    this.again();
+  use(pageEngine, why) {
+    Object.assign(this, {pageEngine, why});
+    this.recompute();
     if (this.studio.isFresh) this.studio.fit();  // with the paths of its pins
     this.studio.isFresh = false;
     this.studio.curves.list();
     this.studio.redraw();
   }
 
-  /** Pins of a drawing of the same structure have moved: run it anew. */
+  /** Compute the motion again after pins have moved in a drawing of the same structure. */
   follow(document) {
-    if (!this.mover?.engine || !this.mover.follow(document)) return;
-    if (Object.keys(pinsOf(document)).length !== this.mover.pins.length) return;
+    if (!this.pageEngine?.engine || !this.pageEngine.follow(document)) return;
+    if (Object.keys(pinsOf(document)).length !== this.pageEngine.pins.length) return;
     this.posed = null;
-    this.again();
+    this.recompute();
   }
 
-  again() {
-    this.run = this.mover.run(this.posed);
-    this.energies = this.mover.energies(this.run);
+  recompute() {
+    this.run = this.pageEngine.run(this.posed);
+    this.energies = this.pageEngine.energies(this.run);
     this.studio.paths = this.traces();
     if (!this.playing) this.still();
     this.showLoops();
   }
 
-  /** The links stand as drawn. */
+  /** Show the links as drawn. */
   still() { this.motions = new Float64Array(3 * list(this.studio.document, "link").length); }
 
   /** The paths of pins that move: [x, y, ...] in metres, and the link that carries each. */
   traces() {
     const {studio, run} = this, {document} = studio, found = [];
     if (run.count < 2) return found;
-    const poses = Array.from({length: run.count}, (_, i) => this.mover.motions(run.q.slice(i * this.mover.size, (i + 1) * this.mover.size)));
+    const poses = Array.from({length: run.count}, (_, i) => this.pageEngine.motions(run.q.slice(i * this.pageEngine.size, (i + 1) * this.pageEngine.size)));
     for (const name of Object.keys(pinsOf(document))) {
       const link = studio.canvas.carrier(document, name), place = placeOf(document, name);
       if (link < 0 || !place || members(document, name).length < 1) continue;
@@ -101,14 +101,14 @@ export class Motion {
   }
 
   seek(t) {
-    if (!this.run || !this.mover) return;
+    if (!this.run || !this.pageEngine) return;
     this.t = Math.min(Math.max(t, 0), this.end);
-    const state = this.mover.at(this.run, this.t);
-    if (this.t > 0 || this.posed) this.motions = this.mover.motions(state.q); else this.still();
+    const state = this.pageEngine.at(this.run, this.t);
+    if (this.t > 0 || this.posed) this.motions = this.pageEngine.motions(state.q); else this.still();
     this.studio.redraw();
   }
 
-  /** Back to the drawing. */
+  /** Return to the drawn position. */
   rewind() {
     this.pause();
     const wasPosed = this.posed !== null;
@@ -116,14 +116,14 @@ export class Motion {
     Object.assign(this, {t: 0, posed: null});
     this.studio.hand = null;
     this.still();
-    if (wasPosed && this.mover) this.again();
+    if (wasPosed && this.pageEngine) this.recompute();
     this.studio.redraw();
   }
 
-  /** Show a closed position; what nothing drives starts from there. */
+  /** Show a closed position; without motors the motion starts from it. */
   pose(q) {
     this.pause();
-    this.posed = {t: 0, q, v: new Float64Array(this.mover.size), closed: true, violation: 0};
+    this.posed = {t: 0, q, v: new Float64Array(this.pageEngine.size), closed: true, violation: 0};
     this.release();
   }
 
@@ -132,24 +132,24 @@ export class Motion {
   beginPull(item, at) {
     this.pause();
     const {document} = this.studio, link = item.kind === "link" ? item.index : this.studio.canvas.carrier(document, item.name);
-    const state = this.posed ?? (this.run && this.end ? this.mover.at(this.run, this.t) : this.mover.start());
-    const from = this.mover.motions(state.q), place = item.kind === "pin" ? placeOf(document, item.name) : undoMotion(from, link, at);
+    const state = this.posed ?? (this.run && this.end ? this.pageEngine.at(this.run, this.t) : this.pageEngine.start());
+    const from = this.pageEngine.motions(state.q), place = item.kind === "pin" ? placeOf(document, item.name) : undoMotion(from, link, at);
     Object.assign(this, {pulled: {link, place: place ?? middle(list(document, "link")[link], document)}, posed: {...state, t: 0}});
     this.pullTo(at);
   }
 
   pullTo(hand) {
     if (!this.pulled) return;
-    const {link, place} = this.pulled, found = this.mover.pull(this.posed, link, place, hand);
-    this.posed = {t: 0, q: found.q, v: new Float64Array(this.mover.size), closed: true, violation: found.violation};
-    this.motions = this.mover.motions(found.q);
+    const {link, place} = this.pulled, found = this.pageEngine.pull(this.posed, link, place, hand);
+    this.posed = {t: 0, q: found.q, v: new Float64Array(this.pageEngine.size), closed: true, violation: found.violation};
+    this.motions = this.pageEngine.motions(found.q);
     this.studio.hand = {at: carry(this.motions, link, place), to: hand};
-    this.studio.say(found.words || "pulled: Home returns to the drawing");
+    this.studio.say(found.words || "pulled: press Home to return to the drawn position");
     this.showLoops(found.violation);
     this.studio.redraw();
   }
 
-  /** Let go: what nothing drives starts from here; what a motor drives goes back when it is played. */
+  /** Let go. Without motors the motion starts from here; with motors it returns to its course when played. */
   endPull() {
     if (!this.pulled) return;
     this.pulled = null;
@@ -157,28 +157,28 @@ export class Motion {
     this.release();
   }
 
-  /** The motion from where it is shown, unless motors drive it. */
+  /** Compute the motion from the position shown, unless motors drive it. */
   release() {
-    if (!this.mover.scene.drivers.length) {
+    if (!this.pageEngine.scene.drivers.length) {
       this.t = 0;
-      this.run = this.mover.run(this.posed);
-      this.energies = this.mover.energies(this.run);
+      this.run = this.pageEngine.run(this.posed);
+      this.energies = this.pageEngine.energies(this.run);
       this.studio.paths = this.traces();
       this.showLoops();
     }
-    this.motions = this.mover.motions(this.posed.q);
+    this.motions = this.pageEngine.motions(this.posed.q);
     this.studio.redraw();
   }
 
   // What is shown
 
   showLoops(violation = null) {
-    const {run, mover, studio} = this;
-    if (!mover) return;
+    const {run, pageEngine, studio} = this;
+    if (!pageEngine) return;
     const worst = violation ?? Math.max(0, ...Array.from(run.violation.slice(0, run.count)));
-    const closed = Number.isFinite(worst) ? `loops closed to ${worst.toExponential(0)}` : "loops open";
+    const closed = Number.isFinite(worst) ? `loops closed to ${worst.toExponential(0)}` : "loops not closed";
     const words = run.done ? "" : ` – ${run.words || "the motion ends"}${run.count > 1 ? ` at ${shown(this.end, "s")}` : ""}`;
-    studio.parts.loops.textContent = mover.engine ? closed + words : `recorded motion: ${this.why || "this browser has no WebAssembly"}${words}`;
+    studio.parts.loops.textContent = pageEngine.engine ? closed + words : `recorded motion: ${this.why || "this browser has no WebAssembly"}${words}`;
     studio.parts.loops.classList.toggle("bad", !run.done);
   }
 
@@ -194,7 +194,7 @@ export class Motion {
   }
 }
 
-/** The place of the drawing that a motion brings to p. */
+/** The drawn place that a motion brings to [x, y]. */
 function undoMotion(motions, k, [x, y]) {
   const c = Math.cos(motions[3 * k + 2]), s = Math.sin(motions[3 * k + 2]), dx = x - motions[3 * k], dy = y - motions[3 * k + 1];
   return [c * dx + s * dy, c * dy - s * dx];

@@ -1,11 +1,11 @@
-// What is under the cursor: the nearest pin, else the topmost symbol that the cursor is near.
+// The item under the cursor: the nearest pin, or else the topmost symbol near the cursor.
 
 import {list} from "./document.js";
 import {isNear} from "./player/symbols.js";
 
-const PIN_REACH = 11, SYMBOL_REACH = 7, TOUCH = 1.8;  // px; fingers reach farther
+const PIN_REACH = 11, SYMBOL_REACH = 7, TOUCH = 1.8;  // px; and the factor by which fingers reach farther
 
-/** The pin nearest to a pixel, within reach, or null. `places` are the pixels of the pins. */
+/** The pin nearest to a pixel and within reach, or null. `places` are the pins' positions in pixels. */
 export function pinAt(places, pixel, touch = false, except = null) {
   let best = null, least = PIN_REACH * (touch ? TOUCH : 1);
   for (const [name, place] of places) {
@@ -15,7 +15,7 @@ export function pinAt(places, pixel, touch = false, except = null) {
   return best;
 }
 
-/** What is at a pixel: {kind, name or index}, or null. `outlines` are the symbols in pixels, the topmost last. */
+/** The item at a pixel, {kind, name or index}, or null. `outlines` are the symbols in pixels, the topmost last. */
 export function itemAt(outlines, places, pixel, touch = false, kinds = null) {
   const reach = SYMBOL_REACH * (touch ? TOUCH : 1), fits = of => !kinds || kinds.includes(of.kind);
   const pin = fits({kind: "pin"}) ? pinAt(places, pixel, touch) : null;
@@ -40,5 +40,5 @@ export function itemsWithin(document, places, [x0, y0], [x1, y1]) {
   return [...links, ...[...pins].map(name => ({kind: "pin", name}))];
 }
 
-/** Tell whether two items are the same. */
+/** True if two items are the same. */
 export const same = (a, b) => a?.kind === b?.kind && a?.name === b?.name && a?.index === b?.index;

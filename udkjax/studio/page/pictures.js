@@ -1,9 +1,9 @@
-// A picture behind the drawing, brought to scale by two of its points and their distance. It stays in the page: it is no part of the file.
+// A picture behind the drawing, scaled by the distance of two of its points. It stays in the page and is not saved in the file.
 
 import {length, lengthName, tidy, lengthUnit} from "./units.js";
 import {button, make} from "./player/elements.js";
 
-const SHARE = 0.7;  // of the view that a new picture takes
+const SHARE = 0.7;  // width of a new picture as a fraction of the view
 const OPACITY = 0.5;
 
 export class Pictures {
@@ -17,8 +17,8 @@ export class Pictures {
   show() {
     const has = Boolean(this.studio.picture);
     this.element.replaceChildren(this.input, ...(has ? [
-      button("scale", "bring the picture to scale: drag between two of its points", () => this.studio.setTool("scale")),
-      button("no picture", "take the picture away", () => this.remove())] : [button("picture", "a picture behind the drawing", () => this.input.click())]));
+      button("scale", "set the scale of the picture: drag between two of its points", () => this.studio.setTool("scale")),
+      button("no picture", "remove the picture", () => this.remove())] : [button("picture", "put a picture behind the drawing", () => this.input.click())]));
   }
 
   async take(file) {
@@ -29,7 +29,7 @@ export class Pictures {
       await image.decode();
     } catch {
       URL.revokeObjectURL(address);
-      return this.studio.say(`${file.name} is no picture that this browser shows`, true);
+      return this.studio.say(`this browser cannot show ${file.name} as a picture`, true);
     }
     const {view, canvas} = this.studio, width = SHARE * canvas.width / view.scale;
     const left = (canvas.width / 2 - view.x) / view.scale - width / 2, middle = (view.y - canvas.height / 2) / view.scale;
@@ -47,7 +47,7 @@ export class Pictures {
     this.studio.redraw();
   }
 
-  /** Ask how far two points (m) of the picture are apart, and scale it about the first one. */
+  /** Ask for the distance of two points (m) of the picture, and scale it about the first one. */
   scale([ax, ay], [bx, by]) {
     const {studio} = this, {document} = studio, now = Math.hypot(bx - ax, by - ay);
     if (!(now > 0)) return studio.say("drag from one point of the picture to another");
@@ -56,12 +56,12 @@ export class Pictures {
       make("div", {class: "group end"}, make("button", {class: "strong"}, "Scale")));
     form.addEventListener("submit", () => {
       const text = input.value.trim(), wanted = length(/^[\d.eE+-]+$/.test(text) ? +text : text, document);
-      if (!(wanted > 0)) return studio.say(`${text} is no distance`, true);
+      if (!(wanted > 0)) return studio.say(`"${text}" is not a distance: write 12 or 12 mm, for example`, true);
       const {picture} = studio, ratio = wanted / now;
       studio.picture = {...picture, width: picture.width * ratio, x: ax + (picture.x - ax) * ratio, y: ay + (picture.y - ay) * ratio};
       return studio.setTool("select");
     });
-    studio.files.dialog("How far apart are they?", form);
+    studio.files.dialog("Distance between the two points", form);
     input.select();
     return undefined;
   }

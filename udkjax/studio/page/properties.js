@@ -1,4 +1,4 @@
-// What is selected, in fields: each value with its unit, as it stands in the file.
+// The fields of the selected element: each value with its unit, as written in the file.
 
 import {groundOf, list, nameOf, pinsOf, renameElement, renamePin, toggleGround, withKey} from "./document.js";
 import {readValue, valueText} from "./values.js";
@@ -8,7 +8,7 @@ import {swapPair} from "./actions.js";
 import {length} from "./units.js";
 import {make} from "./player/elements.js";
 
-// Of each kind the keys that are offered: what they are called, and the kind of quantity they are.
+// The editable keys of each kind of element, and the kind of quantity of each.
 const KEYS = {
   link: [["pins", "names"], ["density", "density"], ["width", "length"], ["thickness", "length"], ["mass", "mass"], ["inertia", "inertia"], ["centre", "length"], ["outline", "length"]],
   slide: [["link", "name"], ["along", "names"], ["direction", "angle"], ["on", "name"]],
@@ -24,10 +24,10 @@ const EXAMPLES = {density: "7850", mass: "0.2 kg", inertia: "1e-4 kg m2", speed:
   force: "[0 N, -10 N]", angle: "30 deg"};
 const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", length: "m"};
 
-/** The unit of plain numbers of a quantity in a document. */
+/** The unit of numbers of a quantity that are written without a unit. */
 function unitOf(document, quantity) {
   const chosen = document.units?.[{speed: "angular_velocity"}[quantity] ?? quantity];
-  if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // a plain number is refused, as its unit is ambiguous
+  if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // the reader refuses a number without a unit here, as ambiguous
   return chosen ?? SI[quantity] ?? "";
 }
 
@@ -46,7 +46,7 @@ export class PropertiesPanel {
     return this.element.replaceChildren(...parts, make("div", {class: "group"}, ...buttons));
   }
 
-  /** A field; what is typed is taken at its end, and an empty one takes the key away. */
+  /** A field for a value; `take` gets the text when editing ends. */
   field(label, value, unit, take, example = "") {
     const input = make("input", {type: "text", value, placeholder: example, "aria-label": label, spellcheck: "false"});
     input.addEventListener("change", () => take(input.value.trim()));
@@ -65,7 +65,7 @@ export class PropertiesPanel {
     return undefined;
   }
 
-  /** Show the fields as they were, and say why nothing changed. */
+  /** Restore the fields, and say why nothing changed. */
   refuse(words) {
     this.studio.say(words, true);
     this.again();
@@ -84,11 +84,11 @@ export class PropertiesPanel {
     const units = document.units ?? {}, unit = (key, names, usual) => {
       const select = make("select", {"aria-label": `unit of ${key}`, onchange: () => change("units", {...units, [key]: select.value})}, ...names.map(name => make("option", {value: name}, name)));
       select.value = units[key] ?? usual;
-      select.title = "of plain numbers in the file; numbers stay, and mean something else";
+      select.title = "Unit of numbers without a unit. Changing it does not convert them.";
       return make("label", {class: "field"}, make("span", {}, `${key} in`), select, make("span", {class: "unit"}));
     };
     return [
-      this.field("name", document.name ?? "", "", value => change("name", value), "of the mechanism"),
+      this.field("name", document.name ?? "", "", value => change("name", value), "name of the mechanism"),
       this.field("gravity", valueText(document.gravity), unitOf(document, "acceleration") || "m/s²", value => change("gravity", readValue(value)), "[0, -9.81 m/s2]"),
       unit("length", ["mm", "cm", "m", "in", "ft"], "m"), unit("angle", ["deg", "rad"], "rad"),
     ];
@@ -98,13 +98,13 @@ export class PropertiesPanel {
     const {studio} = this, {document} = studio, place = pinsOf(document)[name] ?? ["", ""], unit = unitOf(document, "length");
     const to = k => text => {
       const value = readValue(text), next = [...place];
-      if (!Number.isFinite(length(value, document))) return this.refuse(`"${text}" is no length: such as 12, or 12 mm`);
+      if (!Number.isFinite(length(value, document))) return this.refuse(`"${text}" is not a length: write 12 or 12 mm, for example`);
       next[k] = value;
       return this.set({...document, pins: {...pinsOf(document), [name]: next}});
     };
     const rename = to => {
       const found = renamePin(document, name, to);
-      if (found === document && to !== name) return this.refuse(to ? `there is a pin ${to} already` : "a pin needs a name");
+      if (found === document && to !== name) return this.refuse(to ? `another pin is called ${to}` : "a pin needs a name");
       return this.set(found, [{kind: "pin", name: to}]);
     };
     const fixed = make("input", {type: "checkbox", "aria-label": "fixed to the ground"});
@@ -125,17 +125,17 @@ export class PropertiesPanel {
         this.set(withKey(document, kind, index, key, sub ? {...entry[key], [sub]: next} : next));
       };
       const unit = plain ? unitOf(document, quantity) : "";
-      return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ? `such as ${EXAMPLES[quantity]}` : "");
+      return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ? `e.g. ${EXAMPLES[quantity]}` : "");
     });
     const extra = Object.keys(entry).filter(key => key !== "name" && !(KEYS[kind] ?? []).some(([path]) => path.split(".")[0] === key));
     const rename = to => {
       const found = renameElement(document, kind, index, to);
-      if (found === document && to !== title) return this.refuse(to ? `there is a ${kind} ${to} already` : `a ${kind} needs a name`);
+      if (found === document && to !== title) return this.refuse(to ? `another ${kind} is called ${to}` : `a ${kind} needs a name`);
       return this.set(found);
     };
     const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", rename, title), ...fields,
       ...extra.map(key => this.field(key, valueText(entry[key]), "", text => this.set(withKey(document, kind, index, key, readValue(text)))))];
-    if (Array.isArray(entry.of) && entry.of.length === 2) parts.push(make("button", {type: "button", onclick: () => this.set(swapPair(document, kind, index))}, "Turn the other link"));
+    if (Array.isArray(entry.of) && entry.of.length === 2) parts.push(make("button", {type: "button", onclick: () => this.set(swapPair(document, kind, index))}, "Swap the two links"));
     return parts;
   }
 }

@@ -3,7 +3,7 @@
 import {groundOf, list, members, placeOf, pinsOf} from "./document.js";
 import {angle, direction, length, point} from "./units.js";
 
-const IN_LINE = 1e-9;  // of the size squared: points whose hull has less area are in line
+const IN_LINE = 1e-9;  // fraction of the size squared: points whose hull has a smaller area are in line
 
 /** The corners of a link through points, and whether they enclose an area: the hull of a plate, or the ends of a bar. */
 export function corners(points) {
@@ -33,7 +33,7 @@ export function area(points) {
   return Math.abs(sum) / 2;
 }
 
-/** How a link is drawn: {kind: "line" or "plate", points} through its pins or outline, or {kind: "disc", at, radius}. */
+/** The shape of a link: {kind: "line" or "plate", points} through its pins or outline, or {kind: "disc", at, radius}. */
 export function linkShape(document, link) {
   const places = (link.pins ?? []).map(pin => placeOf(document, pin)).filter(Boolean);
   if (Array.isArray(link.outline)) {
@@ -58,7 +58,7 @@ function alongLine(places) {
   return [...places].sort((p, q) => (p[0] - q[0]) * (b[0] - a[0]) + (p[1] - q[1]) * (b[1] - a[1]));
 }
 
-/** The largest distance between pins along an axis (m), or a usual size where there is none. */
+/** The largest distance between pins along an axis (m), or `usual` if there are no two. */
 export function extent(document, usual = 0.1) {
   const places = Object.keys(pinsOf(document)).map(pin => placeOf(document, pin)).filter(Boolean);
   if (places.length < 2) return usual;
@@ -66,7 +66,7 @@ export function extent(document, usual = 0.1) {
   return Math.max(along(0), along(1)) || usual;
 }
 
-/** Places (m) between which all of a drawing is: pins, corners of links, rims of discs, wheels and cams. */
+/** Places (m) that span a whole drawing: pins, corners of links, rims of discs, wheels and cams. */
 export function extentPoints(document) {
   const found = Object.keys(pinsOf(document)).map(pin => placeOf(document, pin)).filter(Boolean);
   const rim = ([x, y], r) => found.push([x - r, y - r], [x + r, y + r]);
@@ -82,14 +82,14 @@ export function extentPoints(document) {
   return found;
 }
 
-/** The pin by which a link turns on its carrier. */
+/** The pin about which a link turns on its carrier; null if there is not exactly one. */
 export function centrePin(document, link, carrier = "ground") {
   const pins = link === "ground" ? groundOf(document) : list(document, "link").find(entry => entry.name === link)?.pins ?? [];
   const shared = pins.filter(pin => members(document, pin).includes(carrier));
   return shared.length === 1 ? shared[0] : null;
 }
 
-/** The radii of a gear pair (m), and the pins of its centres; null where they do not follow. */
+/** The radii of a gear pair (m), and the pins at its centres; null if the drawing does not determine them. */
 export function gearWheels(document, gear) {
   const pins = (gear.links ?? []).map(link => centrePin(document, link, gear.carrier ?? "ground"));
   const [one, two] = pins.map(pin => pin && placeOf(document, pin));
@@ -107,7 +107,7 @@ export function lineAngle(document, entry) {
   return a && b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : direction(entry.direction, document);
 }
 
-/** The outline of a cam: its corners in world coordinates (m), and the name of its link; null where they do not follow. */
+/** The outline of a cam: its corners in world coordinates (m), and the name of its link; null if they are not determined. */
 export function camOutline(document, cam, count = 144) {
   const [centre, follower] = cam.pins ?? [], at = placeOf(document, centre);
   const moving = pin => members(document, pin).filter(name => name !== "ground");
@@ -146,7 +146,7 @@ export function periodicSpline(angles, values) {
   };
 }
 
-/** The solution of linear equations, rows of n + 1 numbers, by elimination with pivots. */
+/** The solution of linear equations, given as rows of n + 1 numbers, by elimination with pivoting. */
 function solve(rows) {
   const n = rows.length;
   for (let k = 0; k < n; k++) {

@@ -1,4 +1,4 @@
-// The text of the file beside the drawing, which may be edited as well: what is typed becomes a step of undo when it is TOML.
+// The text of the file, which can be edited like the drawing: an edit becomes an undo step once it can be read.
 
 import {ask} from "./api.js";
 import {shapeProblem} from "./checks.js";
@@ -8,7 +8,7 @@ const PAUSE = 500;  // ms after the last key
 
 export class SourcePanel {
   constructor(studio, element) {
-    Object.assign(this, {studio, element, timer: null, broken: null});  // the state beside which a text stands that cannot be read
+    Object.assign(this, {studio, element, timer: null, broken: null});  // the state whose text was edited into something that cannot be read
     this.area = make("textarea", {spellcheck: "false", wrap: "off", "aria-label": "text of the file"});
     this.note = make("p", {class: "note", role: "status"});
     this.area.addEventListener("input", () => {
@@ -23,20 +23,20 @@ export class SourcePanel {
     element.append(this.area, this.note);
   }
 
-  /** Whether the text beside the drawing as it is cannot be read. */
+  /** True while the edited text of the current state cannot be read. */
   get isBroken() { return this.broken === this.studio.state; }
 
   say(words, ...buttons) {
     this.note.replaceChildren(words, ...buttons.map(([title, action]) => make("button", {type: "button", class: "small", onclick: action}, title)));
   }
 
-  /** Put a text into the area, as if it were typed. */
+  /** Put a text into the area, as if it had been typed. */
   put(text) {
     this.area.value = text;
     return this.take();
   }
 
-  /** Show the text of the state, unless somebody is writing. A text that could not be read can be had back. */
+  /** Show the text of the state, unless the user is typing. A replaced text that could not be read can be restored. */
   show() {
     const {text} = this.studio.state;
     if (text === null || text === undefined || this.timer || this.area.value === text || this.isBroken) return;
@@ -45,11 +45,11 @@ export class SourcePanel {
     this.area.scrollTop = scrollTop;
     if (document.activeElement === this.area) this.area.setSelectionRange(selectionStart, selectionEnd);
     this.broken = null;
-    if (broken) this.say("The drawing has changed, and this is its text; what was typed is not in it. ", ["Bring it back", () => this.put(value)]);
+    if (broken) this.say("The drawing has changed; this is its new text, without the edit that could not be read. ", ["Restore the edit", () => this.put(value)]);
     else this.say("");
   }
 
-  /** Take what was typed, where it can be read. */
+  /** Take the edited text, if it can be read. */
   async take() {
     clearTimeout(this.timer);
     const text = this.area.value, {state} = this.studio;

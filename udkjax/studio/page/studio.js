@@ -1,4 +1,4 @@
-// The studio: one state, what changes it, and the parts of the page that show it.
+// The studio: one state, its changes, and the parts of the page that show it.
 
 import {askedFile} from "./api.js";
 import {DrawingCanvas} from "./canvas.js";
@@ -21,9 +21,9 @@ import {lengthUnit, niceBelow, tidy} from "./units.js";
 import {fit} from "./view.js";
 import {THEMES} from "./player/painter.js";
 
-const NEW_SIZE = 0.25;  // m: the view of a new drawing
-const SNAP_PIXELS = 8;  // at least between two places that are snapped to
-const LINK_PIXELS = 26;  // the width of a new link
+const NEW_SIZE = 0.25;  // m: width of the view of a new drawing
+const SNAP_PIXELS = 8;  // least spacing of snapping points
+const LINK_PIXELS = 26;  // width of a new link
 
 const text = state => JSON.stringify(state.document);
 
@@ -62,7 +62,7 @@ class Studio {
   get motions() { return this.motion.motions; }
   get isMoved() { return this.motion.isMoved; }
 
-  /** Show another drawing: what was undone, or could be, is forgotten. */
+  /** Show another drawing, with a new history. */
   load(state) {
     this.proposed = null;
     this.history.reset(state);
@@ -74,16 +74,16 @@ class Studio {
     this.changed();
   }
 
-  /** Show a document while a gesture changes it; `commit` makes it an entry of undo. */
+  /** Show a document while a gesture changes it; `commit` makes it an undo step. */
   propose(document) {
     this.proposed = document === this.history.state.document ? null : document;
     this.motion.follow(this.document);
     this.redraw();
   }
 
-  /** Take a document as the next state, and tell whether it says anything new. `source` is its text, where that is known. */
+  /** Make a document the next state; returns whether it differs from the current one. `source` is its text, if known. */
   commit(document, select = null, source = null) {
-    this.gestures.cancel();  // one that is under way changes a drawing that is no more
+    this.gestures.cancel();  // a gesture in progress belongs to the old drawing
     this.proposed = null;
     const base = this.state.text ?? this.state.base;
     const isNew = this.history.push({document, text: source, base}, (a, b) => text(a) === text(b));
@@ -92,7 +92,7 @@ class Studio {
     return isNew;
   }
 
-  /** Take what a tool made, or say why it made nothing. */
+  /** Apply the result of a tool, or say why there is none. */
   apply({document, select, problem, measured}) {
     if (measured) return this.pictures.scale(...measured);
     if (problem) return this.say(problem);
@@ -112,7 +112,7 @@ class Studio {
     this.changed();
   }
 
-  /** The drawing is another one: show it, and let the server and the engine follow. */
+  /** The drawing has changed: show it, and update the server and the engine. */
   changed() {
     this.rewind();
     this.shown();
@@ -139,7 +139,7 @@ class Studio {
 
   showHelp() {
     this.parts.help.showModal();
-    this.parts.help.scrollTop = 0;  // not at the button, which takes the focus
+    this.parts.help.scrollTop = 0;  // the focused button would scroll it down
   }
 
   // The view
@@ -158,7 +158,7 @@ class Studio {
     this.setView(fit(places, width || 800, height || 600, NEW_SIZE), true);
   }
 
-  /** The distance (m) of places that are snapped to. */
+  /** The spacing (m) of snapping points. */
   gridUnit() {
     const unit = lengthUnit(this.document);
     return unit * niceBelow(2 * SNAP_PIXELS / this.view.scale / unit);
@@ -198,11 +198,11 @@ class Studio {
 
   rewind() { this.motion.rewind(); }
 
-  canPull(item) { return Boolean(this.motion.mover?.engine) && (item.kind === "link" || (item.kind === "pin" && members(this.document, item.name).some(name => name !== "ground") && this.canvas.carrier(this.document, item.name) >= 0)); }
+  canPull(item) { return Boolean(this.motion.pageEngine?.engine) && (item.kind === "link" || (item.kind === "pin" && members(this.document, item.name).some(name => name !== "ground") && this.canvas.carrier(this.document, item.name) >= 0)); }
 
   // What is shown
 
-  /** Show what depends on more than the picture. */
+  /** Update everything around the canvas, and redraw. */
   shown() {
     for (const button of this.parts.tools) button.setAttribute("aria-pressed", button.dataset.tool === this.tool);
     this.parts.canvas.dataset.tool = this.tool;
@@ -219,7 +219,7 @@ class Studio {
     this.frame ??= requestAnimationFrame(() => this.draw());
   }
 
-  /** Draw now what is to be drawn: places on the screen are those of the drawing as it is. */
+  /** Draw pending changes at once, so that positions on the screen are current. */
   draw() {
     if (!this.frame) return;
     cancelAnimationFrame(this.frame);

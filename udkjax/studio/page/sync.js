@@ -1,14 +1,13 @@
-// The server and the engine follow the drawing: its text with comments kept, its mistakes, the engine, and what is found about it.
-// Answers that come too late, about a drawing that has changed since, are dropped.
+// Keeps text, mistakes, engine and findings up to date with the drawing. Answers about an outdated drawing are dropped.
 
 import {RequestError, ask} from "./api.js";
-import {Mover} from "./mover.js";
+import {PageEngine} from "./page_engine.js";
 import {loadEngine} from "./player/engine.js";
 
-const BREATH = 120;  // ms without a change before an engine is compiled, which takes the server half a second or more
-const PAUSE = 250;  // ms without a change before a drawing is diagnosed, which takes the server a second
+const COMPILE_DELAY = 120;  // ms without a change before an engine is compiled, which takes the server half a second or more
+const DIAGNOSE_DELAY = 250;  // ms without a change before a drawing is diagnosed, which takes the server a second
 
-/** What an engine is compiled for: all of a drawing but the places of its pins, which are parameters. */
+/** The part of a drawing that its engine is compiled for: everything but the places of pins, which are parameters. */
 const structureOf = ({pins, ...rest}) => JSON.stringify([Object.keys(pins ?? {}), rest]);
 
 export class Sync {
@@ -16,10 +15,10 @@ export class Sync {
     Object.assign(this, {studio, stamp: 0, structure: null, pending: Promise.resolve()});
   }
 
-  /** Let everything follow the present state; `settled` ends when it has. */
+  /** Update everything for the current state; `settled` waits for it. */
   follow() {
     const stamp = ++this.stamp, {studio} = this;
-    if (this.structure !== structureOf(studio.document) || !studio.motion.mover?.engine) {
+    if (this.structure !== structureOf(studio.document) || !studio.motion.pageEngine?.engine) {
       this.structure = null;
       studio.motion.forget();
     }
@@ -30,7 +29,7 @@ export class Sync {
     });
   }
 
-  /** End when the text of the present state is known, and with it its motion and what is found. */
+  /** Wait until text, motion and findings of the current state are known. */
   async settled() {
     for (let before = null; before !== this.pending;) {
       before = this.pending;
@@ -58,7 +57,7 @@ export class Sync {
     }
     if (!moves) await this.compile(found.text, state.document, isLate);
     if (isLate()) return undefined;
-    await new Promise(done => { setTimeout(done, PAUSE); });
+    await new Promise(done => { setTimeout(done, DIAGNOSE_DELAY); });
     return isLate() ? undefined : this.diagnose(found.text, isLate);
   }
 
@@ -71,26 +70,26 @@ export class Sync {
   async compile(text, document, isLate) {
     const {studio} = this, hasWasm = typeof WebAssembly === "object";
     studio.motion.showWaiting();
-    await new Promise(done => { setTimeout(done, BREATH); });
+    await new Promise(done => { setTimeout(done, COMPILE_DELAY); });
     if (isLate()) return;
     let compiled = await ask("compile", {text, engine: hasWasm ? "wasm" : "recorded"});
     if (isLate()) return;
-    if (!compiled.problems.length && !compiled.engine && !compiled.motion) {  // what machine code has no instruction for
+    if (!compiled.problems.length && !compiled.engine && !compiled.motion) {  // machine code cannot express it
       compiled = {...await ask("compile", {text, engine: "recorded"}), why: compiled.why};
       if (isLate()) return;
     }
     if (compiled.problems.length) return void studio.findings.showProblems(compiled.problems);
-    const mover = await Mover.load(document, compiled, loadEngine);
+    const pageEngine = await PageEngine.load(document, compiled, loadEngine);
     if (isLate()) return;
     this.structure = structureOf(document);
-    studio.motion.use(mover, compiled.why ?? "");
+    studio.motion.use(pageEngine, compiled.why ?? "");
   }
 
   async diagnose(text, isLate) {
     const {studio} = this, found = await ask("diagnose", {text});
     if (isLate()) return;
     studio.findings.showStructure(found);
-    if (found.problems.length || !studio.motion.mover?.scene.drivers.length) return;
+    if (found.problems.length || !studio.motion.pageEngine?.scene.drivers.length) return;
     const travel = await ask("diagnose", {text, about: "travel"});
     if (!isLate()) studio.findings.showTravel(travel);
   }

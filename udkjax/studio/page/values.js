@@ -1,13 +1,13 @@
-// Values of a file as they stand in a field, and back: numbers, texts with units, lists, tables.
+// Values of a file as the text of a field, and back: numbers, texts with units, lists, tables.
 
-/** A value as one types it: 12, "12 mm" without its quotes, [1, 2], A, B. */
+/** A value as it would be typed: 12, "12 mm" without its quotes, [1, 2], A, B. */
 export function valueText(value) {
   if (value === undefined || value === null) return "";
   if (Array.isArray(value)) return value.every(x => typeof x === "string" && /^[^\s,[\]{}"]+$/.test(x) && !/^[-+.\d]/.test(x)) ? value.join(", ") : `[${value.map(valueText).join(", ")}]`;
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
 
-/** What is typed as a value; undefined where it is nothing. `isName` keeps texts that look like numbers. */
+/** The value of a typed text; undefined if it is empty. `isName` keeps texts that look like numbers. */
 export function readValue(text, isName = false) {
   const plain = text.trim();
   if (plain === "") return undefined;

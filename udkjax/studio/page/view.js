@@ -1,18 +1,18 @@
-// The view of the drawing: metres to pixels, x + scale X and y - scale Y.
+// The view of the drawing: a place (X, Y) in metres is at the pixel (x + scale X, y - scale Y).
 
-export const ZOOM_STEP = 1.12;  // of the wheel
+export const ZOOM_STEP = 1.12;  // zoom factor of one notch of the wheel
 const SMALLEST_SCALE = 1e-3, LARGEST_SCALE = 1e9;  // px/m: mechanisms from a kilometre to a micrometre
 
 export const toPixels = (view, [x, y]) => [view.x + view.scale * x, view.y - view.scale * y];
 export const toMetres = (view, [x, y]) => [(x - view.x) / view.scale, (view.y - y) / view.scale];
 
-/** The view zoomed about a pixel, whose place stays. */
+/** The view zoomed about a pixel, whose place stays put. */
 export function zoomAt(view, [x, y], factor) {
   const scale = Math.min(Math.max(view.scale * factor, SMALLEST_SCALE), LARGEST_SCALE), ratio = scale / view.scale;
   return {scale, x: x + (view.x - x) * ratio, y: y + (view.y - y) * ratio};
 }
 
-/** The view of so many pixels that holds points (m), with margins; of nothing, a square of a size (m). */
+/** The view of width x height pixels that fits points (m), with margins; without points, a square with sides of `size` (m). */
 export function fit(points, width, height, size) {
   const xs = points.map(p => p[0]), ys = points.map(p => p[1]);
   let [left, right, bottom, top] = points.length ? [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)] : [0, size, 0, size];

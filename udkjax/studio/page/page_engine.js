@@ -1,16 +1,16 @@
-// The engine in the page: the motion of the drawing, its closed positions, and a hand that pulls it. WebAssembly computes; here
-// its bodies are matched to the links of the document, whose frames are that of the ground while they stand as drawn.
+// The engine of the page: the motion of the drawing, its closed positions, and pulling it. WebAssembly computes; this module
+// matches its bodies to the links of the document, whose frames coincide with the ground's in the drawn position.
 
 import {list, placeOf} from "./document.js";
 import {stateAt} from "./player/motion.js";
 
 const INSTANTS = 401;
-const PULLS = 12;  // closings of one frame, each nearer to the hand
-const LONGEST_PULL = 0.08;  // characteristic lengths in one closing, so that no branch is jumped to
-const STILL = 1e-9;  // characteristic lengths, or rad: a motion that is less is rounding
-const NEAR = 1e-4;  // characteristic lengths of the hand: near enough
+const PULLS = 12;  // closures per frame, each nearer to the pointer
+const LONGEST_PULL = 0.08;  // characteristic lengths per closure, so that the pull cannot jump to another branch
+const STILL = 1e-9;  // characteristic lengths, or rad: a smaller motion is rounding
+const NEAR = 1e-4;  // characteristic lengths: the pointer is reached
 
-/** Turn frames x, y, angle of bodies and those that they are drawn in into motions of the ground: place p goes to t + R p. */
+/** Motions p -> t + R p of the ground frame that bring bodies from the frames `drawn` (x, y, angle) to the frames `q`. */
 export function motionsOf(q, drawn, order) {
   const found = new Float64Array(3 * order.length);
   order.forEach((body, k) => {
@@ -22,17 +22,17 @@ export function motionsOf(q, drawn, order) {
   return found;
 }
 
-/** Where a motion brings a place of the drawing. */
+/** The place to which a motion brings a place of the drawing. */
 export function carry(motions, k, [x, y]) {
   if (k < 0) return [x, y];
   const c = Math.cos(motions[3 * k + 2]), s = Math.sin(motions[3 * k + 2]);
   return [motions[3 * k] + c * x - s * y, motions[3 * k + 1] + s * x + c * y];
 }
 
-export class Mover {
-  /** `compiled` is the answer of the compile route for `document`; `loadEngine` makes its engines. */
+export class PageEngine {
+  /** Load the engine of `document` from `compiled`, the answer of the compile route. */
   static async load(document, compiled, loadEngine) {
-    const found = new Mover();
+    const found = new PageEngine();
     found.scene = compiled.scene;
     found.recorded = compiled.motion;
     found.size = 3 * found.scene.bodies.length;
@@ -46,7 +46,7 @@ export class Mover {
     return found;
   }
 
-  /** Take the places of pins from a document of the same structure; tells whether they are numbers. */
+  /** Take the places of pins from a document of the same structure; returns false if one is not a number. */
   follow(document) {
     this.drawn = Float64Array.from(this.scene.frames.flat());
     if (!this.engine) return true;
@@ -59,7 +59,7 @@ export class Mover {
 
   get duration() { return this.scene.duration; }
 
-  /** The closed state as drawn; `closed` says whether the loops close. */
+  /** The state as drawn; `closed` is false if its loops do not close. */
   start() {
     if (!this.engine) return {t: 0, q: this.recorded.q.slice(0, this.size), v: this.recorded.v.slice(0, this.size), closed: true, violation: 0};
     return this.engine.close(this.parameters);
@@ -80,14 +80,14 @@ export class Mover {
     return this.moves(found) ? found : {...still, words: "nothing moves"};
   }
 
-  /** Tell whether a run goes anywhere. */
+  /** True if any body moves during a run. */
   moves({q, count}) {
     const {size} = this, least = STILL * this.scene.length;
     for (let k = size; k < count * size; k++) if (Math.abs(q[k] - q[k % size]) > (k % 3 === 2 ? STILL : least)) return true;
     return false;
   }
 
-  /** The state of a run at a time, closed: between its instants it is interpolated, which leaves loops open by a little. */
+  /** The state of a run at a time. It is closed again: interpolation between instants leaves loops slightly open. */
   at(run, t) {
     const state = stateAt(run, t, this.size);
     if (!this.engine) return {...state, violation: 0};
@@ -95,7 +95,7 @@ export class Mover {
     return found.closed ? found : {...state, violation: found.violation};
   }
 
-  /** The state nearest to one in which a place of a link (m, as drawn) is at the hand: closed, without what drives it. */
+  /** The closed state, with motors released, that brings a drawn place of a link (m) closest to the pointer at `hand`. */
   pull(state, link, place, hand) {
     const body = this.order[link], {length} = this.scene;
     let best = state;
@@ -107,15 +107,15 @@ export class Mover {
       q[3 * body] += share * way[0];
       q[3 * body + 1] += share * way[1];
       const found = this.hand.close(this.parameters, {t: state.t, q, v: new Float64Array(this.size)});
-      if (!found.closed) return {...best, words: "it cannot follow any farther: the loops would open"};
+      if (!found.closed) return {...best, words: "it cannot move any farther: its loops would open"};
       const reached = carry(motionsOf(found.q, this.drawn, this.order), link, place);
-      if (Math.hypot(hand[0] - reached[0], hand[1] - reached[1]) >= away - 1e-9 * length) return {...best, words: "it gets no nearer to the hand"};
+      if (Math.hypot(hand[0] - reached[0], hand[1] - reached[1]) >= away - 1e-9 * length) return {...best, words: "it cannot get closer to the pointer"};
       best = found;
     }
     return {...best, words: ""};
   }
 
-  /** Names, frames, masses (kg) and inertias (kg m2) of the bodies as they are drawn now. */
+  /** Names, frames, masses (kg) and inertias (kg m2) of the bodies in the current drawing. */
   bodies() {
     const {scene, engine, drawn} = this, frames = scene.bodies.map((_, k) => Array.from(drawn.slice(3 * k, 3 * k + 3)));
     if (!engine) return {...scene, frames};

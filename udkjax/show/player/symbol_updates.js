@@ -1,7 +1,7 @@
-// Symbols that follow the numbers of a scene (udkjax/show/player/followers.py).
+// Updates of symbols when numbers of the scene change (udkjax/show/player/symbol_updates.py).
 
-/** Moves the places of a run's symbols, marks and traces to where the numbers say. */
-export class Follower {
+/** Updates the symbols, marks and traces of a run from the numbers of the scene. */
+export class SymbolUpdater {
   constructor(run, rows) {
     this.run = run;
     this.rows = rows;
@@ -12,7 +12,7 @@ export class Follower {
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
 
-  follow(numbers) {
+  update(numbers) {
     const {run, rows} = this, put = (anchor, start, x, y) => { anchor[start] = numbers[x]; anchor[start + 1] = numbers[y]; };
     for (const [k, which, x, y] of rows.frames) put(which < 0 ? run.symbols[k].frame : run.symbols[k].frame[which], 1, x, y);
     for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
