@@ -51,7 +51,7 @@ def test_a_run_and_a_scene_side_by_side(run, tmp_path):
         (("{run}", "--labels", "a", "b", "--out", "x.html"), "2 --labels for 1 files"),
         (("none.nc", "--out", "x.html"), "cannot read none.nc"),
         (("{sweep}", "--out", "x.html"), "has no q and no time"),
-        (("{run}", "--measures", "heat", "--out", "{out}.html"), "measure 'heat' is not known"),
+        (("{run}", "--measures", "heat", "--out", "{out}.html"), "measure 'heat' is unknown"),
         (("{run}", "--traces", "Z", "--out", "{out}.html"), "trace 'Z'"),
         ((SCENE, "--t1", "0", "--out", "x.html"), "--t1 0 must be at least one --dt"),
     ],
