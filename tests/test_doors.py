@@ -32,7 +32,7 @@ def floors(root: Path) -> list[str]:
 
 
 def used_names(root: Path) -> dict[str, dict[Name, list[str]]]:
-    """Of each floor with a door: the names that other floors import, and the files that do."""
+    """Names that other floors import from each floor with a door, and the importing files."""
     found: dict[str, dict[Name, list[str]]] = {floor: {} for floor in floors(root)}
     for file in sorted(root.rglob("*.py")):
         place = file.relative_to(root)

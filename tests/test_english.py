@@ -15,6 +15,11 @@ import udkjax
 
 ROOT = Path(udkjax.__file__).parents[1]
 CLEAN = [  # folders with all below them, or files
+    "tests/expressions",
+    "tests/pinv",
+    "tests/programs",
+    "tests/scene",
+    "tests/transforms",
     "udkjax/__init__.py",
     "udkjax/annotations.py",
     "udkjax/expressions",

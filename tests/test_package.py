@@ -51,7 +51,7 @@ ONLY_IN = {
 
 
 def violations(root: Path) -> list[str]:
-    """What the package below `root` imports from above, sideways, or from a library that belongs to another floor."""
+    """The imports of the package below `root` from floors above or beside, or from libraries that belong to another floor."""
     found = []
     for file in sorted(root.rglob("*.py")):
         place = file.relative_to(root)

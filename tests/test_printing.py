@@ -1,4 +1,4 @@
-"""What is printed, and shown in notebooks: tables of numbers with their units, whatever the numbers are."""
+"""Printing, also in notebooks: tables of numbers with units, for numbers of all kinds."""
 
 import inspect
 import re

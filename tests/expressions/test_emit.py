@@ -35,7 +35,7 @@ def test_floats_are_evaluated_without_compiling():
 
 
 def test_numbers_of_python_give_what_jax_gives(emit):
-    """Also where they are none."""
+    """Results that are not finite agree as well."""
 
     def f(x, y):
         several = [jnp.abs(x), jnp.arctan2(x, y), x**3, x**-2, jnp.maximum(x, y), jnp.minimum(x, y), jnp.square(y), -x]
@@ -49,7 +49,7 @@ def test_numbers_of_python_give_what_jax_gives(emit):
 
 
 def test_an_operation_is_traced_once_for_each_value_it_has(emit):
-    """What the jaxpr of a program holds is what the program counts."""
+    """A program counts the operations of its jaxpr."""
     program = emit(lambda x: (x[0] - x[1]) * jnp.sin(x[2]) + (x[1] - x[0]) / x[2], X).program
     (call,) = jax.make_jaxpr(lambda values: program(values))([jnp.asarray(x) for x in X]).jaxpr.eqns
     names = sorted(e.primitive.name for e in call.params["jaxpr"].jaxpr.eqns)

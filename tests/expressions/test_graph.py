@@ -1,4 +1,4 @@
-"""What a graph simplifies while it is built."""
+"""Simplifications of a graph while it is built."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Whatever JAX can trace becomes a program that computes the same: on floats, under jit and vmap, and differentiated."""
+"""All that JAX can trace becomes a program that computes the same: on floats, under jit and vmap, and differentiated."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ def _doubled(x):
     return 2.0 * x
 
 
-_doubled.defjvp(lambda primals, tangents: (_doubled(*primals), 7.0 * tangents[0]))  # wrong on purpose: it can be told
+_doubled.defjvp(lambda primals, tangents: (_doubled(*primals), 7.0 * tangents[0]))  # wrong on purpose, to recognize the rule
 
 
 def _switch(x, y):
@@ -93,7 +93,7 @@ def test_read(function, emit):
     def total(outputs):
         return sum(jnp.sum(jnp.asarray(o, float) ** 2) for o in jax.tree.leaves(outputs))
 
-    def point(g, x, y):  # of what is written out one function is differentiated: its program is of JAX's own operations
+    def point(g, x, y):  # only one function is unrolled and differentiated: its program consists of JAX's operations
         slope = jax.grad(lambda x, y: total(g(x, y)), argnums=(0, 1))
         return g(x, y), slope(x, y) if name not in WRITTEN_OUT or name == "arithmetic" else ()
 

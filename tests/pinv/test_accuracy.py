@@ -24,7 +24,7 @@ def bound(entry, matrix, dtype):
 
 
 def admitted(entry, matrix, dtype):
-    """Else the method promises nothing, or the rank cannot be told, from a matrix in float32 or by this method."""
+    """True if the rank can be determined from a matrix in float32 by a method, and the method guarantees its error."""
     if entry.power > 1 and bound(entry, matrix, dtype) >= 1:
         return False
     if entry.own_threshold:

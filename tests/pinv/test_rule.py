@@ -75,8 +75,10 @@ def test_checker_sees_what_is_wrong():
 
 
 def derivatives(method):
-    """Of x along a path of constant rank; and of a function of A^+ in every entry of A: also in directions that break the rank
-    the rule gives a number, the same for all methods."""
+    """Derivatives of x along a path of constant rank, and of a function of A^+ with respect to every entry of A.
+
+    In directions that change the rank the rule also gives a number, the same for all methods.
+    """
     x = solution(method)
 
     functions = [

@@ -38,7 +38,7 @@ def at():
 
 @pytest.fixture
 def same():
-    """Whether two mechanisms are equal in structure and, bit by bit, in every number."""
+    """True if two mechanisms have the same structure and bitwise identical numbers."""
 
     def equal(one, two):
         return jax.tree.structure(one) == jax.tree.structure(two) and bool(eqx.tree_equal(one, two))

@@ -1,4 +1,4 @@
-"""Results that are found again by the identities of what they were computed of."""
+"""Results are cached by the identities of the objects from which they were computed."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from udkjax.scene.identity_cache import cached_by_identity
 
 
 class Thing:
-    """An object whose end can be told."""
+    """An object whose deletion can be observed."""
 
 
 @pytest.fixture

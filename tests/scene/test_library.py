@@ -72,7 +72,7 @@ def test_numbers_may_be_traced():
 
 
 def _positions_are_traced(name, key, default):
-    """Whether a mechanism of the library has traced positions where the number `key` is traced."""
+    """True if a mechanism of the library has traced positions when the number `key` is traced."""
     found = []
 
     def build(value):

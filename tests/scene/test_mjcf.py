@@ -248,7 +248,7 @@ def test_a_four_bar_moves_in_mujoco_as_it_does_here():
     assert_allclose(found, udk.simulate(mech, [0.0, 1.0]).q[-1, :, :2], atol=1e-7)
 
 
-# --- what is not ours
+# --- unsupported parts
 
 BODY = '<body name="a"><joint name="h" axis="0 1 0"{joint}/><geom name="g" size="0.1" pos="0.3 0 0"{geom}/>{body}</body>'
 

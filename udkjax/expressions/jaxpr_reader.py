@@ -151,7 +151,6 @@ def _read_inner(graph: Graph, jaxpr: core.Jaxpr | ClosedJaxpr, inputs: Sequence[
 
 
 def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Unroll a loop of known length, iteration by iteration."""
     body, order = equation.params["jaxpr"], range(equation.params["length"])
     inner = getattr(body, "jaxpr", body)
     # Constants and carry come first; the scanned inputs have a leading dimension, one entry per iteration.
@@ -190,7 +189,6 @@ def _fold(primitive: core.Primitive, parameters: dict, values: Sequence[ArrayLik
 
 
 def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Evaluate a primitive on constants, such as indices."""
     values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty array has no type
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)

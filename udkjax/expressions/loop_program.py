@@ -242,7 +242,6 @@ def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tu
 
 
 def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
-    """Return the numbers at places of an array, in the shape of the places."""
     flat = places.ravel()
     if np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
         return x[flat[0] : flat[0] + flat.size].reshape(places.shape)

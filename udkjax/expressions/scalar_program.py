@@ -97,7 +97,6 @@ class ScalarProgram:
 
     @cached_property
     def _calls_arrays(self) -> bool:
-        """True if the program calls primitives on whole arrays."""
         return any(self.graph.nodes[i].kind == "call" for i in self.order)
 
     def _typed(self, values: Sequence[Operand]) -> list[Operand]:

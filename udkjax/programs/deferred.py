@@ -69,7 +69,7 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
 def trace_once(
     function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
-) -> "tuple[Any, list[Any], Out]":
+) -> "tuple[Any, list[Any], ResultForm]":
     """Return the program of a function, traced once per structure of its arguments, their arrays, and the form of the result."""
     dynamic, static = eqx.partition((args, kwargs or {}), _is_array)
     leaves, tree = jax.tree.flatten(dynamic)
@@ -92,7 +92,7 @@ def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Argume
         found = [x if _is_traced(x) else next(numbers).value for x in leaves]
         args, kwargs = jax.tree.unflatten(tree, found)
         traced, rest = eqx.partition(call(*args, **kwargs), _is_traced)
-        return traced, _Rest(rest)
+        return traced, _StaticPart(rest)
 
     program = deferred(with_concrete)
 
@@ -145,7 +145,7 @@ class _ConcreteLeaf:
         return hash(self._key)
 
 
-class _Rest:
+class _StaticPart:
     """The part of a result that is not traced, and not part of a program."""
 
     def __init__(self, value: Any):
@@ -164,7 +164,7 @@ class _ClosesOverError(Exception):
     """A function among the arguments closes over traced numbers: its program cannot be reused."""
 
 
-class Out:
+class ResultForm:
     """The form of a result: the tree of its arrays, and its static part."""
 
     tree: Any
@@ -178,9 +178,9 @@ class Out:
 @lru_cache(maxsize=128)
 def _trace(
     function: Callable[..., Any], tree: Any, fixed: tuple[Hashable, ...], fixed_tree: Any, types: tuple[Any, ...], x64: bool
-) -> tuple[Any, Out]:
+) -> tuple[Any, ResultForm]:
     del x64  # only part of the key of the cache
-    out = Out()
+    out = ResultForm()
 
     def flat(*leaves: Array) -> list[Array]:
         static = jax.tree.unflatten(fixed_tree, fixed)

@@ -131,7 +131,6 @@ def numpy_program(jaxpr: Any) -> NumpyProgram:
 
 
 def _step_of(equation: Any) -> Callable[..., Any]:
-    """Return the function of a meter and arrays for one operation."""
     primitive, parameters = equation.primitive, equation.params
     if primitive in _EVALUATIONS:
         return lambda _, *xs: _EVALUATIONS[primitive](*xs, **parameters)

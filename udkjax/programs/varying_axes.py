@@ -42,6 +42,5 @@ def zero_of(x: Array) -> Array | float:
 
 
 def _axis_count(type_: Any) -> int:
-    """Return the number of device axes over which values of a type vary."""
     manual = getattr(type_, "manual_axis_type", None)
     return len(manual.varying) if manual is not None else 0

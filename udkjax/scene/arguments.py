@@ -173,7 +173,6 @@ def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
 
 
 def _family(classes: Sequence[type]) -> Iterator[type]:
-    """Iterate over classes and all their subclasses."""
     for cls in classes:
         yield cls
         if cls not in (bool, str, type(None)):

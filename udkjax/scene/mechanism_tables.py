@@ -131,7 +131,6 @@ def toml(value: object) -> str:
 
 
 def _string(text: str) -> str:
-    """Return a TOML basic string."""
     escaped = re.sub(r'[\\"]', lambda match: "\\" + match[0], text)
     return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped) + '"'
 

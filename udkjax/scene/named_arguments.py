@@ -42,7 +42,6 @@ def _check_state(name: str, value: Any, given: GivenArguments) -> None:
 
 
 def _check_thresholds(name: str, value: Any, given: GivenArguments) -> None:
-    """Check the thresholds of a pseudoinverse, or the gains of a stabilization."""
     for field in dataclasses.fields(value) if isinstance(value, eqx.Module) else ():
         x = getattr(value, field.name)
         if eqx.is_array(x) or isinstance(x, float):

@@ -40,7 +40,6 @@ def _length(point: Any) -> float:
 
 
 def _far_points(mechanism: Mechanism) -> Iterator[str]:
-    """Iterate over points far outside of all bodies."""
     reaches = {number: _length(p) for name in mechanism.body_names for number, p in attachments(mechanism, name)}
     gyration = max(2 * _gyration(body) for body in mechanism.bodies.values())
     owner = {number: name for name in mechanism.body_names for number, _ in attachments(mechanism, name)}

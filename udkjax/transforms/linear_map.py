@@ -73,7 +73,7 @@ class DifferentiableFunction(eqx.Module):
         return change_along(lambda inputs: change_along(self, inputs, active, tangents)[1], inputs, others, other_tangents)[1]
 
 
-class Along(DifferentiableFunction):
+class TangentMap(DifferentiableFunction):
     """g(x, v) = J(x) v."""
 
     of: DifferentiableFunction
@@ -95,19 +95,19 @@ class Along(DifferentiableFunction):
         if dxs:
             found = self.of.twice(inputs, self.active, directions, of_x, dxs)
         if dvs:
-            found = [a + b for a, b in zip(found, self.of.forward(inputs, self._those(of_v), dvs, None), strict=True)]
+            found = [a + b for a, b in zip(found, self.of.forward(inputs, self._expand(of_v), dvs, None), strict=True)]
         return found
 
     def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
         del run
         (inputs, directions), (of_x, of_v) = self.parts(inputs), self.parts(active)
         found = _by_rows(lambda units: self.of.twice(inputs, self.active, directions, of_x, units), inputs, of_x, cotangents)
-        return [*found, *(self.of.backward(inputs, self._those(of_v), cotangents, None) if any(of_v) else [])]
+        return [*found, *(self.of.backward(inputs, self._expand(of_v), cotangents, None) if any(of_v) else [])]
 
     def parts(self, inputs: Sequence[Any]) -> tuple[Any, Any]:
         return inputs[: len(self.active)], inputs[len(self.active) :]
 
-    def _those(self, which: Mask) -> Mask:
+    def _expand(self, which: Mask) -> Mask:
         """Return a mask of x from a mask of the active entries of x."""
         rest = iter(which)
         return tuple(m and next(rest) for m in self.active)
@@ -116,7 +116,7 @@ class Along(DifferentiableFunction):
         return self.of.shapes(self.parts(inputs)[0])
 
 
-class Back(Along):
+class CotangentMap(TangentMap):
     """h(x, w) = J(x)^T w."""
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
@@ -204,7 +204,7 @@ def _derivative(primals, tangents):
     found = _bind(linear, vector)
     if all(dx is None for dx in at.inputs):
         return found, _bind(linear, change)
-    kind = Back if linear.transposed else Along
+    kind = CotangentMap if linear.transposed else TangentMap
     parts = [None] * len(linear.argument_shapes) if change is None else _split(change, linear.argument_shapes)
     dxs = [*at.inputs, *parts]
     active = tuple(dx is not None for dx in dxs)

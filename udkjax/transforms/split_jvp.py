@@ -41,12 +41,12 @@ def split_jvp(
 
         return function
 
-    both = Both(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ways], shapes)
+    both = SplitForms(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ways], shapes)
     found = along_p.bind(*start, *ways, both=both)
     return list(found[: both.values]), list(found[both.values :])
 
 
-class Both:
+class SplitForms:
     """Both forms as functions of arrays: first `start` arrays of the point, then those of the direction, of shapes `ways`."""
 
     def __init__(
@@ -60,7 +60,7 @@ class Both:
         self.seen, self.run, self.start, self.ways, self.shapes = seen, run, start, ways, shapes
         self.values = len(shapes[0])
 
-    def mapped(self, axes: Sequence[int | None], size: int) -> "Both":
+    def mapped(self, axes: Sequence[int | None], size: int) -> "SplitForms":
         """Return both forms for a batch."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
@@ -68,14 +68,14 @@ class Both:
             x if axis is None else jax.ShapeDtypeStruct((*x.shape[:axis], size, *x.shape[axis:]), x.dtype)
             for x, axis in zip(self.ways, axes[self.start :], strict=True)
         ]
-        return Both(seen, run, self.start, ways, (value, change))
+        return SplitForms(seen, run, self.start, ways, (value, change))
 
 
-def _avals(*xs: Array, both: Both) -> list[jax.core.ShapedArray]:
+def _avals(*xs: Array, both: SplitForms) -> list[jax.core.ShapedArray]:
     return [result_type(x.shape, xs, x.dtype) for part in both.shapes for x in part]
 
 
-def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int | None]]:
+def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: SplitForms) -> tuple[list[Array], list[int | None]]:
     size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
     found = along_p.bind(*xs, both=both.mapped(axes, size))
     if any(axis is not None for axis in axes[: both.start]):
@@ -84,7 +84,9 @@ def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tup
     return [*(x[0] for x in value), *change], [*[None] * len(value), *[0] * len(change)]
 
 
-def _derivative(primals: Sequence[Array], tangents: Sequence[Array], both: Both) -> tuple[list[Array], list[Array | ad.Zero]]:
+def _derivative(
+    primals: Sequence[Array], tangents: Sequence[Array], both: SplitForms
+) -> tuple[list[Array], list[Array | ad.Zero]]:
     return _jvp(both.seen, primals, tangents)
 
 
@@ -103,7 +105,7 @@ def _jvp(
     return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) if n else dx for x, dx, n in zip(found, slopes, none, strict=True)]
 
 
-def _part(trace: Any, *xs: Array, both: Both) -> list[Array]:
+def _part(trace: Any, *xs: Array, both: SplitForms) -> list[Array]:
     with set_current_trace(trace):
         return both.seen(*xs)
 
@@ -111,7 +113,7 @@ def _part(trace: Any, *xs: Array, both: Both) -> list[Array]:
 def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
     """Split under `jax.checkpoint`: if only directions are unknown the value is computed; the backward pass recomputes both."""
     del saveable
-    both: Both = eqn.params["both"]
+    both: SplitForms = eqn.params["both"]
     inputs = [x for x, t in zip(eqn.invars, there, strict=True) if not t and not isinstance(x, Literal)]
     if any(unknown[: both.start]):
         return None, eqn, [True] * len(eqn.outvars), [True] * len(eqn.outvars), inputs
@@ -120,11 +122,11 @@ def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool],
     return value, eqn, [*[False] * both.values, *[True] * changes], [True] * len(eqn.outvars), inputs
 
 
-def _value(*xs: Array, both: Both) -> list[Array]:
+def _value(*xs: Array, both: SplitForms) -> list[Array]:
     return both.seen(*xs, *(jnp.zeros(x.shape, x.dtype) for x in both.ways))[: both.values]
 
 
-def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], both: Both) -> tuple[list[Array], list[int]]:
+def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], both: SplitForms) -> tuple[list[Array], list[int]]:
     found = jax.vmap(partial(_value, both=both), in_axes=tuple(axes))(*xs)
     return found, [0] * len(found)
 

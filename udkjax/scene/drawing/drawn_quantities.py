@@ -190,7 +190,6 @@ def _field(problem: str) -> str:
 
 
 def _unit(cls: type, field: str, variant: str, law: str) -> str:
-    """Return the SI unit of a number of an element."""
     return law if field in FOLLOWS else field_unit(variant or cls.__name__, field)
 
 

@@ -177,7 +177,6 @@ def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[st
 
 
 def _crosses_itself(corners: np.ndarray) -> bool:
-    """Return True if two sides of a polygon cross that are not neighbours."""
     sides = [*pairwise(corners), (corners[-1], corners[0])]
 
     def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:

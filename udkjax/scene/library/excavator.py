@@ -121,7 +121,6 @@ def _points(places, length) -> dict[str, Numbers]:
 
 
 def _spot(placed, local):
-    """Return the position of a point of a body."""
     return as_array(Frame.at(*placed).point(local))
 
 

@@ -281,7 +281,6 @@ class _Writer:
         return titles
 
     def _unique(self, name: str) -> str:
-        """Return a unique name for a site or a tendon."""
         found = unique_name(name, self.taken)
         self.taken.add(found)
         return found
