@@ -125,7 +125,9 @@ def traced_once(function: Callable[Arguments, Result]) -> Callable[Arguments, Re
 
 def _as_traced(value: Any) -> Any:
     """Return a mechanism without its origin, and numbers as arrays: neither affects the trace."""
-    return value.without_origin if isinstance(value, eqx.Module) else jnp.asarray(value, jnp.result_type(float))
+    if isinstance(value, eqx.Module):
+        return value.without_origin  # pyright: ignore[reportAttributeAccessIssue]
+    return jnp.asarray(value, jnp.result_type(float))
 
 
 class _ConcreteLeaf:

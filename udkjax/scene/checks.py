@@ -248,7 +248,7 @@ def _as_array(value: object) -> np.ndarray | None:
 
 def _check_references(path: str, kind: str | None, value: object, known: KnownNames) -> Iterator[str]:
     """Iterate over the mistakes in names of bodies and joints."""
-    if kind not in known:  # in a nested module, whose names need not exist in the scene
+    if kind is None or kind not in known:  # in a nested module, whose names need not exist in the scene
         return
     named = known[kind]
     single = isinstance(value, str)
