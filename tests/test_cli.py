@@ -132,7 +132,7 @@ def test_all_mistakes_of_a_scene_are_named_and_nothing_is_written(tmp_path, caps
         ([PARALLELOGRAM, "--t1", "1", "--dt0", "0"], "--dt0 0 must be positive"),
         ([PARALLELOGRAM, "--t1", "1", "--plot", "run.nc"], "same file"),
         ([PARALLELOGRAM, "--t1", "1", "--plot", "nowhere/run.png"], "no folder nowhere"),
-        ([PARALLELOGRAM, "--t1", "1", "--plot", "run.gif"], "--plot run.gif ends with none of .png, .svg, .pdf, .jpg"),
+        ([PARALLELOGRAM, "--t1", "1", "--plot", "run.gif"], "--plot run.gif must end with one of .png, .svg, .pdf, .jpg"),
     ],
 )
 def test_wrong_input_is_refused_by_name(tmp_path, monkeypatch, capsys, arguments, cause):
@@ -157,7 +157,7 @@ def test_a_file_of_no_known_kind_is_refused_before_anything_runs(tmp_path, monke
     monkeypatch.setattr("udkjax.load", lambda _: pytest.fail("it ran"))
     for name in ("run.xls", "run"):
         assert udkjax(*command, "--out", name) == 2
-        assert f"--out {name} ends with none of .nc, .h5, .csv, .npz" in capsys.readouterr().err
+        assert f"--out {name} must end with one of .nc, .h5, .csv, .npz" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -167,7 +167,7 @@ def test_a_file_of_no_known_kind_is_refused_before_anything_runs(tmp_path, monke
 def test_a_folder_is_not_called_as_a_file_is(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
     assert udkjax(*command, "--out", "out.csv") == 2
-    assert "--out out.csv: a folder is written" in capsys.readouterr().err
+    assert "--out out.csv: a folder with several files is written" in capsys.readouterr().err
 
 
 def test_a_run_is_written_in_the_kind_that_its_name_says(tmp_path, capsys):

@@ -45,7 +45,7 @@ def test_a_run_and_a_scene_side_by_side(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("{run}", "--out", "x.bmp"), "--out x.bmp ends with none of .html"),
+        (("{run}", "--out", "x.bmp"), "--out x.bmp must end with one of .html"),
         (("{run}", "--out", "no/where.html"), "there is no folder no"),
         (("{run}", "{run}", "--out", "x.html"), "different labels, not four_bar, four_bar"),
         (("{run}", "--labels", "a", "b", "--out", "x.html"), "2 --labels for 1 files"),
@@ -53,7 +53,7 @@ def test_a_run_and_a_scene_side_by_side(run, tmp_path):
         (("{sweep}", "--out", "x.html"), "has no q and no time"),
         (("{run}", "--measures", "heat", "--out", "{out}.html"), "measure 'heat' is unknown"),
         (("{run}", "--traces", "Z", "--out", "{out}.html"), "trace 'Z'"),
-        ((SCENE, "--t1", "0", "--out", "x.html"), "--t1 0 must be at least one --dt"),
+        ((SCENE, "--t1", "0", "--out", "x.html"), "and at most --t1 0"),
     ],
 )
 def test_wrong_input_is_refused(run, tmp_path, capsys, arguments, words):

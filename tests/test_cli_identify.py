@@ -42,7 +42,7 @@ def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, 
     out = tmp_path / "found"
     assert udkjax("identify", PENDULUM, data, "--parameters", MASS, INERTIA, "--ignore", "remark", "--out", out, "--quiet") == 1
     shown = capsys.readouterr()
-    assert shown.err == "udkjax: the measurements do not show every parameter\n"
+    assert shown.err == "udkjax: the measurements do not determine every parameter\n"
     for part in ("2 parameters from 62 numbers in 2 records", "unknown", "body.rod.mass and body.rod.inertia by a common factor"):
         assert part in shown.out
     assert {file.name for file in out.iterdir()} == FILES
@@ -58,7 +58,7 @@ def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
     arguments = ["identify", PENDULUM, data, "--parameters", MASS, "--parameters", INERTIA, "--ignore", "remark", *options]
     assert udkjax(*arguments, "--profile", INERTIA, "--out", out, "--json", "--quiet") == 0
     printed, shown = capsys.readouterr()
-    assert "every parameter is known" in shown and f"{INERTIA} is between" in shown
+    assert "the records determine every parameter" in shown and f"{INERTIA} is between" in shown
     assert {file.name for file in out.iterdir()} == {*FILES, "profiles.png"}
     found = json.loads((out / "estimate.json").read_text())
     assert {Path(file).name for file in json.loads(printed)["files"]} == {*FILES, "profiles.png"}
@@ -135,7 +135,7 @@ GOOD = {"--parameters": [MASS, INERTIA], "--out": ["found"], "--ignore": ["remar
     ("option", "values", "problem"),
     [
         ("--out", ["nowhere/found"], "there is no folder nowhere"),
-        ("--out", ["swings.csv"], "--out swings.csv is no folder"),
+        ("--out", ["swings.csv"], "--out swings.csv is not a folder"),
         ("--parameters", ["body.rod.mas"], 'no parameter "body.rod.mas"; did you mean "body.rod.mass"?'),
         ("--parameters", [], "--parameters: name at least one"),
         ("--ignore", ["nothing"], '"remark"'),
@@ -144,11 +144,11 @@ GOOD = {"--parameters": [MASS, INERTIA], "--out": ["found"], "--ignore": ["remar
         ("--bounds", [f"{MASS}=1,2,3"], f'--bounds "{MASS}=1,2,3": must be NAME=LOW,HIGH'),
         ("--prior", ["1,2"], '--prior "1,2": must be NAME=MEAN,DEVIATION'),
         ("--prior", ["body.rod.mas=1,2"], '"body.rod.mas" is not among --parameters; did you mean "body.rod.mass"?'),
-        ("--guess", [f"{MASS}=1", f"{MASS}=2"], f'--guess "{MASS}=2": is there twice'),
+        ("--guess", [f"{MASS}=1", f"{MASS}=2"], f'--guess "{MASS}=2": is given twice'),
         ("--guess", [f"{MASS}=heavy"], "must be NAME=VALUE"),
         ("--profile", ["body.rod.mas"], '"body.rod.mas": is not among --parameters; did you mean "body.rod.mass"?'),
         ("--noise", ["-1"], '--noise "-1": must be NUMBER or CHANNEL=NUMBER, in SI units, and positive'),
-        ("--noise", ["body.rod.omega=1"], '"body.rod.omega" is measured in no record'),
+        ("--noise", ["body.rod.omega=1"], '"body.rod.omega" is not measured in any record'),
         ("--n-starts", ["-1"], "--n-starts -1: must not be negative"),
         ("--tol", ["0"], "--tol 0: must be between 0 and 1"),
         ("--seed", ["-1"], "--seed -1: must not be negative"),
@@ -185,7 +185,7 @@ def test_all_mistakes_are_named_at_once(tmp_path, capsys, data):
     for part in ("6 mistakes", '"body.rod.mas"', '"loud"', "--tol 2", '"x=1,2"', '"remark"', "nowhere.csv"):
         assert part in shown
     assert udkjax("identify", PENDULUM, "--parameters", MASS, "--out", tmp_path / "o") == 2
-    assert "name a file of measurements" in capsys.readouterr().err
+    assert "give a file of measurements" in capsys.readouterr().err
     assert udkjax("identify", "nowhere.toml", data, "--parameters", MASS, "--out", tmp_path / "o") == 2
     assert "cannot read nowhere.toml" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -92,7 +92,7 @@ def test_a_scene_that_finds_no_rest_says_so(tmp_path, capsys):
     scene = tmp_path / "fall.toml"
     scene.write_text('format = 1\n[[body]]\nname = "stone"\nmass = 1.0\ninertia = 0.1\n')
     assert udkjax("statics", scene) == 1
-    assert "no position of rest was found" in capsys.readouterr().err
+    assert "no equilibrium was found" in capsys.readouterr().err
 
 
 def test_statics_and_modes_of_a_scene_without_a_degree_of_freedom(capsys):

@@ -60,17 +60,17 @@ def test_a_sweep_is_run_and_refused_where_it_is_another(tmp_path, grid, capsys):
 @pytest.mark.parametrize(
     ("change", "arguments", "problem"),
     [
-        ("", [], "--out FOLDER is missing"),
+        ("", [], "give --out FOLDER"),
         ("", ["--out", "nowhere/sweep"], "there is no folder nowhere"),
         ("", ["--out", "sweep", "--memory", "0"], "--memory 0: must be positive"),
-        ("", ["--out", "sweep", "--engine", "devices", "--scheduler", "tcp://x:1"], "--scheduler is for --engine dask"),
+        ("", ["--out", "sweep", "--engine", "devices", "--scheduler", "tcp://x:1"], "--scheduler needs --engine dask"),
         (
             "rod.inertia",
             ["--out", "sweep"],
-            '"body.rod.inertai" is no parameter of the mechanism, nor a setting; did you mean "body.rod.inertia"?',
+            '"body.rod.inertai" is neither a parameter of the mechanism nor a setting; did you mean "body.rod.inertia"?',
         ),
         ("max_steps", ["--out", "sweep"], 'settings.max_stpes: unknown key; did you mean "max_steps"?'),
-        ("violation", ["--out", "sweep"], '"voilation": there is none of this name; did you mean "violation"?'),
+        ("violation", ["--out", "sweep"], 'measure "voilation" does not exist; did you mean "violation"?'),
     ],
 )
 def test_wrong_input_is_refused_before_anything_is_run(tmp_path, monkeypatch, capsys, grid, change, arguments, problem):
@@ -93,7 +93,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys, grid):
     monkeypatch.setattr(udk, "sweep", interrupted)
     arguments = ("--out", tmp_path / "sweep", "--engine", "devices", "--memory", 1)
     assert udkjax("sweep", PENDULUM, grid, *arguments) == 130
-    assert "the same command goes on from there" in capsys.readouterr().err
+    assert "run the same command to continue" in capsys.readouterr().err
 
 
 @pytest.mark.slow

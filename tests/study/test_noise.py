@@ -47,8 +47,8 @@ def test_coloured_noise_is_noticed(kind):
     w = found[0]
     assert 0.3 < w.lag1 < 0.75
     text = w.text('"body.a.angle" in record "one"')
-    assert text.startswith('residuals of "body.a.angle" in record "one" are not noise: neighbours have the correlation 0.')
-    assert f"for {w.samples} samples" in text
+    assert text.startswith('residuals of "body.a.angle" in record "one" are not white noise: neighbours have a correlation of 0.')
+    assert f"{w.samples} samples" in text
 
 
 def test_the_correlation_of_neighbours():

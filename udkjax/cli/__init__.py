@@ -1,6 +1,6 @@
-"""The command line: `udkjax COMMAND`, each command a function in the module of its name.
+"""The command line: `udkjax COMMAND`, each command a function in the module of the same name.
 
-Only the standard library and tyro are imported before a command is known, so that help comes at once.
+Only the standard library and tyro are imported before a command runs, so that help is fast.
 """
 
 import gc
@@ -31,12 +31,12 @@ COMMANDS = (
     "doctor",
 )
 
-GARBAGE_EVERY = 50_000  # objects: most that a command makes are there to stay, and looking them through takes a tenth of a second
-PROGRAM_CACHE_BYTES = 200_000_000  # bytes of programs of JAX; those that were used longest ago make room
+GARBAGE_EVERY = 50_000  # objects: most of a command's objects live to its end, and scanning them takes a tenth of a second
+PROGRAM_CACHE_BYTES = 200_000_000  # limit of stored JAX programs; the least recently used are removed
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command; exit with one of the codes of `udkjax.cli.exits`."""
+    """Run one command, and exit with one of the codes of `udkjax.cli.exits`."""
     gc.set_threshold(GARBAGE_EVERY)
     if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
         print(f"udkjax {version('udkjax')}")
@@ -50,9 +50,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def store_compiled_programs() -> None:
-    """Let JAX store what it compiles beside the machine code: a command that is run again then compiles nothing.
+    """Make JAX store its compiled programs in the cache of machine code, so that a repeated command compiles nothing.
 
-    A folder that the environment names for JAX's programs stays, and JAX is left alone where it is imported already.
+    A folder named by the environment takes precedence, and nothing is changed if JAX is already imported.
     """
     from udkjax.native.base.code_cache import cache_folder
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from udkjax import Mechanism
     from udkjax.show.player.measure_curves import ShownMotion
 
-    ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # and further measures by name
+    ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # with further measures by name
 
 ANIMATION_SUFFIXES = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml")]
@@ -41,38 +41,38 @@ def animate(
     width: int | None = None,
     json: Json = False,
 ) -> None:
-    """Show a motion, or several side by side and in step, as a page to open in a browser, a film or a picture.
+    """Show one or several synchronized motions as a page for the browser, a film or a picture.
 
-    A run that failed is shown as far as it came, how it ended is said, and the exit code is 1.
+    A failed run is shown up to its end, with the cause, and the exit code is 1.
 
     Args:
-        files: runs that `udkjax simulate` wrote (NetCDF), or scenes (TOML, or MJCF), which are simulated.
-        out: file to write: .html, a page that needs no network; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
+        files: runs written by `udkjax simulate` (NetCDF), or scenes (TOML or MJCF) to simulate.
+        out: file to write: .html, a self-contained page; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
         t1: end of the run of a scene (s).
-        dt: time between two of its instants (s).
-        labels: of the runs, where there are several; by default the files' names.
-        measures: curves of a strip over time: violation, energy, rank, or a variable over time of the file.
+        dt: time between outputs of the run of a scene (s).
+        labels: names of the runs, if there are several; by default the files' names.
+        measures: curves over time: violation (of the constraints), energy, rank, or a variable of the file over time.
         reactions: draw the forces of the joints as arrows.
-        traces: joints or bodies whose paths are drawn; by default the pins that move.
-        live: a page with sliders that solves the motion anew, and whose bodies one can pull at; of every number of the scene, or
-            of those that are named (motor.crank.speed, pin.B).
-        theme: colours; by default, on a page, what the reader's system prefers, else light.
-        autoplay: a page moves at once.
+        traces: joints or bodies whose paths are drawn; by default the moving pins.
+        live: make a page that simulates, with bodies to drag and a slider for every number of the scene, or for those that are
+            named (motor.crank.speed, pin.B).
+        theme: colours; by default, on a page, the preference of the reader's system, otherwise light.
+        autoplay: start the motion when the page is opened.
         t: time of a pose (s); by default the start.
-        fps: frames of a film in one second.
-        speed: seconds of motion in one second of a film; by default what is comfortable to watch.
-        width: of a film or a picture (px).
+        fps: frames per second of a film.
+        speed: seconds of motion per second of a film; by default a comfortable speed.
+        width: width of a film or a picture (px).
     """
     check_target(out, ANIMATION_SUFFIXES)
     kind = out.suffix.lower()
     if not files:
         refuse("give a run (.nc) or a scene (.toml)")
     if not 0 < dt <= t1 < math.inf:
-        refuse(f"--t1 {t1:g} must be at least one --dt {dt:g}, which must be positive")
+        refuse(f"--dt {dt:g} must be positive, and at most --t1 {t1:g}")
     if labels and len(labels) != len(files):
         refuse(f"{len(labels)} --labels for {len(files)} files")
     if live is not None and kind != ".html":
-        refuse(f"--live makes a page that simulates: --out must be a .html, not {out.name}")
+        refuse(f"--live makes a page that simulates: --out must be a .html file, not {out.name}")
     names = list(labels or (file.stem if len(files) > 1 else "" for file in files))
     if len(set(names)) < len(names):
         refuse(f"runs must have different labels, not {', '.join(names)}: give --labels")
@@ -86,7 +86,7 @@ def animate(
     look = {"theme": theme} if kind != ".dxf" else {}
     options = {name: value for name, value in (film | page | look).items() if value is not None}
     try:
-        with warnings.catch_warnings(action="ignore", category=FailedRunWarning):  # said below
+        with warnings.catch_warnings(action="ignore", category=FailedRunWarning):  # reported below
             found = udk.animate(
                 {name: mechanism for name, (mechanism, _, _) in runs.items()},
                 {name: run for name, (_, run, _) in runs.items()},
@@ -107,7 +107,7 @@ def animate(
 
 
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":
-    """Return the mechanism of a file, its run, and further measures."""
+    """Return the mechanism of a file, its run, and the file's further measures."""
     if file.suffix.lower() in (".toml", ".xml"):
         mechanism, _ = load(file)
 
@@ -126,7 +126,7 @@ def _run(file: Path, t1: float, dt: float) -> "ShownRun":
 
 
 def _measures(wanted: tuple[str, ...], runs: dict[str, "ShownRun"]) -> "dict[str, dict[str, np.ndarray] | None]":
-    """Return the measures by name: those that are computed as None, and variables of the files' own for each run."""
+    """Return the measures by name: None for those to be computed, and the values in each run's file for others."""
     found: dict[str, dict[str, np.ndarray] | None] = {}
     for name in wanted:
         own = {

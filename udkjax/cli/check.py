@@ -6,7 +6,7 @@ from udkjax.cli.common import BAD_RUN, Json, Scene, load, show
 
 
 def check(scene: Scene, /, json: Json = False) -> None:
-    """Count what a scene is made of, name its redundant constraints, and try to close it; exit with 1 if it stays open.
+    """Summarize a scene, name its redundant constraints, and close its loops; exit with 1 if they cannot be closed.
 
     Args:
         scene: the mechanism.

@@ -1,4 +1,4 @@
-"""Parts of all commands: options that are spelled alike, reading a scene, and showing results.
+"""Parts shared by all commands: common options, reading a scene, and showing results.
 
 A command is a function of its options that imports what it needs when it runs:
 
@@ -7,7 +7,7 @@ A command is a function of its options that imports what it needs when it runs:
 
         Args:
             scene: the mechanism.
-            count: how many.
+            count: number of frequencies.
         '''
         mech, _ = load(scene)
         from udkjax.show.summary import table
@@ -16,8 +16,8 @@ A command is a function of its options that imports what it needs when it runs:
         found = compute(mech)
         show({"frequencies": found.frequencies}, table(mech.name, {...}), json)
 
-Wrong input ends with `refuse("--count 0: must be positive")`, a run that failed with `fail(...)` after `show(...)`. Errors that
-udkjax raises by itself (`SceneError`, `SimulationError`, ...) need no handling: see `exits.exit_codes`.
+Wrong input ends with `refuse("--count 0: must be positive")`, a failed run with `fail(...)` after `show(...)`. Exceptions of
+udkjax (`SceneError`, `SimulationError`, ...) need no handling: see `exits.exit_codes`.
 """
 
 import json as json_text
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from udkjax import Mechanism
     from udkjax.positions.channels import Channel, StateHistory
 
-    Columns = dict[str, tuple[np.ndarray, str]]  # values over time and their unit, by name
+    Columns = dict[str, tuple[np.ndarray, str]]  # by name: values over time, and their unit
 
 __all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene"]
 __all__ += ["channels_of", "choose_driver", "fail", "load", "measure_channels", "output_times", "refuse", "say", "show"]
@@ -48,23 +48,23 @@ __all__ += ["channels_of", "choose_driver", "fail", "load", "measure_channels", 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml")]
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="write the results as JSON.")]
 MOST_TIMES = 10**7  # output times of a command: some gigabytes for a few bodies
-Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not show how far it is.")]
+Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not show progress.")]
 
 
 def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[str] | None) -> None:
-    """Run the command that the arguments (default: those of the process) name, with their options."""
+    """Parse arguments (by default those of the process), and run the command that they name."""
     tyro.extras.subcommand_cli_from_dict(
         dict(commands), prog="udkjax", args=arguments, description="Planar mechanisms, however redundantly constrained."
     )
 
 
 def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> tuple["Mechanism", str]:
-    """Read a scene and its text; the options are those of `read_mjcf`."""
+    """Read a scene and its text; for the options see `read_mjcf`."""
     import udkjax as udk
 
     try:
         with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)  # as is an `MjcfWarning`
+            warnings.simplefilter("always", UserWarning)  # including `MjcfWarning`
             mechanism = udk.read_mjcf(scene, leave_out, key) if leave_out or key is not None else udk.load(scene)
         for warning in caught:
             say(f"{scene}: {warning.message}")
@@ -74,23 +74,23 @@ def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> 
 
 
 def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":
-    """Return the times from t0 in steps of dt, t1 too, where it is one of them up to rounding; or refuse the options and exit."""
+    """Return the times from t0 in steps of dt, including t1 if it is one up to rounding; exit if the options are invalid."""
     if not 0 < dt <= t1 - t0 < math.inf:
-        refuse(f"from --t0 {t0:g} to --t1 {t1:g} there must be at least one --dt {dt:g}, which must be positive")
+        refuse(f"--dt {dt:g} must be positive, and at most the time from --t0 {t0:g} to --t1 {t1:g}")
     if (t1 - t0) / dt > MOST_TIMES:
-        refuse(f"--dt {dt:g} makes {(t1 - t0) / dt:.3g} output times; at most {MOST_TIMES:.0e} are written: make it longer")
+        refuse(f"--dt {dt:g} makes {(t1 - t0) / dt:.3g} output times, more than {MOST_TIMES:.0e}: give a larger --dt")
     import numpy as np
 
     return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)
 
 
 def show(results: Mapping[str, object], text: str, json: bool) -> None:
-    """Write the results of a command to stdout: as text, or as one JSON object, and the text then to stderr.
+    """Write the results of a command to stdout: as text, or as one JSON object, with the text on stderr.
 
     Args:
-        results: results by names that scripts can rely on; arrays become lists, numbers that are not finite become null.
+        results: results by stable names; arrays become lists, numbers that are not finite become null.
         text: the same for people.
-        json: whether JSON was asked for.
+        json: True for JSON.
     """
     if json:
         from udkjax.scene.wording import plain
@@ -105,7 +105,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
 
 
 def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
-    """Return the channels of these names, or say what is wrong with one and exit."""
+    """Return the channels with the given names; exit with a message if one is invalid."""
     from udkjax.positions.channels import channel_of
 
     found = []
@@ -118,7 +118,7 @@ def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
 
 
 def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Sequence[Channel]") -> "Columns":
-    """Return the values of channels over a motion."""
+    """Return the values of channels along a motion."""
     import numpy as np
 
     from udkjax.programs.deferred import deferred
@@ -131,11 +131,11 @@ def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Seque
 
 
 def choose_driver(mech: "Mechanism", given: str | None) -> str:
-    """Return the driver that is given, or the scene's only one."""
+    """Return the given driver, or the scene's only one; exit with a message if there are several or none."""
     if given is None and len(mech.driver_names) > 1:
-        refuse(f"--driver: the scene has {len(mech.driver_names)}; name one of {', '.join(mech.driver_names)}")
+        refuse(f"--driver: the scene has {len(mech.driver_names)} drivers; name one of {', '.join(mech.driver_names)}")
     if given is None and not mech.driver_names:
         from udkjax.positions.drive import suggested_coordinate
 
-        refuse(f"--driver: the scene has none; name a coordinate, such as {suggested_coordinate(mech)}")
+        refuse(f"--driver: the scene has no driver; name a coordinate, such as {suggested_coordinate(mech)}")
     return next(iter(mech.drivers)) if given is None else given

@@ -17,13 +17,15 @@ def convert(
     key: str | None = None,
     json: Json = False,
 ) -> None:
-    """Write a scene or an MJCF model to a file of the other kind, closed; refuse what the other kind cannot hold.
+    """Convert between scene files and MJCF models; refuse elements that the target format cannot represent.
+
+    Loops are closed first.
 
     Args:
         scene: a scene file, or an MJCF model.
         target: file to write: .toml, a scene file; .xml, an MJCF model.
-        leave_out: of an MJCF model, what may be passed over.
-        key: the keyframe of an MJCF model from which the initial state is taken.
+        leave_out: elements of an MJCF model that may be left out.
+        key: keyframe of an MJCF model that gives the initial state.
     """
     check_target(target, (".toml", ".xml"), "target")
     mechanism, _ = load(scene, leave_out, key)

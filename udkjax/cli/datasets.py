@@ -1,4 +1,4 @@
-"""Files of commands: arrays in the kind that the name ends with, with what a reader needs to trust them."""
+"""Files written by commands: arrays in the format given by the suffix, with the scene, settings and versions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,39 +13,39 @@ if TYPE_CHECKING:
 
     from udkjax import Mechanism
 
-DATASET_SUFFIXES = (".nc", ".h5", ".csv", ".npz")  # of datasets; .h5 is NetCDF too, which is HDF5 within
+DATASET_SUFFIXES = (".nc", ".h5", ".csv", ".npz")  # .h5 is also NetCDF, which is based on HDF5
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf", ".jpg")
-FILE_SUFFIXES = (*DATASET_SUFFIXES, *PICTURE_SUFFIXES, ".html", ".json", ".toml")  # suffixes that no folder has
+FILE_SUFFIXES = (*DATASET_SUFFIXES, *PICTURE_SUFFIXES, ".html", ".json", ".toml")  # not accepted for a folder
 
-# Names of columns of a .csv, like those of measurements: `body.crank.vx [m/s]`.
+# Names of the columns of a .csv, as in files of measurements: `body.crank.vx [m/s]`.
 COLUMN_NAMES = {"q": ("x", "y", "angle"), "v": ("vx", "vy", "omega"), "a": ("ax", "ay", "alpha")}
 
 
 def check_target(out: Path | None, kinds: Sequence[str] = DATASET_SUFFIXES, option: str = "--out") -> None:
-    """Refuse a file of no known kind, or one that has no folder."""
+    """Exit if the suffix of a file is unknown, or its folder does not exist."""
     if out is None:
         return
     if out.suffix.lower() not in kinds:
-        refuse(f"{option} {out} ends with none of {', '.join(kinds)}")
+        refuse(f"{option} {out} must end with one of {', '.join(kinds)}")
     if not out.parent.is_dir():
-        refuse(f"there is no folder {out.parent} to write {out.name} to")
+        refuse(f"cannot write {out.name}: there is no folder {out.parent}")
 
 
 def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tuple["Mechanism", str]:
-    """Return a scene and its text, once the files that are to be written from it can be."""
+    """Return a scene and its text; exit if the output files cannot be written."""
     check_target(out)
     check_target(plot, PICTURE_SUFFIXES, "--plot")
     return load(scene)
 
 
 def check_folder(out: Path) -> None:
-    """Refuse a folder that cannot be made, or that is called as a file is."""
+    """Exit if a folder cannot be created, or is named like a file."""
     if out.exists() and not out.is_dir():
-        refuse(f"--out {out} is no folder")
+        refuse(f"--out {out} is not a folder")
     if not out.exists() and out.suffix.lower() in FILE_SUFFIXES:
-        refuse(f"--out {out}: a folder is written, of several files; give a name without {out.suffix}")
+        refuse(f"--out {out}: a folder with several files is written; give a name without {out.suffix}")
     if not out.parent.is_dir():
-        refuse(f"there is no folder {out.parent} to make {out.name} in")
+        refuse(f"cannot create {out.name}: there is no folder {out.parent}")
 
 
 def write(
@@ -55,10 +55,7 @@ def write(
     coordinates: Mapping[str, "ArrayLike"],
     settings: Mapping[str, object],
 ) -> None:
-    """Write variables, each its dimensions, values and unit, to a file if there is to be one, with the scene and versions.
-
-    The coordinates of bodies are labelled where a variable lies along them.
-    """
+    """Write variables (dimensions, values, unit) with the scene, settings and versions to a file, unless `out` is None."""
     if out is None:
         return
     from udkjax.extras import OptionalImport
@@ -77,9 +74,9 @@ def write(
 
 
 def save(data: "xarray.Dataset", out: Path) -> None:
-    """Write a dataset in the kind that the name of the file ends with.
+    """Write a dataset in the format given by the suffix.
 
-    A .csv has the numbers alone, one row for each place along the first dimension; all others have the attributes, too.
+    A .csv contains only the numbers, one row per entry of the first dimension; the other formats contain the attributes, too.
     """
     kind = out.suffix.lower()
     if kind == ".csv":
@@ -105,7 +102,7 @@ def save(data: "xarray.Dataset", out: Path) -> None:
 
 
 def _columns(data: "xarray.Dataset") -> "Iterator[tuple[str, np.ndarray]]":
-    """Iterate over the columns of a table, each its heading and its values along the first dimension."""
+    """Iterate over the columns of a table: headings, and values along the first dimension."""
     import numpy as np
 
     along = str(next(iter(data.data_vars.values())).dims[0])
@@ -119,7 +116,7 @@ def _columns(data: "xarray.Dataset") -> "Iterator[tuple[str, np.ndarray]]":
         labels = [[str(x) for x in np.asarray(variable[dim])] if dim in data.coords else None for dim in others]
         units = str(variable.attrs.get("units", "")).split(", ", 2)
         for k, place in enumerate(np.ndindex(*(variable.sizes[dim] for dim in others))):
-            words = [str(i) if known is None else known[i] for known, i in zip(labels, place, strict=True)]
+            words = [str(i) if names is None else names[i] for names, i in zip(labels, place, strict=True)]
             if name in COLUMN_NAMES and others == ["body", "coordinate"]:
                 words = ["body", words[0], COLUMN_NAMES[str(name)][place[1]]]
             else:

@@ -22,16 +22,17 @@ def design(
     out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Find mechanisms that move as a goal says: a path, poses, or a function; exit with 1 where there is none.
+    """Find mechanisms for a prescribed path, poses, or function; exit with 1 if no mechanism is found.
 
-    With `complete = true` in the file all four-bars through nine places, or five poses, are found, whatever --starts and --seed.
+    The loss of a design is the weighted sum of squares of its residuals, the distances from the goal. With `complete = true` in
+    the file, all four-bars through nine points, or five poses, are found, and --starts and --seed are ignored.
 
     Args:
         goal: file with the mechanism, the goal and the limits.
         starts: number of random mechanisms to start from.
-        seed: of these; the same seed gives the same designs.
-        results: most designs to return.
-        out: folder for each design as a drawing (design1.toml) and as a page that moves (design1.html).
+        seed: seed of the random mechanisms; the same seed gives the same designs.
+        results: maximum number of designs to return.
+        out: folder for each design as a drawing (design1.toml) and as an animated page (design1.html).
     """
     for name, value, least in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
         if value < least:
@@ -51,11 +52,11 @@ def design(
         return
     found = search(starts, seed, results)
     mech = search.problem.mechanism
-    lines = {"starts": f"{starts}, of which {len(found.losses)} ended within the limits"}
+    lines = {"starts": f"{starts}; {len(found.losses)} ended within the limits"}
     for k, one in enumerate(found):
         lines[f"design {k + 1}"] = f"loss {one.loss:.8g}, largest residual {np.max(np.abs(one.residuals)):.3g}"
     if out is not None:
-        lines["written"] = _write(found, search.problem.goal, out)
+        lines["files in"] = _write(found, search.problem.goal, out)
     listed = [
         {
             "loss": one.loss,
@@ -73,11 +74,11 @@ def design(
         json,
     )
     if not len(found):
-        fail(f"nothing was found: {found.reason}")
+        fail(f"no mechanism was found: {found.reason}")
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
-    """Find all solutions of a file; show counts, and the first ones."""
+    """Find all solutions of a goal; show their numbers, and the first ones."""
     import udkjax as udk
     from udkjax.show.summary import table
 
@@ -89,13 +90,13 @@ def _show_all(file: Path, search: Any, results: int, out: Path | None, json: boo
         refuse(f"{file}: {problem}")
     chosen = [found[k] for k in range(min(results, len(found)))]
     lines = {"solutions": ", ".join(f"{count} {name}" for name, count in found.paths.items())}
-    lines["real, proven"] = f"{found.classes}, {found.unproven} more without a proof; {len(found)} four-bars"
+    lines["real solutions"] = f"{found.classes} proven, {found.unproven} unproven; {len(found)} four-bars"
     for name in dict.fromkeys(found.defects):
         lines[f"defect {name}"] = str(found.defects.count(name))
     for k, one in enumerate(chosen):
         lines[f"design {k + 1}"] = f"{one.kind}, defect {one.defect}, transmission {one.transmission:.3g}, class {one.number}"
     if out is not None:
-        lines["written"] = _write(chosen, search.goal, out)
+        lines["files in"] = _write(chosen, search.goal, out)
     names = (
         "kind",
         "turns",
@@ -115,11 +116,11 @@ def _show_all(file: Path, search: Any, results: int, out: Path | None, json: boo
     show({**counts, "designs": listed}, table(f"four-bars of {found.mechanism.name or 'a drawing'}", lines), json)
     if not len(found):
         beyond = f" within the limits; {found.left_out} are beyond them" if found.left_out else ""
-        fail(f"no real four-bar meets the goal exactly{beyond}: drop complete = true for the nearest")
+        fail(f"no real four-bar meets the goal exactly{beyond}: remove complete = true to find the nearest")
 
 
 def _write(found: Iterable[Any], goal: Any, out: Path) -> str:
-    """Write each design as a drawing and as a page that moves; return where."""
+    """Write each design as a drawing and as an animated page; return the folder."""
     import udkjax as udk
 
     out.mkdir(parents=True, exist_ok=True)

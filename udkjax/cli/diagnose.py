@@ -6,14 +6,16 @@ from udkjax.cli.common import Json, Scene, fail, load, output_times, show
 def diagnose(
     scene: Scene, /, t: float = 0.0, t1: float | None = None, dt: float = 0.05, fixes: bool = True, json: Json = False
 ) -> None:
-    """Say what depends on what in a scene and how to mend it, where it is singular, and when its rank changes along a run.
+    """Find redundant constraints and changes that remove them, singular configurations, and rank changes along a run.
+
+    The rank is the number of independent constraint equations; it drops in singular configurations, such as dead points.
 
     Args:
         scene: the mechanism.
         t: time of the configuration, for drivers (s).
-        t1: end of a run from `t` along which the rank is followed (s); by default none.
-        dt: time between two instants of the run (s); changes of the rank are located between them.
-        fixes: look for changes of joints that take redundancy away, and verify them.
+        t1: end of a run from `t` along which the rank is followed (s); by default there is no run.
+        dt: time between outputs of the run (s); rank changes are also found between outputs.
+        fixes: search for changes of joints that remove redundancy, and verify them.
     """
     ts = None if t1 is None else output_times(t, t1, dt)
     mech, _ = load(scene)

@@ -4,7 +4,7 @@ from udkjax.cli.common import Json, show
 
 
 def doctor(json: Json = False) -> None:
-    """Tell versions, devices, precision and which engine is used and why, ready to paste into a bug report."""
+    """Print versions, devices, precision, and the engine in use with the reason, to paste into a bug report."""
     from udkjax.show.doctor import facts, summary
 
     found = facts()

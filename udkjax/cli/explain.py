@@ -6,11 +6,11 @@ from udkjax.cli.common import Json, Scene, load, refuse, show
 
 
 def explain(scene: Scene, /, t: float = 0.0, json: Json = False) -> None:
-    """Derive the accelerations and multipliers of one state with the paper's symbols and numbers, and check them.
+    """Derive the accelerations and multipliers of one state, in the paper's symbols and with numbers, and check them.
 
     Args:
         scene: the mechanism.
-        t: time of the state along the motion from the scene's start (s).
+        t: time of the state, reached by a simulation from the scene's initial state (s).
         json: write all arrays as JSON.
     """
     if not 0 <= t < math.inf:

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from udkjax import Estimate
     from udkjax.study.identify.profile_likelihood import ProfileLikelihood
 
-# The names of udkjax.study.identify, which cannot be imported before a command is known: it imports JAX.
+# The names in udkjax.study.identify, which cannot be imported here, since it imports JAX.
 Loss = Literal["least_squares", "huber", "soft_l1"]
 Estimated = Literal["nothing", "position", "velocity", "both"]
 
-Several = tuple[tuple[str, ...], ...]  # of an option that may be given again
+Several = tuple[tuple[str, ...], ...]  # values of an option that may be repeated
 Data = Annotated[
     tuple[Path, ...],
     tyro.conf.Positional,
@@ -51,31 +51,31 @@ def identify(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Find numbers of a scene from measured motion: values, standard errors, and what the measurements do not show.
+    """Identify parameters of a scene from measured motion: values, standard errors, and parameters that are undetermined.
 
     Columns of the data are `time` and channels, such as `body.crank.angle [deg]`, `body.rod(0.5, 0).x [mm]`, `joint.A.fx` or
-    `driver.motor.load`; empty cells are gaps, a column `record` tells runs apart, and each file is a run of its own.
+    `driver.motor.load`. Empty cells are gaps. Each file is a separate run, or several, named by a column `record`.
 
-    The folder gets the scene with the values in (identified.toml), the figures (estimate.json, estimate.csv), what was measured
-    and what the mechanism shows (fit.nc), and pictures. The exit code is 1 where the fit does not settle or the measurements do
-    not show every parameter, which is named; all is written all the same.
+    The folder gets the scene with the identified values (identified.toml), the results (estimate.json, estimate.csv), the
+    measurements and predictions (fit.nc), and pictures. The exit code is 1 if the fit does not converge or the measurements do
+    not determine every parameter; the files are written even then.
 
     Args:
         scene: the mechanism, with first guesses.
         data: measurements, in .csv or .nc files.
         parameters: `body.a.mass`, `length(a)`, a tie "length(a) = length(b)", a common factor "scale(body.a.mass, body.b.mass)".
         out: folder for the results.
-        noise: standard deviation, in SI units, of what was measured: of all channels, or of one; else it is estimated.
-        guess: a first guess other than the scene's value.
+        noise: standard deviation of the measurements, in SI units, for all channels or for one; by default it is estimated.
+        guess: first guess, instead of the scene's value.
         bounds: lower and upper bound of a parameter.
-        prior: prior knowledge of a parameter.
-        estimate_initial_state: parts of the initial state of each run to estimate, too.
-        ignore: columns of the data that are not to be read.
-        loss: huber and soft_l1 let single wrong numbers count less.
-        n_starts: most further first guesses to try.
+        prior: mean and standard deviation of prior knowledge of a parameter.
+        estimate_initial_state: parts of each run's initial state to estimate, too.
+        ignore: columns of the data to ignore.
+        loss: function of the residuals (predicted minus measured) to minimize; huber and soft_l1 give outliers less weight.
+        n_starts: maximum number of further first guesses to try.
         tol: tolerance of the integration.
-        seed: of the first guesses.
-        profile: parameters whose confidence intervals are to be found by profile likelihood, which needs no linear model.
+        seed: seed of the further first guesses.
+        profile: parameters for which to compute confidence intervals by profile likelihood, which assumes no linear model.
         json: write the results as JSON, as in estimate.json.
     """
     check_folder(out)
@@ -106,11 +106,11 @@ def identify(
     lines = [str(estimate), *(found.text for found in profiles), f"wrote {', '.join(files)} to {out}"]
     show(results | {"files": [out / name for name in files]}, "\n".join(lines), json)
     if not estimate.success:
-        fail("the fit has not settled" if not estimate.converged else "the measurements do not show every parameter")
+        fail("the fit has not converged" if not estimate.converged else "the measurements do not determine every parameter")
 
 
 def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], results: Mapping[str, object], out: Path) -> list[str]:
-    """Write everything, and return the names of the files."""
+    """Write all files, and return their names."""
     import csv
     import json
 

@@ -1,4 +1,4 @@
-"""Options of `udkjax identify` as parameters and records: everything that is wrong with them is listed at once."""
+"""Options of `udkjax identify` as parameters and records; all mistakes are reported together."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,9 +17,9 @@ Found = TypeVar("Found")
 
 
 class IdentifyOptions:
-    """Parameters by name, with texts such as NAME=VALUE for the arguments of `Parameter` that `options` names.
+    """Parameters by name, with texts such as NAME=VALUE for the arguments of `Parameter` named by the keys of `options`.
 
-    Every mistake becomes one of `problems`.
+    Mistakes are collected in `problems`.
     """
 
     def __init__(self, mechanism: Mechanism, parameters: Groups, options: Mapping[str, Groups]):
@@ -35,7 +35,7 @@ class IdentifyOptions:
             self.problems.append("--parameters: name at least one, such as body.link1.mass")
 
     def check(self, settings: Mapping[str, Any]) -> None:
-        """Check that there are such parameters, and that settings make sense."""
+        """Check that the parameters exist, and that the settings are valid."""
         if self.parameters:
             self.names = self._try(lambda: unknowns_of(self.mechanism, self.parameters).names, ())
         if settings["n_starts"] < 0:
@@ -46,9 +46,9 @@ class IdentifyOptions:
             self.problems.append(f"--seed {settings['seed']}: must not be negative")
 
     def records(self, data: Sequence[Path], noise: Groups, ignore: Groups, start: Estimated) -> list[Record]:
-        """Read the data."""
+        """Read the data files into records."""
         if not data:
-            self.problems.append("name a file of measurements, .csv or .nc, after the scene")
+            self.problems.append("give a file of measurements (.csv or .nc) after the scene")
             return []
         everywhere, by_channel = self._noise(noise)
         left_out = [name for group in ignore for name in group]
@@ -57,19 +57,19 @@ class IdentifyOptions:
         return [record.changed(initial_state=Start(estimate=start)) for record in found]
 
     def profiled(self, groups: Groups) -> list[str]:
-        """Return the names of parameters, as the estimate has them, that are called by all of their names or one of them."""
-        known = {_plain(part): name for name in self.names for part in (name, *name.split("="))}
+        """Return the names in the estimate of parameters given by their full name, or by one of several tied names."""
+        full_names = {_plain(part): name for name in self.names for part in (name, *name.split("="))}
         given = [text for group in groups for text in group]
         if self.names:
             self.problems += [
                 f"--profile {quote(text)}: is not among --parameters{suggestion(text, self.names)}"
                 for text in given
-                if _plain(text) not in known
+                if _plain(text) not in full_names
             ]
-        return list(dict.fromkeys(known[_plain(text)] for text in given if _plain(text) in known))
+        return list(dict.fromkeys(full_names[_plain(text)] for text in given if _plain(text) in full_names))
 
     def _noise(self, groups: Groups) -> tuple[float | None, dict[str, float]]:
-        """Return the standard deviation of all channels, and of those that have one of their own."""
+        """Return the standard deviation of all channels, and those of single channels."""
         everywhere, by_channel = None, {}
         for text in (text for group in groups for text in group):
             channel, _, number = text.rpartition("=")
@@ -77,7 +77,7 @@ class IdentifyOptions:
             if sigma is None or not sigma[0] > 0:
                 self.problems.append(f"--noise {quote(text)}: must be NUMBER or CHANNEL=NUMBER, in SI units, and positive")
             elif channel.strip() in by_channel or (not channel and everywhere is not None):
-                self.problems.append(f"--noise {quote(text)}: is there twice")
+                self.problems.append(f"--noise {quote(text)}: is given twice")
             elif channel:
                 by_channel[channel.strip()] = sigma[0]
             else:
@@ -85,7 +85,7 @@ class IdentifyOptions:
         return everywhere, by_channel
 
     def _add(self, given: dict[str, dict[str, Any]], option: str, text: str) -> None:
-        """Note what is given of a parameter, which may be called by any of the names that are tied in it."""
+        """Add an option of a parameter, given by its full name or by any of several tied names."""
         place = f"--{option} {quote(text)}"
         name, _, numbers = text.rpartition("=")
         of = {_plain(part): whole for whole in given for part in (whole, *whole.split("="))}.get(_plain(name))
@@ -97,7 +97,7 @@ class IdentifyOptions:
             near = suggestion(name.strip(), [part.strip() for whole in given for part in (whole, *whole.split("="))])
             self.problems.append(f"{place}: {quote(name.strip())} is not among --parameters{near}")
         elif option in given[of]:
-            self.problems.append(f"{place}: is there twice for {quote(of)}")
+            self.problems.append(f"{place}: is given twice for {quote(of)}")
         elif option == "bounds" and not values[0] < values[1]:
             self.problems.append(f"{place}: the lower bound must be below the upper one")
         else:
@@ -112,7 +112,7 @@ class IdentifyOptions:
 
 
 def _numbers(text: str, count: int) -> list[float] | None:
-    """So many finite numbers, separated by commas; None: it is something else."""
+    """Parse `count` comma-separated finite numbers; None if the text is anything else."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:

@@ -19,13 +19,13 @@ def inverse(
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Find the torques and forces that the motion of a scene's drivers takes; exit with 1 where the motion is not possible.
+    """Find the efforts (torques or forces) that drivers need for their prescribed motion; exit with 1 if it is not possible.
 
     Args:
         scene: the mechanism, with the drivers that prescribe its motion.
-        t1: end (s).
-        t0: start (s).
-        dt: time between two instants (s).
+        t1: end of the motion (s).
+        t0: start of the motion (s).
+        dt: time between outputs (s).
         drivers: drivers or coordinates that exert efforts, such as body.crank.angle; by default the scene's drivers.
         out: file to write (.nc, .h5, .csv or .npz): effort and power (time, driver).
         plot: picture to write (.png, .svg, .pdf or .jpg): efforts and powers over time.
@@ -65,5 +65,5 @@ def inverse(
         k = int(np.argmin(determined))
         became = udk.Reached(int(found.motion.status[k])) if found.motion is not None else udk.Reached.closed
         if became in (udk.Reached.closed, udk.Reached.singular, udk.Reached.not_determined):
-            fail(f"at {ts[k]:g} s what the drivers exert is not determined: the position is singular")
-        fail(f"the drivers' motion ends at {ts[k]:g} s: {became.label}")
+            fail(f"at {ts[k]:g} s the efforts are not determined: the position is singular")
+        fail(f"the prescribed motion ends at {ts[k]:g} s: {became.label}")

@@ -31,16 +31,20 @@ def kinematics(
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Drive a scene through its positions: limits of travel, positions, velocities and accelerations; exit with 1 if it stops.
+    """Drive a scene through a range of positions: limits of travel, positions, velocities and accelerations.
+
+    The limits of travel are toggle positions (dead points), where the driver can move no further. The exit code is 1 if a value
+    cannot be reached.
 
     Args:
         scene: the mechanism.
         driver: a driver of the scene, by default its only one; or a coordinate: body.crank.angle, joint.B.angle, pin.C.x.
-        first: first value (rad, m); by default the lower limit of travel, or where it starts if there is none.
-        last: last value; by default the upper limit, or one turn after the first.
+        first: first value (rad, m); by default the lower limit of travel, or the initial value if there is no limit.
+        last: last value; by default the upper limit of travel, or one turn after the first value.
         count: number of values.
-        rate: of the driver (rad/s, m/s), for velocities and accelerations; by default that of a motor at constant speed, else 1.
-        branches: find all ways to put it together for the first value, too.
+        rate: rate of the driver (rad/s, m/s), for velocities and accelerations; by default that of a motor at constant speed,
+            or 1.
+        branches: also find all assembly modes (branches) at the first value.
         channels: further channels to write, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
         plot: picture to write (.png, .svg, .pdf or .jpg): poses and angles, or the channels.
@@ -69,14 +73,14 @@ def kinematics(
         math.isinf(float(travel.lower)) and math.isinf(float(travel.upper)) and udk.Reached.lost not in np.asarray(travel.status)
     )
     lines = {
-        "travel": "no limits" if free else f"{_end(travel, 0)} to {_end(travel, 1)}",
+        "travel": "unlimited" if free else f"{_end(travel, 0)} to {_end(travel, 1)}",
         "reached": f"{reached} of {count} values from {_value(first, travel.unit)} to {_value(last, travel.unit)}",
     }
     if out is not None or plot is not None:
         lines["velocities"] = f"at {format_number(rate)} {travel.unit}/s of {driver}"
     if math.isfinite(float(found.limit)):
-        lines["toggle"] = f"{float(found.limit):.15g} {travel.unit}"
-    for name, words in (("singular", "singular at"), ("not_determined", "rates unknown at")):
+        lines["toggle at"] = f"{float(found.limit):.15g} {travel.unit}"
+    for name, words in (("singular", "singular at"), ("not_determined", "rates undetermined at")):
         if name in names:
             lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(found.values), names, strict=True) if n == name)
     if others is not None:
@@ -115,22 +119,22 @@ def kinematics(
     write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:
-        fail(f"{count - reached} values are not reached: {names[int(np.argmin(np.asarray(found.reached)))].replace('_', ' ')}")
+        fail(f"{count - reached} values cannot be reached: {names[int(np.argmin(np.asarray(found.reached)))].replace('_', ' ')}")
 
 
 def _end(travel: "Travel", side: int) -> str:
-    """Return an end of travel in words: its value; or that nothing ends it, or that the way there could not be followed."""
+    """Return an end of travel in words: its value, that there is no limit, or that it could not be found."""
     import numpy as np
 
     import udkjax as udk
 
     lost = np.asarray(travel.status)[side] == udk.Reached.lost
     value = float((travel.lower, travel.upper)[side])
-    return "an end that could not be found" if lost else "no limit" if math.isinf(value) else _value(value, travel.unit)
+    return "unknown (lost on the way)" if lost else "no limit" if math.isinf(value) else _value(value, travel.unit)
 
 
 def _value(x: float, unit: str) -> str:
-    """Return a value with its unit; of an angle in degrees, too."""
+    """Format a value with its unit; an angle in degrees, too."""
     from udkjax.printing import format_number
 
     degrees = f" ({format_number(math.degrees(x), scale=360.0)} deg)" if unit == "rad" else ""
@@ -138,7 +142,7 @@ def _value(x: float, unit: str) -> str:
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:
-    """Return the value given; else the limit, a little within; else another."""
+    """Return the given value if there is one, else the limit if it is finite, else another value."""
     if given is not None:
         return given
     return limit if math.isfinite(limit) else otherwise

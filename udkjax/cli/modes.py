@@ -7,14 +7,13 @@ from udkjax.cli.datasets import load_to_write, write
 
 
 def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None = None, json: Json = False) -> None:
-    """Find the frequencies, damping and mode shapes of a scene about its position of rest; exit with 1 where it has none.
+    """Find the frequencies, damping and mode shapes of small oscillations about an equilibrium; exit with 1 if there is none.
 
     Args:
-        scene: the mechanism; its drivers hold.
-        stable: about a stable position, downhill from the initial guess; otherwise about the nearest one.
+        scene: the mechanism; its drivers are held.
+        stable: find a stable equilibrium, at lower energy than the initial guess; otherwise the nearest one.
         t: time of drivers and loads (s).
-        out: file to write (.nc, .h5, .csv or .npz): omega2 (mode), shape (mode, body, coordinate), and the position q (body,
-            coordinate).
+        out: file to write (.nc, .h5, .csv or .npz): omega2 (mode), shape (mode, body, coordinate), and q of the equilibrium.
     """
     mech, text = load_to_write(scene, out)
     import numpy as np
@@ -41,4 +40,4 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
     write(out, text, variables, {"body": list(mech.body_names)}, {"t": t})
     show(results, f"{mech.name or 'mechanism'}, {found}", json)
     if not rest.balanced:
-        fail("it does not rest: no equilibrium was found near the initial guess")
+        fail("no equilibrium was found near the initial guess")

@@ -17,15 +17,15 @@ def reactions(
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Simulate a scene and find the forces at its pins, in ground axes; exit with 1 where the run fails.
+    """Simulate a scene and find the forces at its pins, in ground axes; exit with 1 if the run fails.
 
     Args:
         scene: the mechanism.
         t1: end of the run (s).
         t0: start of the run (s).
-        dt: time between two instants (s).
+        dt: time between outputs (s).
         out: file to write (.nc, .h5, .csv or .npz): fx, fy and torque (time) at each pin on each body.
-        plot: picture to write (.png, .svg, .pdf or .jpg): the size of the force at each pin over time.
+        plot: picture to write (.png, .svg, .pdf or .jpg): magnitude of the force at each pin over time.
     """
     ts = output_times(t0, t1, dt)
     mech, text = load_to_write(scene, out, plot)
@@ -39,7 +39,7 @@ def reactions(
     sol = udk.simulate(mech, ts, throw=False)
     found = {pin: {body: np.asarray(x) for body, x in at.items()} for pin, at in udk.pin_reactions(mech, sol).items()}
     if not found:
-        refuse("the scene has no joint that is at a point")
+        refuse("the scene has no pins")
     unique = unique_pin_forces(mech, sol)
     variables: dict[str, Any] = {}
     rows: list[tuple[str, ...]] = []
@@ -50,10 +50,10 @@ def reactions(
                 variables[f"pin.{pin}.{body}.{name}"] = (("time",), x[:, k], unit)
             force = np.hypot(x[:, 0], x[:, 1])
             top, size = int(np.nanargmax(force)) if np.isfinite(force).any() else 0, float(np.nanmax(force, initial=0.0))
-            known = unique[pin][body]
+            is_unique = unique[pin][body]
             cells = [format_number(value, scale=size) for value in (force[top], x[top, 0], x[top, 1])]
-            rows.append((pin, body, *cells, f"{ts[top]:g}", "" if known else "not unique: of least norm"))
-            peak = {"force": force[top], "fx": x[top, 0], "fy": x[top, 1], "time": ts[top], "unique": known}
+            rows.append((pin, body, *cells, f"{ts[top]:g}", "" if is_unique else "not unique: minimum-norm value"))
+            peak = {"force": force[top], "fx": x[top, 0], "fy": x[top, 1], "time": ts[top], "unique": is_unique}
             results.setdefault(pin, {})[body] = peak
     write(out, text, variables, {"time": ts}, {})
     if plot is not None:
@@ -64,9 +64,9 @@ def reactions(
     for cam, pressed in cam_forces(mech, sol).items():
         least = int(np.nanargmin(pressed)) if np.isfinite(pressed).any() else 0
         cams[cam] = {"least": pressed[least], "time": ts[least]}
-        pulls = "; it would have to pull: the follower leaves it" if pressed[least] < 0 else ""
-        remarks.append(f"  cam {cam} presses by {format_number(pressed[least], 'N')} at least, at {ts[least]:g} s{pulls}")
-    heads = "pin", "on", "largest force (N)", "fx (N)", "fy (N)", "at (s)", ""
+        lifts = "; where it is negative, the follower lifts off" if pressed[least] < 0 else ""
+        remarks.append(f"  smallest contact force of cam {cam}: {format_number(pressed[least], 'N')}, at {ts[least]:g} s{lifts}")
+    heads = "pin", "on body", "largest force (N)", "fx (N)", "fy (N)", "at (s)", ""
     show(
         {"result": sol.result, "peaks": results, "cams": cams},
         text_table(PrintedTable(f"{mech.name or 'mechanism'}, forces at its pins", rows, heads, remarks), len(rows)),

@@ -10,7 +10,7 @@ import tyro
 
 from udkjax.cli.common import Json, Quiet, refuse, show
 
-# Of each run, in the JSON.
+# Variables of each run in the JSON.
 VERDICT = (
     "group",
     "method",
@@ -35,17 +35,17 @@ def report(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Do the paper's study again, with what would have been better, and write a page about it (HTML) with its data (NetCDF).
+    """Repeat the paper's study with further methods, and write a report (HTML) and its data (NetCDF).
 
-    Five pseudoinverses, three tolerances, with and without Baumgarte's stabilization, on the paper's five-bar parallelogram, each
-    run compared with the exact solution.
+    It compares five pseudoinverses at three tolerances, with and without Baumgarte's stabilization, on the paper's five-bar
+    parallelogram, with the exact solution.
 
     Args:
-        out: page to write (.html), or folder for report.html; the data goes beside it.
-        quick: cut the stiff runs short and compare fewer integrators: half a minute on two cores.
+        out: page to write (.html), or folder for report.html; the data is written to the same folder.
+        quick: shorten the stiff runs and compare fewer integrators: half a minute on two cores.
         start: angle of the links (degrees) from which they are released at rest.
-        seed: of the starts that differ by rounding errors.
-        from_file: draw the page from this file instead of running anything.
+        seed: seed of initial states that differ by rounding errors.
+        from_file: file of an earlier report: only draw the page from it, without running anything.
     """
     target = out if out.suffix == ".html" else out / "report.html"
     if seed < 0:
@@ -54,9 +54,9 @@ def report(
         refuse(f"--out {out} is neither a page (.html) nor a folder")
     folder = target.parent if out.suffix else out.parent
     if not folder.is_dir():
-        refuse(f"there is no folder {folder} to write {out.name} to")
+        refuse(f"cannot write {out.name}: there is no folder {folder}")
     if not -180 < start < 0 or start == -90:
-        refuse(f"--start {start:g}: between -180 and 0 degrees the links swing without becoming collinear; at -90 they hang")
+        refuse(f"--start {start:g} must be between -180 and 0 degrees, so that the links never become collinear, and not -90")
 
     from udkjax.progress import report_progress
 
@@ -68,8 +68,8 @@ def report(
             refuse(f"cannot read {from_file}: {problem}")
     else:
         with report_progress(False if quiet else None, 1.0, "report") as report_part:
-            tell = lambda what, part: report_part(part, what)  # noqa: E731
-            data = study.study(cases.QUICK if quick else cases.FULL, start, seed, tell=tell)
+            progress = lambda message, part: report_part(part, message)  # noqa: E731
+            data = study.study(cases.QUICK if quick else cases.FULL, start, seed, tell=progress)
     target.parent.mkdir(exist_ok=True)
     files = [target]
     if not from_file:
@@ -81,11 +81,11 @@ def report(
 
 
 def _module(name: str) -> ModuleType:
-    """Import a module of the study: of the installed package, or of a clone."""
+    """Import a module of the study from the installed package, or from a clone."""
     package = "udkjax.paper" if find_spec("udkjax.paper") else "experiments.paper"
     try:
         return import_module(f"{package}.{name}")
     except ModuleNotFoundError as error:
         if error.name in ("experiments", "experiments.paper"):
-            refuse("the paper's study is neither installed nor in this folder: run from a clone, or install the wheel")
+            refuse("the paper's study is neither installed nor in this folder: run udkjax from a clone, or install the wheel")
         raise

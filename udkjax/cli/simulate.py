@@ -12,7 +12,7 @@ from udkjax.cli.common import Json, Scene, channels_of, fail, load, measure_chan
 from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, save
 from udkjax.extras import require
 
-# The names of udkjax.study.choices, which cannot be imported before a command is known: it imports JAX.
+# The names in udkjax.study.choices, which cannot be imported here, since it imports JAX.
 Method = Literal["auto", "elimination", "svd", "varga", "greville", "householder", "gram-schmidt"]
 Formulation = Literal["udwadia-kalaba", "augmented", "null-space-qr", "null-space-svd", "partitioning"]
 Solver = Literal["dopri8", "dopri5", "tsit5", "bosh3", "heun", "kvaerno5", "verner65", "adams", "bdf"]
@@ -41,28 +41,28 @@ def simulate(
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Simulate a scene: write its motion and a picture of it, and say how far both can be trusted.
+    """Simulate a scene; write its motion and a picture, and report the accuracy of the run.
 
     Args:
         scene: the mechanism.
         t1: end of the run (s).
-        out: file to write. NetCDF (.nc, or .h5) has time, q and v (time, body, coordinate), settings, statistics and the scene
-            itself, and so has .npz of NumPy; .csv has the time and a column for each coordinate and its rate.
-        dt: time between two instants that are kept (s); the steps of the solver are its own.
+        out: file to write. NetCDF (.nc or .h5) and NumPy files (.npz) contain time, q and v (time, body, coordinate), settings,
+            statistics and the scene itself; .csv contains the time and a column for each coordinate and its rate.
+        dt: time between outputs (s); the solver chooses its steps independently.
         t0: start of the run (s).
         rtol: relative tolerance of a step.
-        atol: tolerance of a step beside it, in the scene's own length and time, which `udkjax check` prints.
+        atol: absolute tolerance of a step, in units of the scene's characteristic length and time (printed by `udkjax check`).
         method: pseudoinverse of the weighted constraint Jacobian.
-        rank_tol: threshold of the rank; by default, one that suits the method.
+        rank_tol: relative threshold of the rank; by default, one that suits the method.
         formulation: formulation of the accelerations; partitioning integrates independent coordinates only, without Baumgarte.
-        solver: integrator, by its name in diffrax or, verner65, adams and bdf, here.
-        stabilization: way to keep the constraints: a projection of each step, Baumgarte's terms, or nothing.
+        solver: integrator; verner65, adams and bdf are udkjax's own, the others diffrax's.
+        stabilization: projection of each step on the constraints, Baumgarte's terms, or none.
         alpha: Baumgarte's gain on the rate of the constraints (1/s).
         beta: Baumgarte's gain on the constraints (1/s).
-        dt0: first step to try (s); by default it is chosen.
-        max_steps: give up after so many steps.
-        channels: further channels to write, such as pin.C.x, joint.A.fx or driver.motor.load; they have a picture of their own.
-        plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png beside the file.
+        dt0: first step to try (s); by default it is estimated.
+        max_steps: maximum number of steps, after which the run fails.
+        channels: further channels to write, such as pin.C.x, joint.A.fx or driver.motor.load, with a picture of their own.
+        plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png with the name of the file.
     """
     ts = output_times(t0, t1, dt)
     check_target(out)
@@ -70,7 +70,7 @@ def simulate(
     if dt0 is not None and not 0 < dt0 < math.inf:
         refuse(f"the first step --dt0 {dt0:g} must be positive")
     if formulation == "partitioning" and stabilization == "baumgarte":
-        refuse("--formulation partitioning keeps the constraints itself: take --stabilization projection or none")
+        refuse("--formulation partitioning keeps the constraints itself: use --stabilization projection or none")
     if plot == out:
         refuse(f"--out {out} and --plot {plot} are the same file")
     check_target(plot, PICTURE_SUFFIXES, "--plot")
@@ -104,7 +104,7 @@ def simulate(
     with _stopwatch() as seconds, warnings.catch_warnings():
         warnings.simplefilter("ignore", AssemblyWarning)  # the summary reports it
         sol = udk.simulate(mech, ts, **choices)
-        np.asarray(sol.q)  # JAX runs ahead: wait for it
+        np.asarray(sol.q)  # wait for JAX, which runs asynchronously
 
     data = sol.to_xarray(mech)
     data.attrs |= {"scene": text, "scene_file": scene.name}
@@ -136,7 +136,7 @@ def simulate(
 
 @contextmanager
 def _stopwatch() -> Iterator[dict[str, float]]:
-    """Measure wall time (s), and how much of it went into tracing and compiling."""
+    """Measure the wall time (s), and the part of it spent on tracing and compiling."""
     import jax
 
     seconds, spans = {"all": 0.0, "compiling": 0.0}, []
@@ -144,7 +144,7 @@ def _stopwatch() -> Iterator[dict[str, float]]:
     def listen(event: str, duration_secs: float, **_: object) -> None:
         if event.startswith("/jax/core/compile/"):
             end = time.perf_counter()
-            while spans and spans[-1][0] > end - duration_secs:  # inner traces are parts of this one
+            while spans and spans[-1][0] > end - duration_secs:  # inner traces are included in this one
                 spans.pop()
             spans.append((end - duration_secs, end))
 

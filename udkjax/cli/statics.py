@@ -16,16 +16,16 @@ def statics(
     out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Find where a scene rests, whether it is stable there, and the forces there; exit with 1 where it rests nowhere.
+    """Find equilibria of a scene, their stability, and the forces in them; exit with 1 if none is found.
 
     Args:
-        scene: the mechanism; its drivers hold.
-        stable: go downhill to a stable position only.
-        starts: number of positions to search from; from more than one, all that are found are listed.
-        seed: of these positions.
+        scene: the mechanism; its drivers are held.
+        stable: find a stable equilibrium only, at lower energy than the initial guess.
+        starts: number of positions to search from; with more than one, all equilibria found are listed.
+        seed: seed of these positions.
         t: time of drivers and loads (s).
         out: file to write (.nc, .h5, .csv or .npz): q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier
-            (equilibrium, row), and the efforts of drivers and the forces at pins (equilibrium).
+            (equilibrium, row), and the holding torques and forces of drivers and the forces at pins (equilibrium).
     """
     if starts < 1:
         refuse(f"--starts {starts}: must be positive")
@@ -43,8 +43,8 @@ def statics(
         "bodies": mech.body_names,
         "equilibria": [
             {"q": e.q, "omega2": e.omega2, "stable": bool(e.stable), "multipliers": e.multipliers, "residual": e.residual}
-            | held._asdict()
-            for e, held in zip(found, forces, strict=True)
+            | own._asdict()
+            for e, own in zip(found, forces, strict=True)
         ],
     }
     if found:
@@ -56,16 +56,16 @@ def statics(
         for name in mech.driver_names:
             variables[f"effort.{name}"] = (
                 ("equilibrium",),
-                [held.efforts[name] for held in forces],
+                [one.efforts[name] for one in forces],
                 mech.drivers[name].effort_unit,
             )
         for pin, on in forces[0].forces.items():
             for body in on:
                 for k, (part, unit) in enumerate(LOADS.items()):
-                    values = [held.forces[pin][body][k] for held in forces]
+                    values = [one.forces[pin][body][k] for one in forces]
                     variables[f"pin.{pin}.{body}.{part}"] = (("equilibrium",), values, unit)
         write(out, text, variables, {"body": list(mech.body_names)}, {"t": t, "starts": starts})
-    words = (f"{mech.name or 'mechanism'}, {e}\n{force_lines(mech, held)}" for e, held in zip(found, forces, strict=True))
+    words = (f"{mech.name or 'mechanism'}, {e}\n{force_lines(mech, own)}" for e, own in zip(found, forces, strict=True))
     show(results, "\n".join(words), json)
     if not found:
-        fail("no position of rest was found near the initial guess; try --stable, or --starts 64")
+        fail("no equilibrium was found near the initial guess; try --stable, or --starts 64")

@@ -7,7 +7,7 @@ import tyro
 
 from udkjax.cli.common import Json, refuse, show
 
-MOST_PORT = 65535  # of TCP
+MOST_PORT = 65535
 
 
 def studio(
@@ -17,15 +17,15 @@ def studio(
     port: int = 0,
     json: Json = False,
 ) -> None:
-    """Draw mechanisms in the browser: a page that this machine serves to itself, until it is interrupted (Ctrl-C).
+    """Draw mechanisms in the browser, on a page that is served locally until you press Ctrl-C.
 
-    The address is printed. It holds a token without which nothing is answered, and only files in the folder of FILE, by default
-    the current one, are opened and saved.
+    The address is printed; it contains a token, without which all requests are refused. Only files in the folder of FILE, by
+    default the current one, can be opened and saved.
 
     Args:
-        file: drawing to open, or to make; or the folder to work in.
+        file: drawing to open or create; or the folder to work in.
         browser: open a browser.
-        port: port to listen at; by default one that is free.
+        port: port to listen on; by default a free one.
         json: print the address as JSON.
     """
     if not 0 <= port <= MOST_PORT:
@@ -35,7 +35,7 @@ def studio(
         refuse(f"there is no folder {folder}")
     opened = "" if file is None or file.is_dir() else file.name
     if opened and not opened.endswith(".toml"):
-        refuse(f"{file}: the studio opens drawings, which end in .toml")
+        refuse(f"{file}: must be a drawing (.toml)")
 
     from udkjax.studio.serving import serve
 

@@ -30,29 +30,29 @@ def sweep(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Simulate a scene with all combinations of some of its numbers, tolerances and methods, or with a design over their ranges.
+    """Simulate a scene for all combinations of values of numbers, tolerances and methods, or for samples from their ranges.
 
-    Finished members stay in the folder, whatever happens: the same command again goes on from there. At the end the folder
-    holds the dataset, sweep.nc, with the scene, settings and versions, and a picture of each number that was kept of a member.
-    Members that fail have a result that says how; examples/grids shows what a grid can be.
+    Each run is a member of the sweep. Finished members stay in the folder, even if the command is interrupted: run it again to
+    continue. At the end the folder contains the dataset (sweep.nc) with the scene, settings and versions, and a picture of each
+    stored number. The `result` of a member says how its run ended. For examples of grids, see examples/grids.
 
     Args:
         scene: the mechanism.
-        grid: file of the axes, and of what to keep of each member.
-        out: folder for the dataset, the pictures and what is finished so far.
-        engine: place to compute members: the devices of this machine, or as tasks of dask.distributed.
-        scheduler: address of a scheduler of dask, such as tcp://host:8786; without one, workers are processes of this machine.
-        memory: memory of the members that are computed at a time, at most (MiB).
-        dry_run: say how many members there are, and what they will take, from a sample; compute nothing else.
+        grid: file with the axes (the varied quantities) and the measures to store for each member.
+        out: folder for the dataset, the pictures and finished members.
+        engine: compute members on the devices of this machine, or as tasks of dask.distributed.
+        scheduler: address of a dask scheduler, such as tcp://host:8786; by default workers are started on this machine.
+        memory: limit of the memory of members in computation (MiB).
+        dry_run: only print the number of members, and their cost estimated from a sample.
     """
     if out is None and not dry_run:
-        refuse("--out FOLDER is missing (or --dry-run)")
+        refuse("give --out FOLDER, or --dry-run")
     if out is not None:
         check_folder(out)
     if not memory > 0:
         refuse(f"--memory {memory:g}: must be positive")
     if scheduler is not None and engine == "devices":
-        refuse("--scheduler is for --engine dask")
+        refuse("--scheduler needs --engine dask")
     mech, text = load(scene)
 
     from udkjax.study.sweep.dimensions import SweepError
@@ -75,7 +75,7 @@ def sweep(
     except SweepError as problem:
         refuse(f"{grid}: {problem}")
     except KeyboardInterrupt:
-        say(f"stopped; what is finished is in {out}, and the same command goes on from there")
+        say(f"stopped; finished members are in {out}: run the same command to continue")
         sys.exit(INTERRUPTED)
 
 

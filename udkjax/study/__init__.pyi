@@ -1,4 +1,4 @@
-"""The door of `study`: the names that floors above import, each from the module that it is in."""
+"""The names that floors above may import from `study`."""
 
 from udkjax.study.accuracy import Accuracy as Accuracy
 from udkjax.study.accuracy import accuracy as accuracy

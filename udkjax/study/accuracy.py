@@ -1,4 +1,4 @@
-"""Accuracy of a run, by its constraints, its energy and, where one is known, the exact solution."""
+"""Accuracy of a run: constraint violation, energy change and, for a parallelogram, the error against the exact solution."""
 
 from typing import NamedTuple
 
@@ -11,29 +11,29 @@ from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
 from udkjax.scene import GROUND, Mechanism, Revolute
 
-N_SAMPLES = 5  # times at which it is asked whether drivers move and potentials change
+N_SAMPLES = 5  # times at which drivers and potentials are checked for change
 
 
 class Accuracy(NamedTuple):
-    """Errors of a run, each the largest over all output times that it reached."""
+    """Errors of a run: maxima over the output times that it reached."""
 
     violation: float  # of any constraint, m or rad
     energy_change: float  # of the total energy since the start, J
     kinetic_energy: float  # J
-    error: float | None  # of any coordinate against the exact solution, m or rad; None where none is known
-    work: float | None  # of drivers, dampers, loads and impacts up to the end, J; None where there are none
-    length: float  # characteristic, m: unit of a violation
+    error: float | None  # of any coordinate against the exact solution, m or rad; None if no exact solution is known
+    work: float | None  # of drivers, dampers, loads and impacts up to the end, J; None if the mechanism conserves energy
+    length: float  # characteristic length, m
 
 
 def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
-    """Return measures of how far a run, or part of one that failed, can be trusted.
+    """Measure the accuracy of a run, or of the part that a failed run completed.
 
     Args:
         mechanism: mechanism that was simulated.
         solution: one run, no batch.
 
     Returns:
-        The largest violation, energies and error: see `Accuracy`.
+        An `Accuracy`: the largest violation, energies and error.
     """
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
@@ -52,11 +52,11 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 
 
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
-    """Return whether nothing but errors changes the total energy: no driver moves, and all forces have potentials at rest."""
-    from udkjax.integrate.events.conditions import frames_of  # and with it events, which other studies do without
+    """Return True if only errors change the total energy: drivers are at rest, and all forces have constant potentials."""
+    from udkjax.integrate.events.conditions import frames_of  # imports the code of events, which other studies do not need
 
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
-    ts = np.asarray(ts)  # of which JAX would compile a program to find the least
+    ts = np.asarray(ts)  # the minimum of a JAX array would compile a program
     times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
     for element in mechanism.forces.values():
         attached = [frames[name] for name in mechanism.frames_of(element)]
@@ -73,11 +73,11 @@ def largest_violation(violated: Float[ArrayLike, "T m"]) -> Float[np.ndarray, " 
 
 
 class Parallelogram(NamedTuple):
-    """A parallelogram linkage as it stands at the start, in ground axes.
+    """A parallelogram linkage in its initial configuration, in ground axes.
 
-    Links that are equal and parallel, pinned to the ground and to one coupler at the same spacing, turn as one; the coupler only
-    translates. With c_i the centre of mass of link i seen from its ground pivot, p the arm from there to the coupler's pin, and
-    R(theta) the turn since the start, the energies are
+    Equal and parallel links, pinned to the ground and to one coupler at the same spacing, rotate together; the coupler only
+    translates. With c_i the centre of mass of link i relative to its ground pivot, p the arm from the pivot to the coupler's pin,
+    and R(theta) the rotation since the start, the energies are
 
         T = J theta'^2 / 2,     J = sum(I_i + m_i |c_i|^2) + m_c |p|^2
         V = -g . R(theta) w,    w = sum(m_i c_i) + m_c p
@@ -86,7 +86,7 @@ class Parallelogram(NamedTuple):
     de Falco, Pennestri and Vita (2005), section 6, is one: 3.05 theta'' = -3.5 g cos(theta), theta the angle of its links.
     """
 
-    links: list[int]  # places in the order of the bodies
+    links: list[int]  # body indices
     coupler: int
     pivots: Float[np.ndarray, "links 2"]  # m
     centres: Float[np.ndarray, "links 2"]  # c_i, m
@@ -94,10 +94,10 @@ class Parallelogram(NamedTuple):
 
 
 def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[np.ndarray, "T bodies 3"] | None:
-    """Return the exact x, y (m) and angle (rad) of all bodies at the times `ts` (s), or None: this is no parallelogram.
+    """Return the exact x, y (m) and angle (rad) of all bodies at the times `ts` (s); None if this is not a parallelogram.
 
-    It starts at `ts[0]` from `q0`, `v0`, both (bodies, 3). Links count as equal and parallel within `tol` times their length,
-    since assembly closes the loops only to rounding.
+    The motion starts at `ts[0]` from `q0`, `v0`, both (bodies, 3). Links count as equal and parallel within `tol` times their
+    length, since assembly closes the loops only to rounding.
     """
     ts, q0, v0 = (np.asarray(array, float) for array in (ts, q0, v0))
     linkage = parallelogram(mech, q0, tol)
@@ -116,7 +116,7 @@ def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[n
 
 
 def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
-    """Return phi (rad) of a linkage as it stands, its angle from hanging, and omega (1/s) of its small oscillations."""
+    """Return phi (rad), the angle of a linkage from its hanging position, and omega (rad/s) of its small oscillations."""
     bodies, gravity = list(mech.bodies.values()), np.asarray(mech.gravity, float)
     masses = np.array([float(bodies[link].mass) for link in linkage.links])
     load, arm = float(bodies[linkage.coupler].mass), linkage.arm
@@ -128,10 +128,10 @@ def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
 
 
 def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, " T"]:
-    """Return by how much phi has turned (rad) at `ts`, where phi'' = -omega^2 sin(phi) starts from `angle` with `rate` (rad/s).
+    """Return the change of phi (rad) at `ts`, where phi'' = -omega^2 sin(phi) starts from `angle` with `rate` (rad/s).
 
-    Below the top it swings, sin(phi / 2) = k sn(omega t + u, k); above it turns over, phi / 2 = am(k omega t + u, 1 / k). The
-    first amplitude comes from atan2: asin would lose half of the digits at a release from rest.
+    Oscillation (k <= 1): sin(phi / 2) = k sn(omega t + u, k). Rotation (k > 1): phi / 2 = am(k omega t + u, 1 / k). The first
+    amplitude comes from atan2: asin would lose half of the digits at a release from rest.
     """
     from scipy.special import ellipj, ellipkinc  # importing SciPy takes longer than a run
 
@@ -151,7 +151,7 @@ def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, "
 
 
 def parallelogram(mech: Mechanism, q0, tol: float) -> Parallelogram | None:
-    """Recognize a parallelogram linkage that moves under gravity alone, in the configuration `q0`, (bodies, 3)."""
+    """Return the linkage in the configuration `q0`, (bodies, 3), if it is a parallelogram that moves under gravity alone."""
     if mech.drivers or mech.forces or not all(type(joint) is Revolute for joint in mech.joints.values()):
         return None
     pins = [dict(zip(joint.bodies, np.asarray(joint.points), strict=True)) for joint in mech.joints.values()]

@@ -1,4 +1,4 @@
-"""Values of channels along a motion, and paths of points: positions, rates, accelerations, reactions, functions of one's own."""
+"""Values of channels along a motion, and paths of points: positions, rates, accelerations, reactions, user-defined functions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ from udkjax.scene.mechanism import Mechanism
 
 
 def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Channel | Quantity]) -> Float[Array, "T C"]:
-    """Compute the values of channels at the output times of a solution; it may be traced and batched.
+    """Compute the values of channels at the output times of a solution, which may be traced and batched.
 
     Accelerations and reactions are those of the constraints without stabilization,
 
         lambda = -(D^+)^T D^+ b,    M a = F - Psi_q^T lambda,
 
-    of minimum norm where constraints are redundant, by singular values (`SVD`), whatever the method of the run: a batch would
-    compute both sides of a branch. They are only computed where a channel needs them.
+    of minimum norm where constraints are redundant, by `SVD` whatever the method of the run, since a batch would compute both
+    sides of a branch. They are computed only if a channel needs them.
 
     Args:
         mechanism: the mechanism that moved.
@@ -39,40 +39,39 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
         channels: channels to measure.
 
     Returns:
-        Values (T, C) in SI units, one channel a column. Where a state is not a number, after a run has failed, nor are its
-        values; where its velocities alone are none, at a toggle, positions, angles and distances are known. Derivatives are
-        zero where values are not numbers, and unharmed elsewhere.
+        Values (T, C) in SI units, one column per channel; NaN where the state is NaN, after a run has failed. At a toggle only
+        velocities are NaN: positions, angles and distances are finite. Derivatives of NaN values are zero.
     """
     motion, placed, reached = _fill(mechanism, solution)
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
     if not columns:
         return jnp.zeros((len(motion.q), 0))
-    known = [placed if isinstance(c, Channel) and c.quantity in POSITIONS else reached for c in channels]
-    return jnp.where(jnp.stack(known, -1), jnp.stack(columns, -1), jnp.nan)
+    valid = [placed if isinstance(c, Channel) and c.quantity in POSITIONS else reached for c in channels]
+    return jnp.where(jnp.stack(valid, -1), jnp.stack(columns, -1), jnp.nan)
 
 
 @checked
 def path(
     mechanism: Mechanism, solution: StateHistory, of: str, point: Numbers | None = None, derivative: Literal[0, 1, 2] = 0
 ) -> Float[Array, "T 2"]:
-    """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities, or accelerations.
+    """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities or accelerations.
 
     Pure, jittable, batched by `vmap`, and differentiable by every number of the mechanism, the point and the motion.
 
     Args:
         mechanism: the mechanism that moved.
         solution: a `Solution`, a `Kinematics`, or another motion with ts (T,), q and v (T, bodies, 3).
-        of: a body; or a pin, by the name of its joint or as it is drawn. Of a joint of two points it is that of its second body.
+        of: a body; or a pin, by the name of its joint or in the drawing. A joint with two points stands for its second body's.
         point: a point in the body's own frame (m); by default its centre of mass.
-        derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2): those that the motion has, as a
-            `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
+        derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2): the motion's own, if it has them
+            as a `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
 
     Returns:
-        x and y (T, 2) in ground axes; not a number where the motion is not. At a toggle positions are known, and no velocities.
+        x and y (T, 2) in ground axes; NaN where the motion is NaN. At a toggle only positions are finite.
 
     Raises:
-        ValueError: no such body or pin.
+        ValueError: the body or pin is unknown.
     """
     body, local = locate(mechanism, of, point)
     given = getattr(solution, "a", None)
@@ -90,21 +89,21 @@ def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
 def _fill(
     mechanism: Mechanism, solution: StateHistory | SimpleNamespace, analysis: Analysis | None = None
 ) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
-    """Return a motion with the scene's guess where it is not a number, so that all derivatives are.
+    """Return a motion with its NaN states replaced by the scene's guess, so that all derivatives are finite.
 
-    Where its positions are numbers, and where its velocities are so as well, comes with it.
+    Returned with it are masks of the times at which positions are finite, and at which velocities are finite, too.
     """
     placed = jnp.all(jnp.isfinite(solution.q), axis=(1, 2))
     reached = placed & jnp.all(jnp.isfinite(solution.v), axis=(1, 2))
     filled = ((placed, solution.q, mechanism.q0), (reached, solution.v, mechanism.v0))
-    q, v = (jnp.where(known[:, None, None], x, jax.lax.stop_gradient(x0)) for known, x, x0 in filled)
+    q, v = (jnp.where(valid[:, None, None], x, jax.lax.stop_gradient(x0)) for valid, x, x0 in filled)
     a = getattr(solution, "a", None)
     a = None if a is None else jnp.where(reached[:, None, None], a, 0.0)
     return _Motion(mechanism, solution.ts, q, v, a, analysis), placed, reached
 
 
-POSITIONS = ("x", "y", "angle", "distance")  # quantities that velocities do not matter to
-DERIVATIVE = {"": 0, "v": 1, "a": 2}  # of a position, by the letter before x or y
+POSITIONS = ("x", "y", "angle", "distance")  # quantities that do not depend on velocities
+DERIVATIVE = {"": 0, "v": 1, "a": 2}  # order of the derivative of a position, by the letter before x or y
 
 
 class _Dynamics(NamedTuple):
@@ -118,18 +117,18 @@ class _Dynamics(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """States at all output times, and what follows from them."""
+    """States at all output times, and quantities derived from them."""
 
     mechanism: Mechanism
     ts: Float[Array, "T"]
     q: Float[Array, "T bodies 3"]
     v: Float[Array, "T bodies 3"]
-    a: Float[Array, "T bodies 3"] | None  # where the motion has accelerations of its own
+    a: Float[Array, "T bodies 3"] | None  # the motion's own accelerations, if it has them
     analysis: Analysis | None
 
     @cached_property
     def dynamics(self) -> _Dynamics:
-        """Solve the equations of motion: only where a channel asks for it."""
+        """The solution of the equations of motion, computed only if a channel needs it."""
         equations: MechanismSystem = prepare(self.mechanism, SVD(), None, self.analysis)
         mass = jnp.stack([jnp.stack([body.mass, body.mass, body.inertia]) for body in self.mechanism.bodies.values()])
 
@@ -174,7 +173,7 @@ class _Motion:
         return Point(ax - alpha * arm.y - square * arm.x, ay + alpha * arm.x - square * arm.y)
 
     def load(self, owner: str, body: str) -> tuple[Array, Array, Array]:
-        """Return force and torque of a constraint on a body; on the ground: minus those on the others."""
+        """Return force and torque of a constraint on a body; on the ground, the opposite of those on the other bodies."""
         loads = self.loads[owner]
         if body != GROUND:
             fx, fy, torque = self._entries(loads, body)

@@ -1,4 +1,4 @@
-"""Choices of a run by the names that files and the command line have for them."""
+"""Methods, formulations, stabilizations and solvers by their names in files and on the command line."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -45,16 +45,17 @@ CHOICES = {"method": METHODS, "formulation": FORMULATIONS, "stabilization": STAB
 
 
 def choice(setting: str, given: str | Mapping[str, str | float]) -> Choice:
-    """Return the object of a name in a setting ("method": "svd"), or of a table of its `type` and its numbers.
+    """Return the object for a setting ("method") from its name ("svd"), or from a table of its `type` and arguments.
 
-    Raises ValueError, which says what there is.
+    Raises:
+        ValueError: the name or an argument is unknown; the message lists the valid ones.
     """
-    known = CHOICES[setting]
+    options = CHOICES[setting]
     table = given if isinstance(given, Mapping) else {"type": given}
     name, numbers = table.get("type"), {key: value for key, value in table.items() if key != "type"}
-    if not isinstance(name, str) or name not in known:
-        raise ValueError(f"no {setting} {abbreviate(name)}{suggestion(name, known) or '; one of ' + ', '.join(known)}")
-    make = known[name]
+    if not isinstance(name, str) or name not in options:
+        raise ValueError(f"no {setting} {abbreviate(name)}{suggestion(name, options) or '; one of ' + ', '.join(options)}")
+    make = options[name]
     expected = [] if setting == "solver" else list(inspect.signature(make).parameters)
     for key in numbers:
         if key not in expected:

@@ -1,4 +1,4 @@
-"""Differences of motions by their parameters, and how far off they are."""
+"""Finite differences of motions with respect to parameters, and their errors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,19 +9,19 @@ from jaxtyping import Float, Int
 STEP_RATIO = 4.0  # from one step of differences to the next
 DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # of dimensionless unknowns: 0.1 to 4e-7
 RICHARDSON = STEP_RATIO**2  # ratio of the errors, of second order, of one step and the next
-NEXT_STEPS = 2  # smaller steps whose truncation does not count beside that of one; two, since one may be near by chance
-LEAST_CHANGE = 1e-2  # of what is seen: a step that changes less is small, however large its prediction is
-TOO_LARGE = 0.5  # of a difference: where smaller steps say otherwise by more, a step is too large
+NEXT_STEPS = 2  # smaller steps whose truncation is negligible relative to that of one; two, since one may agree by chance
+LEAST_CHANGE = 1e-2  # relative to the observed size: a step that changes less is small, whatever the derivative predicts
+TOO_LARGE = 0.5  # relative to a difference: a step is too large if smaller steps disagree by more
 
 
 class Differences(NamedTuple):
-    """Differences R(h) at all steps but the last two, and their errors in each of S series; nan: not known."""
+    """Differences R(h) at all steps but the last two, and their errors in each of S series; NaN where unknown."""
 
     steps: Float[np.ndarray, "H"]
     values: Float[np.ndarray, "H R"]
     noise: Float[np.ndarray, "H S"]
     truncation: Float[np.ndarray, "H S"]
-    largest: Float[np.ndarray, "S"]  # size of what was seen
+    largest: Float[np.ndarray, "S"]  # largest root mean square of the values
 
 
 def differences(
@@ -30,24 +30,24 @@ def differences(
     series: Sequence[np.ndarray],
     steps: np.ndarray = DIFFERENCE_STEPS,
 ) -> Differences:
-    """Compute central differences, extrapolated to fourth order, and their errors, root mean squares over each of some series.
+    """Compute central differences, extrapolated to fourth order, and their errors as root mean squares over each series.
 
         D(h) = (y(h) - y(-h)) / 2h,      R(h) = (16 D(h/4) - D(h)) / 15
 
-    They are off by two errors, neither of which needs a derivative to compare with:
+    Two errors are estimated, without a derivative to compare with:
 
-        noise        |e(h) - e(-h)| / 2h, of what the integration leaves. Such errors e are not like rounding: where step control
-                     takes other steps they jump, and in between they move with the parameters, so that differences settle at
-                     ever smaller h, on a wrong value. So e is measured at each step, by the same run at another tolerance, not
-                     guessed from how rough y is (as by J. J. More and S. M. Wild, Estimating computational noise, 2011).
-        truncation   ~ h^4: by how much smaller steps say otherwise, beyond their own errors; where these hide it, what is
-                     expected from larger steps. Steps at which that is much of the whole are too large to tell anything.
+        noise        |e(h) - e(-h)| / 2h, from the integration error e. Unlike rounding, e jumps where the step controller takes
+                     other steps, and changes smoothly with the parameters in between, so that differences converge, as h
+                     decreases, to a wrong value. So e is measured at each step, by the same run at another tolerance, not
+                     estimated from the roughness of y (as by J. J. More and S. M. Wild, Estimating computational noise, 2011).
+        truncation   ~ h^4: the disagreement with smaller steps, beyond their own errors; where these hide it, extrapolated from
+                     larger steps. Steps at which it is a large part of the difference are discarded.
 
     Args:
-        y: values at +-steps; not a number where a run has failed, which leaves its step out.
-        errors: of y.
-        series: labels of values that belong together.
-        steps: steps, each smaller than the one before by `STEP_RATIO`.
+        y: values at +-steps; NaN where a run has failed, which excludes its step.
+        errors: integration errors of y.
+        series: index arrays of values that belong together.
+        steps: steps, each smaller than the previous one by the factor `STEP_RATIO`.
 
     Source: L. F. Richardson, The approximate arithmetical solution by finite differences of physical problems, 1911.
     """
@@ -56,7 +56,7 @@ def differences(
     R = (RICHARDSON * D[1:] - D[:-1]) / (RICHARDSON - 1)
     rounding = np.finfo(float).eps * sizes(y[:, 0], series)
     jumps = sizes(errors[:, 0] - errors[:, 1], series) / 2 + rounding
-    # No smaller than at smaller steps, where it is only by chance.
+    # An error smaller than at smaller steps is so only by chance.
     off = np.fmax.accumulate(jumps[::-1])[::-1] / h
     noise = (RICHARDSON * off[1:] + off[:-1]) / (RICHARDSON - 1)
     noise = np.where(np.isfinite(sizes(R, series)), noise, np.nan)
@@ -65,7 +65,7 @@ def differences(
 
 
 def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the truncation at all steps but the last."""
+    """Return the truncation error at all steps but the last."""
     count = len(R) - 1
     found = np.full((count, len(series)), np.nan)
     for k in reversed(range(count)):
@@ -80,18 +80,18 @@ def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) 
 
 
 def leave_out_far_steps(found: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
-    """Leave out the differences whose steps lead to quite another motion; `size` is that of the derivative in each series."""
+    """Exclude differences whose steps lead to an entirely different motion; `size` is the derivative's size in each series."""
     h = found.steps[:, None]
     far = (h * size > found.largest) & (h * sizes(found.values, series) > LEAST_CHANGE * found.largest)
     return found._replace(truncation=np.where(far, np.nan, found.truncation))
 
 
 def best_steps(errors: Float[np.ndarray, "... H"]) -> Int[np.ndarray, "..."]:
-    """Return the number of the step with the least error; -1 where none is known."""
-    known = np.where(np.isfinite(errors), errors, np.inf)
-    return np.where(np.isfinite(known).any(-1), known.argmin(-1), -1)
+    """Return the index of the step with the least error; -1 where no error is known."""
+    finite = np.where(np.isfinite(errors), errors, np.inf)
+    return np.where(np.isfinite(finite).any(-1), finite.argmin(-1), -1)
 
 
 def sizes(values: Float[np.ndarray, "... R"], series: Sequence[np.ndarray]) -> Float[np.ndarray, "... S"]:
-    """Return the root mean square of values in each of some series."""
+    """Return the root mean square of the values in each series."""
     return np.stack([np.sqrt(np.mean(values[..., places] ** 2, -1)) for places in series], -1)

@@ -1,7 +1,7 @@
 """The derivation of the accelerations for one state, with the paper's symbols and numbers: `explain`.
 
-Everything comes from the textbook's functions (equations/constraints.py, loads.py, udwadia_kalaba.py), one symbol each, and each
-claim is checked beside it: the equations of motion, the constraints, Penrose's four conditions, and Gauss's principle.
+Everything comes from the textbook functions (equations/constraints.py, loads.py, udwadia_kalaba.py), one symbol each. The
+equations of motion, the constraints, Penrose's four conditions and Gauss's principle are checked.
 """
 
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.explanation import Explanation, Gauss
 
-N_RIVALS = 200  # feasible accelerations that a is compared with
+N_RIVALS = 200  # random feasible accelerations to compare a with
 
 
 @checked
@@ -30,7 +30,7 @@ def explain(
     """Derive the accelerations and multipliers of one state, step by step, with numbers; print the result.
 
     Args:
-        mechanism: its numbers are known.
+        mechanism: mechanism with concrete numbers.
         t: time (s), for drivers and loads.
         state: the state; it is closed first. By default the initial guess.
         stabilization: Baumgarte's terms in b, if any.
@@ -46,7 +46,7 @@ def explain(
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005, section 3.
     """
     if not mechanism.is_concrete:
-        raise ValueError("explain takes known numbers; under jit and vmap take accelerations and uniqueness, which are pure")
+        raise ValueError("explain needs concrete numbers; under jit and vmap use accelerations and uniqueness, which are pure")
     state = assemble(mechanism, t, state)
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)
@@ -110,7 +110,7 @@ def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
 
 
 def _checks(s: dict[str, np.ndarray]) -> dict[str, float]:
-    """Return the differences that must vanish, each relative to its largest term."""
+    """Return the residuals of the identities, each relative to its largest term."""
     inertia, reaction = s["mass"] * s["a"], s["psi_q"].T @ s["multipliers"]
     required = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
     D, plus = s["D"], s["D_plus"]

@@ -1,4 +1,4 @@
-"""An explanation: every symbol of the derivation for one state, and the same as text that reads like the paper's section."""
+"""Every symbol of the derivation for one state, as numbers and as text in the order of the paper's section 3."""
 
 import html
 from typing import Any, NamedTuple
@@ -11,30 +11,30 @@ from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.wording import plain, plural, row_label
 
-MOST_MATRIX_COLUMNS = 18  # columns of a matrix that fit beside each other
-SMALLEST_PRINTED = 1e-12  # relative to the largest of an array: printed as 0
-SMALLEST_TERM = 1e-9  # of the largest coefficient of a combination of rows: smaller ones are rounding
+MOST_MATRIX_COLUMNS = 18  # columns of a matrix on one line
+SMALLEST_PRINTED = 1e-12  # relative to the largest entry of an array; smaller ones are printed as 0
+SMALLEST_TERM = 1e-9  # relative to the largest coefficient of a combination of rows; smaller ones are rounding
 
 
 class Gauss(NamedTuple):
-    """Gauss's principle: of all accelerations that the constraints allow, a deviates least from a_F.
+    """Gauss's principle: of all feasible accelerations, a deviates least from a_F.
 
-    G(x) = (x - a_F)^T M (x - a_F) / 2. Feasible is a + V y, V spanning what the constraints leave free, M-orthonormal; then
-    G(a + V y) = G(a) + y . V^T M (a - a_F) + |y|^2 / 2, least at y = 0 if and only if V^T M (a - a_F) = 0.
+    G(x) = (x - a_F)^T M (x - a_F) / 2. Feasible accelerations are a + V y, with V an M-orthonormal basis of the null space of
+    Psi_q; then G(a + V y) = G(a) + y . V^T M (a - a_F) + |y|^2 / 2, least at y = 0 if and only if V^T M (a - a_F) = 0.
     """
 
     at_a: float  # G(a), kg m^2/s^4
     free: int  # columns of V
-    slope: float  # the largest of |V^T M (a - a_F)|, relative to |M^(1/2) (a - a_F)|: zero
-    least_rival: float  # the least G of feasible accelerations at random
-    rivals: int
+    slope: float  # the largest of |V^T M (a - a_F)|, relative to |M^(1/2) (a - a_F)|: zero up to rounding
+    least_rival: float  # the least G of random feasible accelerations
+    rivals: int  # their number
 
 
 class Explanation(NamedTuple):
     """Every symbol of section 3 of the paper for one state. Rows are those of Psi, columns x, y, angle of each body.
 
     Attributes:
-        mechanism: of which it is.
+        mechanism: the mechanism.
         t: time (s).
         q: coordinates.
         v: velocities.
@@ -77,19 +77,19 @@ class Explanation(NamedTuple):
     null_rows: Float[np.ndarray, "m k"]  # N: combinations of rows of Psi_q that vanish
     constraint_force: Float[np.ndarray, "n"]  # -Psi_q^T lambda
     gauss: Gauss
-    checks: dict[str, float]  # differences that must vanish, relative to their terms
+    checks: dict[str, float]  # residuals of the identities, relative to their terms
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain numbers, lists and texts, for JSON."""
+        """Return everything as plain numbers, lists and strings, for JSON."""
         found = plain(self) | {"bodies": list(self.mechanism.body_names), "rows": self.row_labels()}
         return found | {"lambda": found.pop("multipliers")}
 
     def row_labels(self) -> list[str]:
-        """Return the names of the rows in texts."""
+        """Return the names of the rows as they are printed."""
         return [row_label(self.mechanism, *name) for name in self.row_names]
 
     def __str__(self) -> str:
-        """Lay out the derivation for a terminal."""
+        """Format the derivation for a terminal."""
         rows, columns = self.row_labels(), _columns(self.mechanism)
         parts = [_state(self, columns)]
         parts += [_constraints(self, rows, columns), _rank(self, rows)] if rows else []
@@ -115,7 +115,7 @@ def _columns(mechanism: Mechanism) -> list[str]:
 
 def _state(e: Explanation, columns: list[str]) -> list[str]:
     bodies = ", ".join(f"{k + 1} {name}" for k, name in enumerate(e.mechanism.body_names))
-    head = f"{e.mechanism.name or 'mechanism'} at t = {e.t:g} s. Bodies: {bodies}; x, y (m) and th (rad) of each."
+    head = f"{e.mechanism.name or 'mechanism'} at t = {e.t:g} s. Bodies: {bodies}. Coordinates of each: x, y (m), th (rad)."
     return [head, "", *_table(["q", "v"], columns, np.stack([e.q, e.v]))]
 
 
@@ -125,7 +125,7 @@ def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> list[st
         "1. Constraints Psi(t, q) = 0; along a motion Psi_dot = Psi_q v + Psi_t = 0, and Psi_q a = gamma",
         *_table(rows, ["Psi", "Psi_dot", "gamma"], np.stack([e.psi, e.psi_dot, e.gamma], axis=1)),
         "",
-        f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}), which entries are there, and their values:",
+        f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}): its nonzero entries (x), then their values:",
         *(
             f"  {name:<{_width(rows)}}  " + " ".join("x" if entry else "." for entry in row)
             for name, row in zip(rows, shown, strict=True)
@@ -141,7 +141,7 @@ def _rank(e: Explanation, rows: list[str]) -> list[str]:
     lines = [f"2. Rank of Psi_q: {e.rank} of {len(rows)} rows; {free}"]
     if not e.null_rows.shape[1]:
         return [*lines, "  All rows are independent."]
-    lines.append("  These combinations of rows vanish, so that lambda may be changed by any of them without an effect:")
+    lines.append("  These combinations of rows vanish: adding any multiple of one to lambda leaves the motion unchanged.")
     for column in e.null_rows.T:
         column = column / column[np.argmax(np.abs(column))]
         terms = [f"{x:+.3g} {name}" for x, name in zip(column, rows, strict=True) if abs(x) > SMALLEST_TERM]
@@ -150,39 +150,43 @@ def _rank(e: Explanation, rows: list[str]) -> list[str]:
 
 
 def _masses(e: Explanation, columns: list[str]) -> list[str]:
-    title = "3. Masses M (diagonal), loads F, and a_F = M^(-1) F: what the loads would do without the constraints"
+    title = "3. Masses M (diagonal), loads F, and the unconstrained accelerations a_F = M^(-1) F"
     return [title, *_table(["M", "F", "a_F"], columns, np.stack([e.mass, e.force, e.a_F]))]
 
 
 def _right_hand_side(e: Explanation, rows: list[str]) -> list[str]:
     values = np.stack([e.gamma, e.psi_q @ e.a_F, e.b / e.weights], axis=1)
-    return ["4. What the constraints still ask: b = gamma - Psi_q a_F", *_table(rows, ["gamma", "Psi_q a_F", "b"], values)]
+    title = "4. b = gamma - Psi_q a_F: the residual of a_F in the constraints Psi_q a = gamma"
+    return [title, *_table(rows, ["gamma", "Psi_q a_F", "b"], values)]
 
 
 def _pseudoinverse(e: Explanation, rows: list[str], columns: list[str]) -> list[str]:
     weighted = not np.allclose(e.weights, 1.0)
     return [
-        f"5. D = Psi_q M^(-1/2){'; rows in radians are multiplied by the characteristic length, b too' if weighted else ''}",
+        f"5. D = Psi_q M^(-1/2){'; angular rows of D and b are multiplied by the characteristic length' if weighted else ''}",
         *_table(rows, columns, e.D),
         f"  Singular values: {' '.join(_number(x, e.singular_values.max(initial=0.0)) for x in e.singular_values)}",
         "",
-        f"  D^+, transposed (a row of it for each row of D), of rank {e.rank}:",
+        f"  D^+, transposed (one row for each row of D), of rank {e.rank}:",
         *_table(rows, columns, e.D_plus.T),
     ]
 
 
 def _accelerations(e: Explanation, columns: list[str]) -> list[str]:
-    title = "6. a = a_F + M^(-1/2) D^+ b: what the loads would do, and what the constraints add"
+    title = "6. a = a_F + M^(-1/2) D^+ b: the unconstrained accelerations, and the accelerations added by the constraints"
     return [title, *_table(["a_F", "added", "a"], columns, np.stack([e.a_F, e.a - e.a_F, e.a]))]
 
 
 def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
-    marks = ["", *("unique" if unique else "not unique: the share of least norm" for unique in e.unique)]
+    marks = ["", *("unique" if unique else "not unique: the minimum-norm solution" for unique in e.unique)]
     shown = zip(_table(rows, ["lambda"], e.multipliers[:, None]), marks, strict=True)
     return [
-        "7. lambda = -(D^+)^T D^+ b (N, N m), with which M a + Psi_q^T lambda = F",
+        "7. lambda = -(D^+)^T D^+ b (N, N m), so that M a + Psi_q^T lambda = F",
         *(f"{line}   {mark}".rstrip() for line, mark in shown),
-        *(f"  {name}: its force is unique only along {np.rad2deg(angle):.4g} degrees" for name, angle in _directions(e)),
+        *(
+            f"  {name}: only the component of its force along {np.rad2deg(angle):.4g} degrees is unique"
+            for name, angle in _directions(e)
+        ),
         "",
         "  The constraints' forces on the bodies, -Psi_q^T lambda = M (a - a_F), are unique:",
         *_table(["force"], _columns(e.mechanism), e.constraint_force[None]),
@@ -190,7 +194,7 @@ def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
 
 
 def _directions(e: Explanation) -> list[tuple[str, float]]:
-    """Return the pins and welds whose force is unique in one direction alone, and that direction (rad)."""
+    """Return the pins and welds whose force is unique in one direction only, with that direction (rad)."""
     found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
     for name, joint in e.mechanism.joints.items():
         own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
@@ -203,24 +207,27 @@ def _directions(e: Explanation) -> list[tuple[str, float]]:
 def _gauss(e: Explanation) -> list[str]:
     g = e.gauss
     lines = [
-        "8. Gauss's principle: of all accelerations that the constraints allow, a has the least",
+        "8. Gauss's principle: of all accelerations that the constraints allow, a has the smallest",
         "     G(x) = (x - a_F)^T M (x - a_F) / 2",
         f"  G(a) = {g.at_a:.10g}",
     ]
     if not g.free:
-        return [*lines, "  The constraints leave nothing free: a is the only one."]
-    free = f"  {plural(g.free, 'direction')} {'is' if g.free == 1 else 'are'} left free"
-    verdict = "more." if g.least_rival >= g.at_a else "LESS, which must not be."
+        return [*lines, "  The constraints leave no direction free: a is the only feasible acceleration."]
+    free = f"  {plural(g.free, 'direction')} {'is' if g.free == 1 else 'are'} free"
+    verdict = "larger." if g.least_rival >= g.at_a else "SMALLER, which is an error."
     return [
         *lines,
-        f"{free}. The slope of G there is {g.slope:.1e} of its size: zero, to rounding.",
-        f"  The least G of {g.rivals} other feasible accelerations is {g.least_rival:.10g}: {verdict}",
+        f"{free}. The relative slope of G at a is {g.slope:.1e}: zero up to rounding.",
+        f"  The smallest G of {g.rivals} other feasible accelerations is {g.least_rival:.10g}: {verdict}",
     ]
 
 
 def _checks(e: Explanation) -> list[str]:
     width = _width(list(e.checks))
-    return ["9. Checks, relative: all vanish", *(f"  {name:<{width}}  {x:.1e}" for name, x in e.checks.items())]
+    return [
+        "9. Checks: relative residuals, zero up to rounding",
+        *(f"  {name:<{width}}  {x:.1e}" for name, x in e.checks.items()),
+    ]
 
 
 def _width(names: list[str]) -> int:
@@ -228,7 +235,7 @@ def _width(names: list[str]) -> int:
 
 
 def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]:
-    """Lay out a matrix with its names; wide ones in pieces below each other."""
+    """Format a matrix with names of its rows and columns; a wide one in blocks below each other."""
     width, lines = _width(rows), []
     sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
     cells = [[_number(x, size) for x, size in zip(row, np.broadcast_to(sizes, row.shape), strict=True)] for row in values]
@@ -242,5 +249,5 @@ def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]
 
 
 def _number(x: float, size: float) -> str:
-    """Write a number with four digits; as zero where it is rounding beside the largest."""
+    """Format a number with four digits; as 0 if it is rounding relative to `size`."""
     return "0" if abs(x) <= SMALLEST_PRINTED * size else f"{x:.4g}"

@@ -1,14 +1,14 @@
-"""Inverse dynamics: the drivers' torques and forces that a prescribed motion takes, loops and redundant actuation included.
+"""Inverse dynamics: driver torques and forces for a prescribed motion, with closed loops and redundant actuation.
 
 A driver's row of Psi is c(q) - motion(t), so the generalized force that it exerts along its coordinate c is f = -lambda. With
-the joints' rows J and the drivers' rows C of Psi_q, the motion's equation
+the joints' rows J and the drivers' rows C of Psi_q, the equation of motion is
 
-    M a - F = J^T mu + C^T f
+    M a - F = J^T mu + C^T f.
 
-holds for all mu and f that there are: the joints can take what lies in the range of J^T, and what is left over must be driven.
-With N a basis of the null space of J, N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. Of more drivers than
-that, f is of least weighted norm, sum_i w_i f_i^2. Where branches meet, N has a column more, along the other branch, in which the
-joints take what drivers do not: with one degree of freedom the branch's own direction v takes the place of N.
+The joints carry any force in the range of J^T; the drivers must supply the rest. With N a basis of the null space of J,
+N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. If there are more drivers than degrees of freedom, f is the
+solution of least weighted norm, sum_i w_i f_i^2. Where branches meet, N has another column, along the other branch, in which the
+joints carry load, too: with one degree of freedom, the direction v of the motion replaces N.
 """
 
 import math
@@ -42,17 +42,17 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class InverseDynamics(PrintsTable):
-    """Efforts of drivers along their coordinates on a prescribed motion; not a number where they are not determined.
+    """Efforts (torques or forces) of drivers along their coordinates for a prescribed motion; NaN where undetermined.
 
-    It is not where the motion does not get, nor in a position where its velocities do not follow, nor where branches meet and
-    there is more than one degree of freedom.
+    They are undetermined where the motion is not possible or its velocities are undetermined, and where branches meet in a
+    mechanism with more than one degree of freedom.
     """
 
     ts: Float[Array, "T"]  # s
-    motion: Kinematics | None  # where it was found here
+    motion: Kinematics | None  # None if the motion was given
     efforts: dict[str, Float[Array, "T"]]  # by driver: torque (N m) along an angle, force (N) along a length
     powers: dict[str, Float[Array, "T"]]  # W: effort times the coordinate's rate
-    residual: Float[Array, "T"]  # the largest part of M a - F that neither joints nor drivers exert, over M a and single loads
+    residual: Float[Array, "T"]  # largest part of M a - F that neither joints nor drivers exert, relative to M a and the loads
     effort_units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # by driver
 
     _units = units(ts="s", efforts="N m or N", powers="W")
@@ -73,26 +73,27 @@ class InverseDynamics(PrintsTable):
             energies = (format_number(one[name], "J", largest) for one in (self.works, self.swings))
             peak, mean = format_number(x[k], unit), format_number(math.sqrt(mean_square), unit)
             rows.append((name, f"{peak} at {ts[k]:.6g} s", mean, f"{span} W", *energies))
-        left = float(np.nanmax(np.asarray(self.residual), initial=0.0))
-        rows.append(("left over", f"{format_number(left, scale=1.0)} of the loads", "", "", "", ""))
-        heads = "driver", "peak", "root mean square", "power", "work", "swing of energy"
+        unbalanced = float(np.nanmax(np.asarray(self.residual), initial=0.0))
+        rows.append(("unbalanced", f"{format_number(unbalanced, scale=1.0)} of the loads", "", "", "", ""))
+        heads = "driver", "peak effort", "rms effort", "power", "work", "energy swing"
         return PrintedTable(f"inverse dynamics at {len(ts)} times from {ts[0]:g} to {ts[-1]:g} s", rows, heads)
 
     @property
     def determined(self) -> Bool[Array, "T"]:
-        """Times at which the efforts follow from the motion."""
+        """Mask of the times at which the efforts are determined."""
         return jnp.all(jnp.isfinite(jnp.stack(list(self.efforts.values()))), 0)
 
     @property
     def works(self) -> dict[str, Float[Array, ""]]:
-        """Work (J) of each driver from the first time to the last, by the trapezoidal rule."""
+        """Work (J) of each driver over all times, by the trapezoidal rule."""
         return {name: jnp.trapezoid(power, self.ts) for name, power in self.powers.items()}
 
     @property
     def swings(self) -> dict[str, Float[Array, ""]]:
-        """The largest difference (J) of the work done from what the mean power does, by driver, by the trapezoidal rule.
+        """Range (J) of each driver's work minus the work of its mean power, by the trapezoidal rule.
 
-        Over whole cycles it is what a flywheel is to store: one of the inertia swing / (k w^2) keeps the speed w within k w.
+        Over whole cycles it is the energy that a flywheel must store: an inertia of swing / (k w^2) keeps the variation of the
+        speed w within k w.
         """
         steps, swings = jnp.diff(self.ts), {}
         for name, power in self.powers.items():
@@ -117,16 +118,14 @@ class AcceleratedTrajectory(StateHistory, Protocol):
 
 
 class Effort(ForceElement):
-    """An effort (N m, N) along a coordinate of two bodies: it does the work effort times the change of the coordinate.
-
-    `law` gives the effort at time t (s), as a `Motion` gives a value.
+    """A torque (N m) or force (N) along a coordinate of two bodies: its power is the effort times the coordinate's rate.
 
     Args:
         bodies: the names of the two bodies.
-        coordinate: of the driver: "angle", "x", "y" or "distance".
-        law: the torque (N m) or force (N) as a function of time.
-        points: each in its own body's frame (m); None: the origins.
-        axis: for x and y: the direction of x in body 1's frame (rad); None: its own.
+        coordinate: kind of the coordinate: "angle", "x", "y" or "distance".
+        law: the torque or force as a function of time (s).
+        points: attachment points, each in its own body's frame (m); by default the origins.
+        axis: for x and y, the direction of x in body 1's frame (rad); by default the frame's own.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
@@ -150,24 +149,24 @@ def inverse_dynamics(
     drivers: Sequence[str | Coordinate] | None = None,
     weights: Mapping[str, NumberLike] | None = None,
 ) -> InverseDynamics:
-    """Return the efforts of drivers at the times ts (s) on a prescribed motion: M a - F = J^T mu + C^T f.
+    """Compute the efforts of drivers at the times ts (s) for a prescribed motion: M a - F = J^T mu + C^T f.
 
-    Pure and batched by `vmap`, with exact derivatives by every number of the mechanism, the motion's share included.
+    Pure and batched by `vmap`, with exact derivatives by every number of the mechanism, including those of the motion.
 
     Args:
-        mechanism: its drivers prescribe the motion where none is given; F holds its force elements and gravity.
+        mechanism: mechanism whose drivers prescribe the motion unless `motion` does; F are its force elements and gravity.
         ts: times (s).
-        motion: anything with q, v and a (T, bodies, 3); by default that of all drivers, by `kinematics`.
-        drivers: names of drivers or coordinates (`body.crank.angle`) that exert efforts, or each a `Coordinate`; by default the
-            scene's drivers. More than there are degrees of freedom share by least weighted norm.
-        weights: w_i > 0 of each driver's squared effort, by name; by default 1.
+        motion: a trajectory with q, v and a (T, bodies, 3); by default that of all drivers, by `kinematics`.
+        drivers: drivers or coordinates that exert efforts, each a name (`motor`, `body.crank.angle`) or a `Coordinate`; by
+            default the scene's drivers. If there are more than degrees of freedom, their efforts have least weighted norm.
+        weights: weight w_i > 0 of each driver's squared effort, by name; by default 1.
 
     Returns:
-        An `InverseDynamics`: efforts and powers (T,) by driver, and what neither joints nor drivers can exert.
+        An `InverseDynamics`: efforts and powers (T,) by driver, and the unbalanced part of the loads.
 
     Raises:
-        SceneError: there is no driver, or a name is unknown.
-        ValueError: `motion` has another number of states than `ts` has times.
+        SceneError: there are no drivers, or a name is unknown.
+        ValueError: the number of states of `motion` differs from that of `ts`.
     """
     ts = number(ts)
     found = None
@@ -175,7 +174,7 @@ def inverse_dynamics(
         motion = found = kinematics(mechanism, None, ts)
     chosen = list(mechanism.driver_names) if drivers is None else list(drivers)
     if not chosen:
-        raise SceneError(["drivers: nothing drives it; name coordinates that do, such as body.crank.angle"], mechanism.name)
+        raise SceneError(["drivers: the scene has none; name coordinates to drive, such as body.crank.angle"], mechanism.name)
     named = {d if isinstance(d, str) else f"{d.coordinate} of {' and '.join(d.bodies)}": d for d in chosen}
     unknown = [name for name in weights or {} if name not in named]
     if unknown:
@@ -186,7 +185,7 @@ def inverse_dynamics(
     analysis = analyse(joints)
     q, v, a = (jnp.asarray(x) for x in (motion.q, motion.v, motion.a))
     if len(q) != len(ts):
-        raise ValueError(f"motion has {len(q)} states, and ts {len(ts)} times: give the times of the motion")
+        raise ValueError(f"motion has {len(q)} states, but ts has {len(ts)} times: give the times of the motion")
     efforts, rates, residual = _efforts(joints.without_origin, analysis, values, w, ts, q, v, a)
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
@@ -196,21 +195,20 @@ def inverse_dynamics(
 
 @checked
 def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
-    """Return the mechanism whose drivers exert these efforts, each a natural cubic spline through the times, and hold nothing.
+    """Return the mechanism with its drivers replaced by force elements that exert these efforts as natural cubic splines.
 
-    A spline misses an effort by about h^4, where h is the time between its knots, and by h^2 near its ends: let the times begin
-    a dozen knots before the run and end as many after it. Simulated from a state of the prescribed motion, the mechanism
-    follows that motion.
+    Simulated from a state of the prescribed motion, it follows that motion. The splines' errors are O(h^4) in the time h between
+    knots, and O(h^2) near their ends: begin the times a dozen knots before the run, and end them a dozen after it.
 
     Args:
-        mechanism: the mechanism that `found` is of.
+        mechanism: the mechanism of `found`.
         found: the result of `inverse_dynamics`, determined at all times.
 
     Returns:
         The mechanism without drivers, with one force element for each effort.
 
     Raises:
-        ValueError: an effort is not determined at some time.
+        ValueError: an effort is undetermined at some time.
     """
     if not isinstance(found.ts, Tracer) and not np.all(found.determined):
         t = float(found.ts[int(np.argmin(found.determined))])
@@ -229,7 +227,7 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
 def _efforts(
     mechanism: Mechanism, analysis: Analysis, values: Sequence[Coordinate], w: Array, ts: Array, q: States, v: States, a: States
 ) -> tuple[Array, Array, Array]:
-    """Efforts (T, k), rates of their coordinates (T, k), and what is left over (T,)."""
+    """Return efforts (T, k), rates of their coordinates (T, k), and the unbalanced part (T,)."""
     scales = analysis.scales
     units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
     coordinates = [value_of(mechanism, element) for element in values]
@@ -238,28 +236,28 @@ def _efforts(
         q, v, a = q.ravel(), v.ravel(), a.ravel()
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
-        free, known = _free_part(J), jnp.asarray(True)
+        free, determined = _free_part(J), jnp.asarray(True)
         missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
-        if analysis.rank is not None:  # else it is not known how many directions there are
+        if analysis.rank is not None:  # else the number of degrees of freedom is unknown
             deficient = SVD(RANK_TOL).plus(J).rank < analysis.rank if len(J) else jnp.asarray(False)
             u = v / units
             speed = jnp.linalg.norm(jnp.where(deficient, u, 1.0))
             u = u / jnp.where(speed > 0, speed, 1.0)
-            everywhere, known = free, ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
+            everywhere, determined = free, ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
             free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
-        wanted, A = free(missing), free((C * units).T * share)
-        f = share * (SVD(RANK_TOL).plus(A) @ wanted)
-        # Of the parts, which may balance: their rest is rounding then.
+        required, A = free(missing), free((C * units).T * share)
+        f = share * (SVD(RANK_TOL).plus(A) @ required)
+        # Relative to the single terms, which may balance: their sum is then rounding.
         parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))
         size = jnp.maximum(jnp.max(parts), scales.mass * (scales.length * scales.rate) ** 2)
-        left = jnp.max(jnp.abs(wanted - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
-        return jnp.where(known, f, jnp.nan), C @ v, left
+        residual = jnp.max(jnp.abs(required - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
+        return jnp.where(determined, f, jnp.nan), C @ v, residual
 
     return jax.vmap(at)(ts, q, v, a)
 
 
 def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
-    """Return x -> (I - J^+ J) x for vectors (n,) or columns (n, k): what no row of J sees; differentiable."""
+    """Return x -> (I - J^+ J) x for vectors (n,) or columns (n, k): the projection onto J's null space; differentiable."""
     if not len(J):
         return lambda x: x
     plus = SVD(RANK_TOL).plus(J)

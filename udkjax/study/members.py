@@ -1,7 +1,7 @@
-"""Functions of the members of a study, compiled: what is computed of each member, with forward derivatives.
+"""Compiled functions of the members of a study, with forward derivatives.
 
-A member has numbers of its own, and shares others with all. A program computes a fixed number of members, a piece; the last piece
-is filled up with copies. So results do not depend on how many members there are, nor on how they are cut into chunks.
+A member has inputs of its own, and inputs shared by all. A program computes a fixed number of members at a time (a piece), the
+last piece padded with copies, so that results do not depend on the number of members or on the size of chunks.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-MOST_PROGRAMS = 64  # of identifications, and of sweeps, in memory: each holds the scene that it was made for
+MOST_PROGRAMS = 64  # programs of identifications, and of sweeps, kept in memory: each holds the scene that it was made for
 
 T = TypeVar("T")
 Outputs: TypeAlias = dict[str, Array]
@@ -28,13 +28,13 @@ Results: TypeAlias = tuple[dict[str, np.ndarray], dict[str, np.ndarray]]  # valu
 
 
 class MemberFunction(Protocol):
-    """Computes arrays by name of one member: of numbers shared by all, its own, and a shift (K,) of what slopes are taken by."""
+    """A function of one member: arrays by name, from shared inputs, its own, and a shift (K,) of the varied numbers."""
 
     def __call__(self, shared: Any, own: Any, shift: Array, /) -> Outputs: ...
 
 
 class Program:
-    """A function of members, compiled for `piece` members on each of some devices of a kind, with slopes by K numbers."""
+    """A function of members, compiled for `piece` members on each device, with derivatives (slopes) by K numbers."""
 
     def __init__(self, function: MemberFunction, slopes: int, piece: int, devices: Sequence[Any] = ()):
         self.function, self.slopes, self.piece, self.devices = function, slopes, piece, tuple(devices)
@@ -43,7 +43,7 @@ class Program:
         self._compiled: jax.stages.Compiled | None = None
 
     def __call__(self, shared: PyTree, own: PyTree, on_threads: bool = False) -> Results:
-        """Compute members, the first axis of `own`, in their order; pieces one after another, or side by side on threads."""
+        """Compute members, the first axis of `own`, in their order; pieces run one after another, or concurrently on threads."""
         count = len(jax.tree.leaves(own)[0])
         program = self.compile(shared, own)
 
@@ -54,23 +54,23 @@ class Program:
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *each(compute, range(0, count, self.size)))
 
     def place(self, shared: T, own: PyTree) -> T:
-        """Compile for members such as these, and put what they share on the devices: for calls that would do so each time."""
+        """Compile for members like these, and return the shared inputs on the devices: repeated calls need not transfer them."""
         return jax.device_put(shared, self.compile(shared, own).input_shardings[0][0])
 
     def compile(self, shared: PyTree, own: PyTree) -> jax.stages.Compiled:
-        """Return the executable, which is made once, for members such as these."""
+        """Return the executable for members like these, compiled once."""
         with self._lock:
             if self._compiled is None:
                 self._compiled = _compile(jax.jit(self._on_devices()).lower(shared, _rows(own, 0, self.size)), self.devices)
         return self._compiled
 
     def shapes(self, shared: PyTree, own: PyTree) -> tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]]:
-        """Return shapes and types of what is computed of one such member."""
+        """Return shapes and types of the values and slopes of one member."""
         found = jax.eval_shape(self._compute, shared, _rows(own, 0, 1))
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found)
 
     def _compute(self, shared: PyTree, own: PyTree) -> tuple[Outputs, Outputs]:
-        """Compute values of members, and slopes of those that are not whole numbers."""
+        """Compute values of members, and slopes of the floating-point ones."""
         alone = len(jax.tree.leaves(own)[0]) == 1
 
         def values(shift: Array) -> tuple[Outputs, Outputs]:
@@ -88,7 +88,7 @@ class Program:
         return found, slopes
 
     def _on_devices(self) -> Callable[[PyTree, PyTree], tuple[Outputs, Outputs]]:
-        """Return the function of a piece for each device."""
+        """Return the function that computes one piece on each device."""
         if len(self.devices) < 2:
             return self._compute
         from jax.sharding import AxisType, Mesh, PartitionSpec
@@ -98,14 +98,14 @@ class Program:
         return jax.shard_map(self._compute, mesh=mesh, in_specs=(same, spread), out_specs=spread, check_vma=False)
 
 
-_EXECUTABLES: OrderedDict[Hashable, jax.stages.Compiled] = OrderedDict()  # the `MOST_PROGRAMS` that were asked for last
+_EXECUTABLES: OrderedDict[Hashable, jax.stages.Compiled] = OrderedDict()  # the `MOST_PROGRAMS` used most recently
 
 
 def _compile(lowered: jax.stages.Lowered, devices: tuple[Any, ...]) -> jax.stages.Compiled:
-    """Return the executable of a program: one serves all studies that differ by the values of its arguments alone.
+    """Return the executable of a program: studies that differ only in the values of its arguments share one.
 
-    Programs are identified by their text, but for those whose text does not hold all of them: functions of Python that they call,
-    and constants that JAX may keep beside them.
+    Programs are identified by their text. Those that call Python functions, or whose constants JAX keeps outside the text, are
+    always compiled.
     """
     text = lowered.as_text()
     if "callback" in text or getattr(jax.config, "jax_use_simplified_jaxpr_constants", False):
@@ -120,18 +120,18 @@ def _compile(lowered: jax.stages.Lowered, devices: tuple[Any, ...]) -> jax.stage
 
 
 def _rows(own: T, first: int, count: int) -> T:
-    """Return the numbers of some members, filled up with copies of the last."""
+    """Return the inputs of some members, padded with copies of the last."""
     return jax.tree.map(lambda x: x[np.minimum(np.arange(first, first + count), len(x) - 1)], own)
 
 
 @lru_cache(maxsize=1)
 def _threads(process: int) -> ThreadPoolExecutor:
-    """Return the threads of this process: to start them anew would take as long as a short run."""
+    """Return the thread pool of this process: starting threads anew would take as long as a short run."""
     return ThreadPoolExecutor(cores(), thread_name_prefix="members")
 
 
-CHUNKED_PLATFORMS = ("cpu",)  # devices that take a batch in chunks; others take it whole
-PIECE_MEMBERS = 64  # of a chunk, on them
+CHUNKED_PLATFORMS = ("cpu",)  # platforms that compute a batch in pieces; others compute it whole
+PIECE_MEMBERS = 64  # members of a piece on these platforms
 
 
 def cores() -> int:
@@ -140,16 +140,16 @@ def cores() -> int:
 
 
 def concurrent_chunks() -> int:
-    """Return the number of chunks that are computed at a time.
+    """Return the number of chunks that are computed concurrently.
 
-    One CPU device runs as many programs side by side as it has cores; several devices share each chunk.
+    One CPU device runs one program per core; several devices share each chunk.
     """
     devices = jax.local_devices()
     return cores() if len(devices) == 1 and devices[0].platform in CHUNKED_PLATFORMS else 1
 
 
 def machine() -> str:
-    """Name the processor, how many of its cores may be used, and the system."""
+    """Name the processor, the number of its cores that may be used, and the system."""
     return f"{processor()}, {cores()} of {os.cpu_count()} cores, {platform.system()} {platform.release()}"
 
 

@@ -1,4 +1,4 @@
-"""The noise of a series of measurements: its size before a fit, what is no noise, and whether residuals are white."""
+"""Noise of a series of measurements: its standard deviation before a fit, outliers, and a test of residuals for whiteness."""
 
 from typing import NamedTuple
 
@@ -6,19 +6,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import chdtrc, ndtri
 
-GAUSSIAN_RATIO = 1.4826  # standard deviation over median of absolute values, of Gaussian noise
-MOST_TOGETHER = 5  # wrong numbers one after another: more are no slips of a sensor
-SIGNIFICANCE = 1e-3  # probability of what was seen if noise is white: below it, it is said not to be so
-MAX_LAGS = 5  # at most; a model that lacks something leaves long waves, which show at the first of them
-PAIRS_PER_LAG = 4  # at least: with fewer there is nothing to be said
-NO_GAP = 1.5  # times the usual distance in time of k samples: pairs farther apart have a gap between them
+GAUSSIAN_RATIO = 1.4826  # standard deviation over median absolute value of Gaussian noise
+MOST_TOGETHER = 5  # consecutive outliers; longer runs are not slips of a sensor
+SIGNIFICANCE = 1e-3  # p-value below which noise is reported as not white
+MAX_LAGS = 5  # an incomplete model leaves slow waves in the residuals, which show at the first lags
+PAIRS_PER_LAG = 4  # fewer pairs are too few for the test
+NO_GAP = 1.5  # times the usual duration of k samples: pairs farther apart have a gap between them
 
 
 def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray, "N"]) -> float:
-    """Estimate the standard deviation of the noise from how far each value is from the line through its neighbours.
+    """Estimate the standard deviation of the noise from the distance of each value from the line through its neighbours.
 
-    The median of these distances, over what each would be for unit noise, is not moved by single wrong numbers. Between samples
-    the signal should be nearly straight: its curvature is taken for noise, too. Not a number where there are less than three.
+    The median of these distances, scaled to unit noise, is insensitive to outliers. The signal should be nearly straight between
+    samples: its curvature counts as noise. NaN for fewer than three values.
 
     Source: T. Gasser, L. Sroka & C. Jennen-Steinmetz, Residual variance and residual pattern in nonlinear regression, 1986.
     """
@@ -32,14 +32,14 @@ def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray
 
 
 def robust_deviation(values: Float[np.ndarray, "N"]) -> float:
-    """Return the standard deviation of Gaussian noise whose absolute values have the median of these: outliers do not move it."""
+    """Return the standard deviation of Gaussian noise with the median absolute value of these: insensitive to outliers."""
     return float(GAUSSIAN_RATIO * np.median(np.abs(values)))
 
 
 def outlier_rows(values: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-    """Return a mask of numbers that are too large to be noise like the others: Gaussian noise has one in a thousand such series.
+    """Return a mask of numbers too large to be noise like the others: one in a thousand series of Gaussian noise has any.
 
-    More than `MOST_TOGETHER` in a row are none: there the signal is another one.
+    Runs of more than `MOST_TOGETHER` are not outliers: the signal itself is different there.
     """
     limit = ndtri(1.0 - 0.5 * SIGNIFICANCE / max(len(values), 1)) * robust_deviation(values) if len(values) else np.inf
     found = np.abs(values) > limit if limit > 0.0 else np.zeros(len(values), bool)
@@ -55,22 +55,21 @@ class Whiteness(NamedTuple):
     lag1: float  # correlation of neighbours
     statistic: float  # Q
     lags: int
-    p: float  # probability that white noise has such a Q; not a number where there are too few residuals
+    p: float  # probability that white noise has a Q as large; NaN if there are too few residuals
     samples: int
 
     @property
     def white(self) -> bool:
-        """True if nothing speaks against white noise."""
+        """True if the residuals are consistent with white noise."""
         return not self.p < SIGNIFICANCE
 
     def text(self, channel: str) -> str:
-        """Return a sentence about the residuals; nothing where they are white."""
+        """Return a sentence about residuals that are not white; else an empty string."""
         if self.white:
             return ""
         return (
-            f"residuals of {channel} are not noise: neighbours have the correlation {self.lag1:.2f} (probability {self.p:.1g} "
-            f"for {self.samples} samples of white noise): the model leaves something out, or the noise is "
-            "coloured; standard errors are too small"
+            f"residuals of {channel} are not white noise: neighbours have a correlation of {self.lag1:.2f} (p = {self.p:.1g}, "
+            f"{self.samples} samples); the model omits something, or the noise is coloured, and standard errors are too small"
         )
 
 
@@ -83,13 +82,13 @@ def whiteness_of(
 
         z_k = sum (e_i e_(i+k) + s^2 H_(i, i+k)) / (sum e_i^2 e_(i+k)^2)^(1/2),        Q = sum z_k^2,
 
-    which white noise makes chi^2 with as many degrees of freedom as there are lags, with whatever variances and spacing.
-    H = U U^T is the hat matrix of the fit: -s^2 H is the covariance that fitting leaves in the residuals of white noise.
+    For white noise of any variances and spacing, Q is chi^2-distributed with one degree of freedom per lag. H = U U^T is the hat
+    matrix of the fit: -s^2 H is the covariance that fitting leaves in the residuals of white noise.
 
     Args:
         times: increasing, s; samples may be irregular and have gaps.
-        residuals: not a number where nothing was measured.
-        projection: the rows of U of these residuals; by default nothing was fitted.
+        residuals: residuals; NaN where nothing was measured.
+        projection: the rows of U for these residuals; by default nothing was fitted.
 
     Source: Lobato, Nankervis & Savin, International Economic Review 42 (2001) 187.
     """

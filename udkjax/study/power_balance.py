@@ -2,10 +2,10 @@
 
 With M a + Psi_q^T lambda = F and Psi_q v = -Psi_t the energies T and V change by
 
-    d(T + V)/dt = sum of v . Q_e of the loads that force elements state + sum of dV_e/dt at rest + lambda . Psi_t,
+    d(T + V)/dt = sum of v . Q_e over loads + sum of dV_e/dt at fixed q over potentials + lambda . Psi_t,
 
-the power of springs' dampers, forces, torques and friction, of potentials that depend on time, and of drivers. Joints do no work.
-The left side is the derivative of the energies along (v, a); the right one knows forces only.
+the power of dampers, forces, torques and friction, of potentials that depend on time, and of drivers. Joints do no work. The left
+side is the derivative of the energies along (v, a); the right side is computed from forces only.
 """
 
 from typing import NamedTuple
@@ -33,15 +33,15 @@ from udkjax.scene.mechanism import Mechanism
 
 @prints_table
 class PowerBalance(NamedTuple):
-    """Powers (W) at each output time. The rest of the energies' rates is `residual`.
+    """Powers (W) at each output time; their imbalance is `residual`.
 
     Attributes:
         drivers: power of each driver over time (W).
     """
 
     drivers: dict[str, Float[Array, "T"]]
-    forces: dict[str, Float[Array, "T"]]  # power that is not stored: of dampers, loads, and potentials that change with time
-    joints: dict[str, Float[Array, "T"]]  # of both bodies together: zero, to rounding and what the velocities violate
+    forces: dict[str, Float[Array, "T"]]  # power of dampers, loads, and potentials that depend on time
+    joints: dict[str, Float[Array, "T"]]  # on both bodies together: zero up to rounding and the violation of the velocities
     kinetic: Float[Array, "T"]  # dT/dt
     potential: Float[Array, "T"]  # dV/dt
     scale: Float[Array, ""]  # of powers: m L^2 / T^3 of the mechanism
@@ -59,8 +59,8 @@ class PowerBalance(NamedTuple):
         }
         size = max(float(np.nanmax(np.abs(power), initial=0.0)) for power in parts.values())
         rows = [(name, *(format_number(end(x), "W", size) for end in (np.nanmin, np.nanmax))) for name, x in parts.items()]
-        rows.append(("residual over the largest", format_number(self.relative, scale=1.0), ""))
-        return PrintedTable("balance of powers", rows, ("power", "least", "largest"))
+        rows.append(("residual / largest power", format_number(self.relative, scale=1.0), ""))
+        return PrintedTable("power balance", rows, ("power", "minimum", "maximum"))
 
     @property
     def supplied(self) -> Float[Array, "T"]:
@@ -69,12 +69,12 @@ class PowerBalance(NamedTuple):
 
     @property
     def residual(self) -> Float[Array, "T"]:
-        """d(T + V)/dt less what is supplied."""
+        """d(T + V)/dt minus the supplied power."""
         return self.kinetic + self.potential - self.supplied
 
     @property
     def relative(self) -> Float[Array, ""]:
-        """The largest residual over the largest of the powers that it is the difference of, or over the mechanism's own scale."""
+        """The largest residual over the largest of its terms, or over the mechanism's own scale of power if that is larger."""
         parts = [self.kinetic, self.potential, *self.drivers.values(), *self.forces.values(), self.scale]
         size = jnp.max(jnp.stack([jnp.max(jnp.abs(part)) for part in parts]))
         return jnp.max(jnp.abs(self.residual)) / jnp.where(size > 0, size, 1.0)
@@ -89,8 +89,8 @@ def power_balance(
     Args:
         mechanism: the mechanism.
         solution: ts (T,), q and v (T, bodies, 3).
-        method: decides the rank; by default `SVD`.
-        stabilization: the run's `Baumgarte`, to include what it adds.
+        method: pseudoinverse; by default `SVD`.
+        stabilization: the run's `Baumgarte`, to include its terms.
 
     Returns:
         The `PowerBalance` (W).
@@ -124,13 +124,13 @@ def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
         kinetic = jax.jvp(lambda v: loads.kinetic_energy(mechanism, v), (v,), (a,))[1]
         potential = jax.jvp(lambda t, q: loads.potential_energy(mechanism, t, q, v), (t, q), (jnp.ones_like(t), v))[1]
         by_joint = -multipliers * (constraints.psi_q(mechanism, t, q) @ v)
-        return multipliers * psi_t, _of_forces(mechanism, t, q, v), by_joint, kinetic, potential
+        return multipliers * psi_t, _force_powers(mechanism, t, q, v), by_joint, kinetic, potential
 
     return jax.vmap(one)(ts, q, v)
 
 
-def _of_forces(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
-    """Return the power of each force element that is not the rate of its potential along the motion."""
+def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
+    """Return the power of each force element: of its loads, and of the explicit time dependence of its potential."""
 
     def power(element: ForceElement, *frames: Frame) -> Array:
         stated = element.loads(t, *frames)

@@ -100,11 +100,11 @@ def estimate() -> Estimate:
 def test_each_row_says_what_is_wrong_with_it(estimate):
     found = estimate.rows()
     assert [row.note for row in found] == [
-        "cannot be told from others",
-        "cannot be told from others",
-        "shows in nothing that was measured",
-        "poorly known, at a bound",
-        "added to the guess of the start",
+        "undetermined together with others",
+        "undetermined together with others",
+        "affects no measured quantity",
+        "poorly determined, at a bound",
+        "added to the guess of the initial state",
     ]
     assert [row.first_guess for row in found] == [1.0, 2.0, 3.0, 4.0, 0.0]
     assert found[-1][:4] == ("start: angle", 0.1, 0.01, "rad")
@@ -113,14 +113,14 @@ def test_each_row_says_what_is_wrong_with_it(estimate):
 def test_the_text_says_how_the_fit_ended_and_what_the_noise_was(estimate):
     lines = str(estimate).splitlines()
     assert lines[0] == "<linkage>: 4 parameters from 40 numbers in 1 record"
-    assert lines[2].split() == "a 1.5 unknown kg 1 cannot be told from others".split()
-    assert lines[5].split() == "d 4.5 2.5 1 4 poorly known, at a bound".split()
+    assert lines[2].split() == "a 1.5 unknown kg 1 undetermined together with others".split()
+    assert lines[5].split() == "d 4.5 2.5 1 4 poorly determined, at a bound".split()
     assert [len(line) - len(line.lstrip()) for line in lines[1:7]] == [2] * 6
     assert lines[7:] == [
-        "fit: not settled after 1 evaluation in 2.0 s, 3 of 16 first guesses led here",
+        "fit: not converged after 1 evaluation in 2.0 s, 3 of 16 first guesses led to it",
         "chi^2: 39.5 with 35 degrees of freedom",
-        "noise, estimated: " + ", ".join(f"y{k} 0.02 rad" for k in range(1, 7)) + " and y7 0.02 rad",
-        "the fit has not settled: these are the best values that were found",
+        "estimated noise: " + ", ".join(f"y{k} 0.02 rad" for k in range(1, 7)) + " and y7 0.02 rad",
+        "the fit has not converged: these are the best values found",
         "a & b",
         "d is at one of its bounds",
     ]
@@ -130,7 +130,7 @@ def test_a_notebook_shows_the_same_as_a_table(estimate):
     root = ElementTree.fromstring(f"<div>{estimate._repr_html_()}</div>".replace("<br>", "<br/>"))
     texts = [[cell.text or "" for cell in row] for row in root.iter("tr")]
     assert texts[0][:3] == ["parameter", "value", "standard error"] and len(texts) == 6
-    assert texts[4] == ["d", "4.5", "2.5", "1", "4", "poorly known, at a bound"]
+    assert texts[4] == ["d", "4.5", "2.5", "1", "4", "poorly determined, at a bound"]
     said = "".join(root.itertext())
     assert "<linkage>: 4 parameters" in said and "a & b" in said and "chi^2: 39.5 with 35 degrees of freedom" in said
 

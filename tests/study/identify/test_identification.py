@@ -32,7 +32,7 @@ def test_values_are_found_again(measured, factors):
     estimate = found(first, {"time": TS, ANGLE: measured[1]})
     assert off(estimate) < 1e-10
     assert estimate.success and estimate.converged and estimate.ways == ("whole records",)
-    assert estimate.message == "every parameter is known from the records"
+    assert estimate.message == "the records determine every parameter"
     assert estimate.mechanism.parameters()["body.rod.inertia"] == estimate.values[0]
     assert np.abs(estimate.residuals[0][ANGLE]).max() < 1e-10
 
@@ -94,7 +94,7 @@ def test_wrong_numbers_count_less(measured, loss, noise):
     squares, robust = found(measured[0], data, noise=noise), found(measured[0], data, noise=noise, loss=loss)
     assert off(robust) < 0.2 * off(squares) and off(robust) < 0.03
     assert [one.row for one in robust.outliers] == list(range(5, len(TS), 9))
-    assert robust.noise[0][ANGLE][0] == pytest.approx(0.003, rel=0.3) and "counts little" in robust.message
+    assert robust.noise[0][ANGLE][0] == pytest.approx(0.003, rel=0.3) and "gives outliers little weight" in robust.message
 
 
 def test_one_wrong_number_is_named_and_is_no_noise(measured):
@@ -112,7 +112,7 @@ def test_one_wrong_number_is_named_and_is_no_noise(measured):
     assert (one.record, one.channel, one.row, one.time, one.units) == (1, ANGLE, 20, TS[23], "rad")
     assert one.residual == pytest.approx(-0.3, abs=0.02) and one.deviations == pytest.approx(100.0, rel=0.3)
     assert estimate.noise[1][ANGLE][0] == pytest.approx(sigma, rel=0.2)
-    assert f"row 20 ({TS[23]:.6g} s) by -0." in str(estimate) and "put nan there" in estimate.message
+    assert f"row 20 ({TS[23]:.6g} s) by -0." in str(estimate) and "replace them by nan" in estimate.message
     assert not without.outliers and "row" not in without.message
     errors = without.uncertainty.standard_errors
     assert (np.abs(robust.values - without.values) < 0.5 * errors).all()
@@ -122,7 +122,7 @@ def test_one_wrong_number_is_named_and_is_no_noise(measured):
 
 def test_what_the_mechanism_lacks_is_told(measured):
     estimate = found(measured[0], {"time": TS, ANGLE: measured[1] + 0.02 * np.sin(2.0 * TS)}, n_starts=0)
-    assert "not noise" in estimate.message
+    assert "not white noise" in estimate.message
 
 
 def test_a_prior_counts_as_one_more_measurement(measured):
@@ -223,7 +223,7 @@ def test_every_mistake_is_told(measured):
     ("choices", "told"),
     [
         ({"loss": "cauchy"}, "huber"),
-        ({"n_starts": -1}, "from 0 on"),
+        ({"n_starts": -1}, "between 0 and 1,000,000"),
         ({"guesses": [[1.0]]}, r"\(B, 2\)"),
         ({"guesses": [[-1.0, 1.0]]}, "not positive"),
         ({"rtol": 1e-3}, "rtol"),

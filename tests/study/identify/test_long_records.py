@@ -34,7 +34,7 @@ def test_a_record_grows_as_far_as_it_is_predicted():
     problem, parts = FitProblem(first, unknowns_of(first, NAMES), [Record(ts, {ANGLE: angle})]), []
     fit = fit_growing_records(problem, np.zeros(2), LOOSE_TOL, Minimizer(report=parts.append))
     found = problem.unknowns.values(fit.z)
-    assert fit.settled and np.all(np.abs(found / [0.375, 0.005] - 1.0) < [0.01, 0.2])
+    assert fit.converged and np.all(np.abs(found / [0.375, 0.005] - 1.0) < [0.01, 0.2])
     assert len({text.split(":")[0] for text in parts}) <= 8
     assert problem.predictor.evaluations < 60
 

@@ -36,7 +36,7 @@ def entry(values, name):
     return float(np.asarray(values[owner])[tuple(map(int, index))])
 
 
-ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" close a loop'
+ALL = 'joints "A1", "A2", "A3", "B1", "B2" and "B3" form a loop'
 
 
 CHOICES = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3"))]  # each by itself; one for all
@@ -50,7 +50,7 @@ def problems(linkage):
 
 def test_three_cranks_must_stay_equal(problems):
     (problem,) = problems[0]
-    assert problem == f"a, b and c cannot move each by itself: {ALL} that only holds for a = b = c; tie them, or leave them fixed"
+    assert problem == f"a, b and c cannot vary independently: {ALL} that only closes for a = b = c; tie them, or keep them fixed"
 
 
 def test_sparse_arithmetic_says_the_same(linkage, problems, monkeypatch):
@@ -62,7 +62,7 @@ def test_sparse_arithmetic_says_the_same(linkage, problems, monkeypatch):
 @pytest.mark.parametrize("groups", [(("link1", "link2"), "link3"), (("link1", "link3"), "link2")])
 def test_two_tied_and_one_free_are_refused(linkage, groups):
     (problem,) = loop_problems(linkage, lengths(*groups), [1.0, 1.0], ["two", "one"])
-    assert "two and one cannot move each by itself" in problem and "only holds for two = one; tie them" in problem
+    assert "two and one cannot vary independently" in problem and "only closes for two = one; tie them" in problem
 
 
 def test_all_three_tied_are_legal_and_so_are_masses(linkage):
@@ -80,8 +80,8 @@ def test_of_masses_nothing_is_looked_at(linkage, monkeypatch):
 
 def test_one_crank_alone_is_refused(linkage):
     (problem,) = loop_problems(linkage, lengths("link2"), [1.0], ["length(link2)"])
-    assert problem.startswith("length(link2) cannot move by itself: joints")
-    assert problem.endswith("leave it fixed, or tie it to what has to move with it")
+    assert problem.startswith("length(link2) cannot vary by itself: joints")
+    assert problem.endswith("keep it fixed, or tie it to the parameters that must vary with it")
 
 
 def test_first_guesses_that_open_a_loop_are_refused(linkage):
@@ -98,10 +98,10 @@ def test_legal_to_first_order_is_not_enough(linkage):
     for name in ("link1", "link3"):
         assert loop_problems(linkage, lengths(name), [1.0], ["one of them"])
     (problem,) = loop_problems(linkage, apply, [0.0], ["d"])
-    assert problem.startswith("d cannot move by itself")
+    assert problem.startswith("d cannot vary by itself")
     # A pin beside its crank's line: longer by the square of the distance.
     (problem,) = asked(linkage, "joint.A1.points[1][1]")
-    assert "cannot move by itself" in problem
+    assert "cannot vary by itself" in problem
 
 
 def triangle():
@@ -130,7 +130,7 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
         return mechanism.with_parameters({f"joint.B{i}.points[0]": (1.0 + x[0]) * arm for i, arm in enumerate(arms)})
 
     (problem,) = loop_problems(mechanism, apply, [0.0], ["larger"])
-    assert "larger cannot move by itself" in problem
+    assert "larger cannot vary by itself" in problem
     monkeypatch.setattr(loop_consistency.RedundantLoops, "_closes", lambda *_: True)
     assert loop_problems(mechanism, apply, [0.0], ["larger"]) == [problem]
     monkeypatch.setattr(loop_consistency, "sample_positions", lambda rows, q: [rows.close(0.0, q)])
@@ -140,18 +140,18 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
 def test_cranks_under_a_triangle_must_stay_equal():
     mechanism, _, _ = triangle()
     (problem,) = loop_problems(mechanism, lengths("link0", "link1", "link2"), [1.0] * 3, ["a", "b", "c"])
-    assert "only holds for a = b = c" in problem
+    assert "only closes for a = b = c" in problem
 
 
 def test_pivots_move_with_the_coupler(linkage):
     a, b = "joint.A3.points[0][0]", "joint.B3.points[0][0]"
     (problem,) = asked(linkage, a, b)
-    assert f"only holds for {a} and {b} changing by the same amount; tie them" in problem
+    assert f"only closes for {a} and {b} changing by the same amount; tie them" in problem
     (problem,) = asked(linkage, "joint.B1.points[0][0]", b)
-    assert "cannot move, each by itself or together" in problem and problem.endswith("leave them fixed")
+    assert "cannot vary, neither independently nor together" in problem and problem.endswith("keep them fixed")
     # A third one that has no partner stays fixed.
     (problem,) = asked(linkage, a, b, "joint.B1.points[0][0]")
-    assert problem.endswith("tie them, and leave joint.B1.points[0][0] fixed")
+    assert problem.endswith("tie them, and keep joint.B1.points[0][0] fixed")
 
 
 def test_gears_on_two_axles_keep_their_ratio():
@@ -161,8 +161,8 @@ def test_gears_on_two_axles_keep_their_ratio():
     mechanism = udk.Mechanism(bodies, axles | wheels)
     names = ["joint.pair.radii[0]", "joint.second pair.radii[0]"]
     (problem,) = asked(mechanism, *names)
-    assert 'joints "pair" and "second pair" close a loop' in problem
-    assert f"only holds for {names[0]} and {names[1]} in proportion 1 : 0.5; tie them" in problem
+    assert 'joints "pair" and "second pair" form a loop' in problem
+    assert f"only closes for {names[0]} and {names[1]} in proportion 1 : 0.5; tie them" in problem
     assert asked(mechanism, "joint.one.points[0][0]", "joint.two.points[1][0]") == []  # wheels mesh wherever their axles are
 
 
@@ -170,7 +170,7 @@ def test_bars_of_a_scissor_lift_stay_equal_in_pairs():
     lift = udk.library.scissor_lift(1)
     names = ("rising0", "falling0")
     (problem,) = loop_problems(lift, lengths(*names), [1.0, 1.0], names)
-    assert "only holds for rising0 = falling0" in problem and '"guide"' in problem
+    assert "only closes for rising0 = falling0" in problem and '"guide"' in problem
     assert loop_problems(lift, lengths(names), [1.0], ["both"]) == []
 
 
@@ -202,7 +202,7 @@ def test_loops_side_by_side_are_told_apart(linkage):
     problems = loop_problems(both, apply, [1.0] * 6, cranks)
     assert len(problems) == 2
     for k, problem in enumerate(problems):
-        assert f"only holds for 1/{k} = 2/{k} = 3/{k};" in problem
+        assert f"only closes for 1/{k} = 2/{k} = 3/{k};" in problem
         assert f'"A1/{k}"' in problem and f'"A1/{1 - k}"' not in problem
 
 

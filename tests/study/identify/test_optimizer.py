@@ -39,12 +39,12 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize(("optimizer", "settled", "within"), OTHERS.values(), ids=list(OTHERS))
-def test_optimizers_end_where_least_squares_do(noisy, optimizer, settled, within):
+@pytest.mark.parametrize(("optimizer", "step_tol", "within"), OTHERS.values(), ids=list(OTHERS))
+def test_optimizers_end_where_least_squares_do(noisy, optimizer, step_tol, within):
     problem = problem_of(noisy)
-    fit = minimize_by_gradient(GradientMethod(optimizer), objective(problem), np.zeros(2), steps=600, settled=settled)
+    fit = minimize_by_gradient(GradientMethod(optimizer), objective(problem), np.zeros(2), steps=600, step_tol=step_tol)
     squares = Minimizer().minimize(problem, np.zeros(2), TOL)
-    assert fit.settled and np.abs(fit.z - squares.z).max() < within
+    assert fit.converged and np.abs(fit.z - squares.z).max() < within
     costs = [cost for cost, _ in fit.history]
     assert costs == sorted(costs, reverse=True) and costs[-1] == fit.cost
 
@@ -58,7 +58,7 @@ def test_a_loss_of_the_users_own(noisy):
     fit = minimize_by_gradient(method, objective(problem), np.zeros(2), steps=200)
     squares = Minimizer().minimize(problem, np.zeros(2), TOL)
     truth = problem.unknowns.z_of(np.array([0.375, 0.2]))
-    assert fit.settled and np.abs(fit.z - truth).max() < 0.02
+    assert fit.converged and np.abs(fit.z - truth).max() < 0.02
     assert np.abs(squares.z - truth).max() > 3.0 * np.abs(fit.z - truth).max()
 
 
@@ -69,5 +69,5 @@ def test_identify_takes_them(noisy):
     for choices in several:
         estimate = identify(first, record, NAMES, progress=False, **choices)
         assert estimate.converged and estimate.values == pytest.approx(squares.values, rel=1e-5)
-    with pytest.raises(IdentificationError, match="take one without a line search"):
+    with pytest.raises(IdentificationError, match="use one without a line search"):
         identify(first, record, NAMES, progress=False, optimizer=optax.lbfgs())

@@ -113,5 +113,5 @@ def test_every_mistake_is_told(linkage):
     told = "\n".join(error.value.problems)
     for part in ('"body.link1.maß"', "link9", "another kind", "bounds", "deviation", "must be > 0", "guess=", "tie them"):
         assert part in told, part
-    with pytest.raises(udk.IdentificationError, match="none to identify"):
+    with pytest.raises(udk.IdentificationError, match="the list is empty"):
         unknowns_of(linkage, [])

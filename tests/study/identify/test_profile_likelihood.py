@@ -73,8 +73,8 @@ def test_a_flat_direction_is_open():
     found = trace_profile(fit, 0, np.zeros(2), 0.00625, 1.0, value=lambda z: 3.0 * np.exp(z), name="a", units="kg")
     assert found.interval == (-np.inf, np.inf) and len(count) < 20
     assert found.text == (
-        "a is not known: no lower end as far as 6.183e-09 kg (the end of what was looked at), "
-        "no upper end as far as 1.455e+09 kg (the end of what was looked at)"
+        "a is undetermined: no lower end up to 6.183e-09 kg (the limit of the search), "
+        "no upper end up to 1.455e+09 kg (the limit of the search)"
     )
 
 
@@ -86,7 +86,7 @@ def test_one_end_may_be_open():
     end = 1.0 + np.sqrt(stats.chi2.ppf(0.95, 1) / 2)
     assert found.interval[0] == -np.inf
     assert_allclose(found.interval[1], end, rtol=2e-3)
-    looked = "no lower end as far as 2.061e-09 N s/m (the end of what was looked at)"
+    looked = "no lower end up to 2.061e-09 N s/m (the limit of the search)"
     assert found.text == f"b is below {found.interval[1]:.4g} N s/m (95 %): {looked}"
 
 
@@ -108,7 +108,7 @@ def test_it_ends_before_what_cannot_be_fitted():
 
 def test_few_steps_leave_it_open():
     found = trace_profile(curve(lambda z: 1e-6 * z**2), 0, np.zeros(1), 0.0, 1e-3, steps=5)
-    assert found.interval == (-np.inf, np.inf) and "(not in 5 steps)" in found.text and len(found.values) == 11
+    assert found.interval == (-np.inf, np.inf) and "(not reached in 5 steps)" in found.text and len(found.values) == 11
 
 
 def test_a_better_fit_on_the_way_is_said():
@@ -119,7 +119,7 @@ def test_a_better_fit_on_the_way_is_said():
 
     found = trace_profile(curve(cost), 0, np.zeros(1), 0.0, 0.3, name="a", units="m")
     assert found.costs[found.best] < -0.1 and 0.8 < found.values[found.best] < 1.3
-    assert found.text.endswith(f"a better fit was met at {found.values[found.best]:.6g} m: identify again from there")
+    assert found.text.endswith(f"a better fit was found at {found.values[found.best]:.6g} m: identify again from that guess")
 
 
 def test_curves_that_jump_and_estimates_at_a_bound():

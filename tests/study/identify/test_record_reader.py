@@ -111,12 +111,12 @@ def test_all_mistakes_of_a_file_are_told_at_once(mech, file):
     ]
     text = "\n".join(rest)
     for part in (
-        'no body named "cranc"; did you mean "crank"? (what is not to be read must be listed in `ignore`)',
+        'no body named "cranc"; did you mean "crank"? (list columns that are not to be read in `ignore`)',
         'there is no column "joint.O.fx"',
         '"deg" does not fit; it is measured in m, mm, cm',
         '"furlong" is not a known unit',
         'must be a number, is "x"',
-        "0.1 s does not exceed the one before, 0.2 s",
+        "0.1 s does not exceed the previous time, 0.2 s",
     ):
         assert part in text
 
@@ -124,8 +124,8 @@ def test_all_mistakes_of_a_file_are_told_at_once(mech, file):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("", "holds no header"),
-        ("# nothing\n", "holds no header"),
+        ("", "has no header"),
+        ("# nothing\n", "has no header"),
         ("body.crank.angle\n1\n", 'there is no column "time"'),
         ("Time,body.crank.angle\n0,1\n", 'did you mean "Time"?'),
         ("time,body.crank.angle,body.crank.angle [deg]\n0,1,1\n", 'there are two columns "body.crank.angle"'),
@@ -149,7 +149,7 @@ def test_a_mistake_in_a_file_says_where_it_is(mech, file, text, problem):
 
 def test_a_mistake_in_every_row_is_told_a_few_times(mech, file):
     found = problems(mech, file("time,body.crank.angle\n" + "".join(f"{k},x\n" for k in range(50))))
-    assert len(found) == 4 and found[-1].endswith("and so in 47 more rows")
+    assert len(found) == 4 and found[-1].endswith("the same in 47 more rows")
 
 
 def test_files_that_cannot_be_read_are_told(mech, file, tmp_path):
@@ -205,7 +205,7 @@ def test_mistakes_in_mappings_say_which_and_where(mech):
             'data[1], column "time": must be 3 numbers, is of shape (2,)',
             'data[1], entry 0, column "body.rod.x": must be a number, is true',
             'noise, "crank": begins with none of',
-            'noise: "body.crank.omega" is measured in no record',
+            'noise: "body.crank.omega" is not measured in any record',
         ),
         strict=True,
     ):

@@ -27,14 +27,14 @@ def test_noise_of_all_channels_or_of_none():
         ((TS.reshape(5, 1), {"c": TS}), "vector"),
         (([0.0, np.nan], {"c": [1.0, 2.0]}), "entry 1 is not a finite"),
         ((TS, {"c": TS[:3]}), "each of the 5 times"),
-        ((TS, {"c": np.full(5, np.nan)}), "holds no number"),
+        ((TS, {"c": np.full(5, np.nan)}), "contains no number"),
         ((TS, {"c": [1.0, np.inf, 1.0, 1.0, 1.0]}), "entry 1 is infinite"),
         ((TS, {"c": ["one"] * 5}), "must be numbers"),
         ((TS, {}), "no channel"),
         ((TS, {"c": TS}, {"d": 1.0}), "not among the channels"),
         ((TS, {"c": TS}, -1.0), "finite number > 0"),
         ((TS, {"c": TS}, {"c": [1.0, 2.0]}), "of shape"),
-        ((TS, {"c": TS}, None, None, 0.5), "after the first time"),
+        ((TS, {"c": TS}, None, None, 0.5), "after the first measurement"),
     ],
 )
 def test_what_a_record_cannot_be(arguments, told):

@@ -62,7 +62,7 @@ def test_a_first_guess_follows_what_was_measured(pieces):
 
 def test_the_fit_is_that_of_the_whole_record(problem):
     pieces, fit = fit_pieces(problem, np.zeros(problem.K), TOL, Minimizer(), samples=6)
-    assert fit.settled and explains(pieces, fit, TOL)
+    assert fit.converged and explains(pieces, fit, TOL)
     assert pieces.gaps(fit.z[None], TOL)[0] < 1e-7
     whole = Minimizer().minimize(problem, fit.z[:2], TOL)
     assert np.abs(fit.z[:2] - whole.z).max() < 1e-5
@@ -74,7 +74,7 @@ def test_the_fit_is_that_of_the_whole_record(problem):
 @pytest.mark.slow
 def test_whole_records_end_the_fit_where_they_can(problem):
     found = search(problem, np.zeros((1, problem.K)), TOL, Minimizer(), strategy="pieces")
-    assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.settled
+    assert found.ways == ("records in pieces",) and found.problem is problem and found.fit.converged
     assert found.fit.z.shape == (2,)
 
 

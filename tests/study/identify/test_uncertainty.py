@@ -103,7 +103,9 @@ def test_a_common_factor_is_found_and_said():
     assert np.isinf(known.covariance[0, 0]) and np.isnan(known.covariance[0, 2]) and np.isnan(known.correlation[1, 2])
     assert_allclose(known.covariance[2, 2], fixed.covariance[1, 1], rtol=1e-6)
     assert known.degrees_of_freedom == 58 and known.correlated == () and known.poor == ()
-    assert known.messages == (f"no measured quantity shows {flat.text}: fix one of them, give one a prior, or measure more",)
+    assert known.messages == (
+        f"no measured quantity changes with {flat.text}: fix one of them, give one a prior, or measure more",
+    )
 
 
 def test_two_flat_directions_are_told_apart():
@@ -148,7 +150,7 @@ def test_what_nothing_depends_on_is_named():
     assert known.dead == ("c",) and known.flat == () and np.isinf(known.standard_errors[2])
     rest = estimate_uncertainty(np.delete(J, 2, 1), r, positive(*"abd"), parameters=2)
     assert_allclose(known.standard_errors[:2], rest.standard_errors)
-    assert known.messages == ("no measured quantity depends on c: leave out what does not show, or measure what does",)
+    assert known.messages == ("no measured quantity depends on c: do not identify it, or measure other quantities",)
     nothing = estimate_uncertainty(np.zeros((5, 2)), np.ones(5), positive("a", "b"))
     assert nothing.dead == ("a", "b") and np.isinf(nothing.standard_errors).all()
 
@@ -158,7 +160,7 @@ def test_too_few_residuals(R):
     J = RNG(4).standard_normal((R, 3))
     known = estimate_uncertainty(J, np.zeros(R), positive(*"abc"), noise_group=np.zeros(R, int))
     assert np.isnan(known.noise).all() and not np.isfinite(known.standard_errors).any()
-    assert any("nothing from which to estimate the noise" in text for text in known.messages)
+    assert any("too few to estimate the noise" in text for text in known.messages)
     assert len(known.flat) == 3 - R
     given = estimate_uncertainty(J, np.zeros(R), positive(*"abc"))
     assert np.isfinite(given.standard_errors).all() == (R == 3)
@@ -174,8 +176,8 @@ def test_poorly_known_parameters_are_named_with_their_numbers():
     assert_allclose(known.standard_errors, [0.02, 2.4, 0.025, 6.0])
     assert known.poor == ("b", "d")
     assert known.messages == (
-        "b is poorly known: 3 kg m2 with a standard error of 2.4 kg m2 (80 %)",
-        "d is poorly known: 8 with a standard error of 6 (75 %)",
+        "b is poorly determined: 3 kg m2 with a standard error of 2.4 kg m2 (80 %)",
+        "d is poorly determined: 8 with a standard error of 6 (75 %)",
     )
 
 
@@ -185,10 +187,10 @@ def test_parameters_hardly_known_apart_are_named():
     known = estimate_uncertainty(J, r, positive("a", "b"))
     ((one, other, rho),) = known.correlated
     assert (one, other) == ("a", "b") and -1.0 < rho < -0.98
-    assert known.messages == (f"a and b are hardly known apart: their errors have the correlation {rho:.4f}",)
+    assert known.messages == (f"a and b are hard to distinguish: the correlation of their errors is {rho:.4f}",)
 
 
-@pytest.mark.parametrize(("noise", "said"), [(1.0, ""), (2.0, "times as large as the noise given"), (0.5, "are only")])
+@pytest.mark.parametrize(("noise", "said"), [(1.0, ""), (2.0, "times as large as the given noise"), (0.5, "are only")])
 def test_noise_that_is_not_as_given_is_noticed(noise, said):
     J, r = problem(R=200, noise=noise)
     texts = estimate_uncertainty(J, r, positive(*"abc")).messages

@@ -72,7 +72,7 @@ def test_a_sweep_that_is_done_computes_nothing_and_another_is_refused(tmp_path, 
     before, seen = chunks(tmp_path), []
     xarray.testing.assert_identical(sweep(out=tmp_path, progress=seen.append), whole)
     assert [status.done for status in seen] == [CHUNKS * PIECE] and chunks(tmp_path) == before
-    with pytest.raises(StoreError, match=r"settings\.drift_tol: was not there, is 0\.001"):
+    with pytest.raises(StoreError, match=r"settings\.drift_tol: was missing, is now 0\.001"):
         sweep(out=tmp_path, drift_tol=1e-3)
 
 
@@ -86,7 +86,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, monkeypatch, whole
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        with pytest.raises(StoreError, match=r"No space left on device; 3 chunks in .* stay valid"):
+        with pytest.raises(StoreError, match=r"No space left on device; the 3 finished chunks in .* stay valid"):
             sweep(out=tmp_path)
     before = chunks(tmp_path)
     assert len(before) == 3

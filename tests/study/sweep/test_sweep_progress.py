@@ -51,12 +51,12 @@ def test_a_sweep_is_followed(clock):
     watch(CHUNKS[4], {**result(), "steps": np.array([3, 9, 7, 10])})
     assert seen[-1].left == 6.0 and seen[-1].slowest == (19, 10) and seen[-1].slowest_chunk == (2, 7.5)
     assert str(seen[-1]) == (
-        "16 of 20 members (80 %); 0.857 a second; 6 s left; failed: 2 drift, 1 step limit; slowest chunk 2: 7.5 s; "
+        "16 of 20 members (80 %); 0.857 per second; 6 s left; failed: 2 drift, 1 step limit; slowest chunk 2: 7.5 s; "
         "slowest member 19: 10 steps"
     )
     clock.now += 1
     watch(CHUNKS[3], result())
-    assert str(seen[-1]).startswith("20 of 20 members (100 %); 1.07 a second; 15 s; failed")
+    assert str(seen[-1]).startswith("20 of 20 members (100 %); 1.07 per second; 15 s; failed")
 
 
 def test_it_is_reported_as_everything_else_is(capsys):

@@ -1,4 +1,4 @@
-"""Diagnosis of a mechanism: dependent constraints, fixes, and the configurations where its rank changes."""
+"""Diagnosis of a mechanism: dependent constraints, changes that remove them, and configurations where the rank changes."""
 
 from udkjax.study.diagnosis.diagnose import diagnose as diagnose
 from udkjax.study.diagnosis.diagnosis import Diagnosis as Diagnosis

@@ -1,11 +1,11 @@
-"""Distance of a configuration from the next one where the rank of the constraints changes.
+"""Distance from a configuration to the next one where the rank of the constraints changes.
 
-The smallest singular value that counts, sigma, is the distance of J to the nearest matrix of lower rank. Within the mechanism's
-own motion its slope along the displacements V that the constraints allow says how far that is, to first order: sigma / |sigma_V|,
-where sigma_V = u^T (J_q V) w. A mechanism of one degree of freedom, or one that is driven, is led along its path as well, both
-ways. Where sigma vanishes it has a kink, and with its sign turned beyond it goes through zero as smoothly as the path: a
-polynomial through closed positions on both sides has the configuration at its root. None of them is close to it, where closing is
-slow.
+The smallest nonzero singular value, sigma, is the distance of J to the nearest matrix of lower rank. Its slope along the
+displacements V that the constraints allow gives the distance within the mechanism's own motion to first order: sigma / |sigma_V|,
+where sigma_V = u^T (J_q V) w. A mechanism with one degree of freedom, or a driven one, is also followed along its path in both
+directions. Where sigma vanishes it has a kink; with its sign reversed beyond the kink, it passes through zero as smoothly as the
+path, so that the configuration is a root of a polynomial through closed positions on both sides. These positions are not close to
+the root, where closing is slow.
 """
 
 from itertools import pairwise
@@ -17,32 +17,32 @@ from scipy.optimize import brentq
 
 from udkjax.study.diagnosis.configuration import NEIGHBOUR_STEP, Configuration, RankedPositions
 
-SLOPE_STEP = 1e-5  # of the characteristic length, and rad: the third root of rounding, for central differences
-WALK_STEPS = 160  # steps along the path in each direction: about a turn of everything, or more
-POINTS_BESIDE = 4  # positions on each side of a root that the polynomial goes through: it misses a step to the eighth
+SLOPE_STEP = 1e-5  # relative to the characteristic length, and rad: the cube root of rounding, for central differences
+WALK_STEPS = 160  # steps along the path in each direction: about one turn of the mechanism, or more
+POINTS_PER_SIDE = 4  # positions on each side of a root that the polynomial interpolates: its error is O(step^8)
 
 
 class RankChange(NamedTuple):
-    """The next configuration on the path where the rank is another one."""
+    """The next configuration on the path where the rank differs."""
 
     t: float  # s
     q: np.ndarray  # (bodies, 3)
     rank: int
-    distance: float  # along the path: the norm of the displacement, lengths over L and angles in rad
-    forward: bool  # in which direction of the path, or of time
+    distance: float  # along the path: norm of the displacement, rad and lengths over the characteristic length
+    forward: bool  # direction along the path, or in time
 
 
 class Clearance(NamedTuple):
-    """Distance of the next rank change."""
+    """Distance to the next rank change."""
 
-    smallest: float  # the smallest singular value that counts, relative to the largest
-    estimate: float  # the distance by its slope, as in `RankChange`; infinite where it does not change
+    smallest: float  # the smallest nonzero singular value, relative to the largest
+    estimate: float  # distance estimated from its slope, as in `RankChange`; infinite if the slope is zero
     nearest: RankChange | None  # the change found on the path; only a single degree of freedom has a path
     searched: float  # length of the path that was searched
 
 
 def clearance(positions: RankedPositions, at: Configuration, rank: int, walk: bool = True) -> Clearance:
-    """Look for the next configuration where the rank is below `rank`, which it has in general."""
+    """Return the distance to the next configuration where the rank is below `rank`, the generic rank."""
     if not rank or at.rank < rank:
         return Clearance(0.0 if rank else 1.0, 0.0 if rank else np.inf, None, 0.0)
     sigma = at.sigma[rank - 1]
@@ -60,7 +60,7 @@ def _slope(positions: RankedPositions, at: Configuration, direction: np.ndarray,
 
 
 def _search(positions: RankedPositions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
-    """Return the nearest rank change on the path, and how far that was followed."""
+    """Return the nearest rank change on the path, and the length of path searched."""
     onward, around = _walk(positions, start, rank, 1.0)
     back = [] if around else _walk(positions, start, rank, -1.0)[0]
     path = [*reversed(back), start, *onward]
@@ -75,7 +75,7 @@ def _search(positions: RankedPositions, start: Configuration, rank: int) -> tupl
 
 
 def _walk(positions: RankedPositions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
-    """Follow closed positions along the path to beyond the first minimum of sigma; say whether they came back to the start."""
+    """Return closed positions along the path to beyond the first minimum of sigma, and True if they returned to the start."""
     path, more = [start], WALK_STEPS
     heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
     while more:
@@ -88,20 +88,20 @@ def _walk(positions: RankedPositions, start: Configuration, rank: int, side: flo
             heading = _onward([c.q / positions.unit for c in path[-3:]])
         if len(path) > 3 and positions.distance(start, moved, turns=False) < NEIGHBOUR_STEP:
             return path[1:], True
-        if len(path) > 2 and more > POINTS_BESIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
-            more = POINTS_BESIDE
+        if len(path) > 2 and more > POINTS_PER_SIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
+            more = POINTS_PER_SIDE
     return path[1:], False
 
 
 def _onward(places: list[np.ndarray]) -> np.ndarray:
-    """Return the direction to the next of two or three places on a path: of three, that of the parabola through them."""
+    """Return the direction onward from the last of two or three points of a path; that of their parabola, if three."""
     *before, last = np.diff(places, axis=0)
     onward = 2 * last - before[0] * np.linalg.norm(last) / np.linalg.norm(before[0]) if before else last
     return onward / np.linalg.norm(onward)
 
 
 def _has_kink(sigma: list[float]) -> bool:
-    """Return True if three values have a minimum that may be one of zero: not above the rise on either side."""
+    """Return True if three values have a minimum that may be zero: not above the rise on one of its sides."""
     return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
@@ -111,11 +111,11 @@ def _step(positions: RankedPositions, at: Configuration, heading: np.ndarray, st
 
 
 def _root(positions: RankedPositions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
-    """Return the configuration beside the k-th position where sigma vanishes, if it does."""
+    """Return the configuration near the k-th position where sigma vanishes, if it does."""
     if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None
-    near = slice(max(0, k - POINTS_BESIDE), k + POINTS_BESIDE + 1)
-    for turned in (k, k + 1):  # from where on sigma has the other sign
+    near = slice(max(0, k - POINTS_PER_SIDE), k + POINTS_PER_SIDE + 1)
+    for turned in (k, k + 1):  # the first position beyond the root, where the sign of sigma is reversed
         signed = np.where(np.arange(len(sigma)) < turned, sigma, -sigma)
         smooth = BarycentricInterpolator(way[near], signed[near])
         low, high = (way[k - 1], way[k]) if turned == k else (way[k], way[k + 1])

@@ -1,6 +1,6 @@
-"""One closed position of a mechanism, its scaled Jacobian and what that leaves free; and closed positions around it.
+"""A closed position of a mechanism, its scaled Jacobian with null spaces, and nearby closed positions.
 
-All of it is NumPy on the scene's programs: nothing is compiled for it. Rows and columns are scaled as in determinacy.py.
+Everything is NumPy on the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py.
 """
 
 from functools import cached_property
@@ -13,19 +13,19 @@ from udkjax.equations.position_closure import LONGEST_STEP, close_position, is_c
 from udkjax.equations.redundancy import PositionRows, kinematic_rows
 from udkjax.scene.mechanism import Mechanism
 
-NEIGHBOUR_STEP = 0.1  # of the characteristic length, and rad: from one position to the next of a neighbourhood
-N_NEIGHBOURS = 12  # of a neighbourhood
-SMALLEST_MOVE = 0.01  # of a step: positions nearer than that to each other are the same
+NEIGHBOUR_STEP = 0.1  # relative to the characteristic length, and rad: from one neighbour to the next
+N_NEIGHBOURS = 12
+SMALLEST_MOVE = 0.01  # relative to a step: positions closer to each other are the same
 
 
 class Configuration:
-    """A closed position and its scaled Jacobian J = U S V^T, decomposed as far as it is asked for.
+    """A closed position and its scaled Jacobian J = U S V^T, decomposed only as far as needed.
 
     Args:
         t: time (s).
         q: coordinates (n,).
         J: scaled Jacobian (m, n).
-        rank_tol: singular values up to so much of the largest count as zero.
+        rank_tol: singular values up to this fraction of the largest count as zero.
     """
 
     def __init__(self, t: float, q: np.ndarray, J: np.ndarray, rank_tol: float):
@@ -33,12 +33,12 @@ class Configuration:
 
     @cached_property
     def sigma(self) -> np.ndarray:
-        """The singular values alone, which take a fraction of the time of all."""
+        """The singular values, without the vectors, which take several times as long."""
         return singular_values(self.J)
 
     @cached_property
     def rank(self) -> int:
-        """The number of singular values that count."""
+        """Number of nonzero singular values."""
         return count_rank(self.sigma, self._rank_tol)
 
     @cached_property
@@ -58,27 +58,27 @@ class Configuration:
 
     @property
     def left(self) -> np.ndarray:
-        """The combinations of rows that vanish, (m, m - rank)."""
+        """Basis of the left null space, (m, m - rank): combinations of rows that vanish."""
         return self.u[:, self.rank :]
 
     @property
     def right(self) -> np.ndarray:
-        """The displacements that the constraints allow to first order, (n, n - rank)."""
+        """Basis of the null space, (n, n - rank): displacements that the constraints allow to first order."""
         return self.vt[self.rank :].T
 
     @property
     def redundancy(self) -> int:
-        """Number of rows that depend on others."""
+        """Number of redundant rows."""
         return len(self.J) - self.rank
 
     @property
     def smallest(self) -> float:
-        """The smallest singular value that counts, relative to the largest."""
+        """The smallest nonzero singular value, relative to the largest."""
         return float(self.sigma[self.rank - 1] / self.sigma[0]) if self.rank else 1.0
 
 
 class RankedPositions:
-    """The closed positions of one mechanism of known numbers."""
+    """Closed positions of one mechanism with concrete numbers."""
 
     def __init__(self, mechanism: Mechanism, rank_tol: float):
         rows = self.rows = KinematicRows(mechanism)
@@ -88,13 +88,13 @@ class RankedPositions:
         self.row_unit = np.asarray(rows.scales.rows, float)
 
     def at(self, t: float, q: np.ndarray) -> Configuration:
-        """Return the configuration of closed coordinates."""
+        """Return the configuration at closed coordinates."""
         J = self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
         return Configuration(t, q, J, self.rank_tol)
 
     @cached_property
     def _closing(self) -> PositionRows:
-        return kinematic_rows(self._mechanism)  # sparse, of large scenes
+        return kinematic_rows(self._mechanism)  # sparse in large scenes
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
         """Return the closed position nearest to q, or None."""
@@ -105,18 +105,18 @@ class RankedPositions:
         return self.at(t, q) if is_closed(self.rows.scales, q, 0 * q, psi, 0 * psi, np) else None
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
-        """Return the closed position nearest to one that is displaced by a step along a direction, in scaled coordinates."""
+        """Return the closed position nearest to `start` displaced by a step along a direction in scaled coordinates, or None."""
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
     def distance(self, one: Configuration, two: Configuration, turns: bool = True) -> float:
-        """Return the distance of two positions: the norm of the scaled displacement; whole turns may not count."""
+        """Return the distance of two positions: the norm of the scaled displacement, modulo whole turns unless `turns`."""
         way = (two.q - one.q) / self.unit
         if not turns:
             way[2::3] = np.remainder(way[2::3] + np.pi, 2 * np.pi) - np.pi
         return float(np.linalg.norm(way))
 
     def around(self, start: Configuration) -> list[Configuration]:
-        """Return closed positions along a random motion from one, while drivers go on; none where it cannot move."""
+        """Return closed positions along a random motion from `start`, with drivers in motion; empty if it cannot move."""
         random, found, last = np.random.default_rng(0), [], start
         heading, t = random.standard_normal(len(start.q)), start.t
         for _ in range(N_NEIGHBOURS if self.rows.count else 0):
@@ -135,18 +135,18 @@ class RankedPositions:
 
 
 class JointForces(NamedTuple):
-    """Multipliers of a constraint that equilibrium decides."""
+    """Uniqueness of the multipliers of a constraint."""
 
     unique: tuple[bool, ...]  # row by row
-    share: tuple[float, ...]  # the length of each row of N: 0 unique, 1 arbitrary
-    direction: float | None  # of a joint that holds a point: the only one (rad) in which its force is unique, if there is one
+    share: tuple[float, ...]  # norm of each row of N: 0 unique, 1 arbitrary
+    direction: float | None  # for a joint at a point: the only direction (rad) in which its force is unique, if any
 
 
 def singular_values(J: np.ndarray) -> np.ndarray:
-    """Return the singular values of a matrix, which may have no entries."""
+    """Return the singular values of a matrix, which may be empty."""
     return np.linalg.svd(J, compute_uv=False) if J.size else np.zeros(0)
 
 
 def count_rank(sigma: np.ndarray, rank_tol: float) -> int:
-    """Return the number of singular values, the largest first, that are above `rank_tol` of the largest."""
+    """Return the number of singular values, sorted from the largest, that exceed `rank_tol` times the largest."""
     return int(np.sum(sigma > rank_tol * sigma[:1]))

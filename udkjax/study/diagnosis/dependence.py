@@ -1,9 +1,9 @@
-"""Minimal sets of constraints that depend on each other: circuits of the matroid of the rows, constraint by constraint.
+"""Minimal sets of dependent constraints: circuits of the matroid of the rows, grouped by constraint.
 
 N spans the null space of J^T. The rows of a set S of constraints are dependent if and only if a combination y of the columns of N
-vanishes outside S, N[outside] y = 0, and redundant by nullity(N) - rank(N[outside]). S is minimal if no constraint can be taken
-out of it. One set is grown around each constraint; the smallest are taken until their combinations y span all of N. Further
-combinations are searched for without a row of each that is known.
+vanishes outside S, N[outside] y = 0; the number of redundant rows is nullity(N[outside]). S is minimal if no constraint can be
+removed from it. One set is found around each constraint; the smallest are taken until their combinations y span all of N. Further
+combinations are searched for after leaving out one row of each that was found.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,23 +13,23 @@ import numpy as np
 
 from udkjax.pinv.row_spaces import null_space
 
-DEPENDS = 1e-6  # the length of rows of N, whose columns are orthonormal: rounding leaves far less
+DEPENDS = 1e-6  # norm of a row of N, whose columns are orthonormal, from which it is nonzero: far above rounding
 
 
 class Dependency(NamedTuple):
-    """A minimal set of constraints whose rows depend on each other."""
+    """A minimal set of constraints whose rows are dependent."""
 
     constraints: tuple[str, ...]
     redundancy: int  # number of their redundant rows
 
 
 def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple[str, ...]]) -> list[Dependency]:
-    """Return minimal dependent sets that together say all that N (m, k) does, the smallest first.
+    """Return minimal dependent sets whose combinations together span N (m, k), the smallest first.
 
-    `owners` is the constraint of each row, `attached` the bodies of each constraint, by which near ones come first into a set.
+    `owners` is the constraint of each row, `attached` the bodies of each constraint: neighbouring constraints are preferred.
     """
     owner, found = np.array(owners), []
-    spanned = np.zeros((N.shape[1], 0))  # the combinations of columns that the sets found so far are made of
+    spanned = np.zeros((N.shape[1], 0))  # basis of the combinations of columns of the sets found so far
     remaining = N
     while spanned.shape[1] < N.shape[1]:
         involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
@@ -41,7 +41,7 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
             if rank > spanned.shape[1]:
                 found.append(Dependency(tuple(members), rank - spanned.shape[1]))
                 spanned = both[0][:, :rank]
-        # Combinations that no set accounts for yet: those of N that vanish in one row for each that the sets span.
+        # Combinations that no set accounts for yet: those that vanish in one row for each combination already spanned.
         remaining = N
         rest = N @ spanned
         while rest.shape[1]:
@@ -52,19 +52,19 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
 
 
 def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:
-    """Return by how many rows a set of constraints is redundant in itself."""
+    """Return the number of redundant rows of a set of constraints on its own."""
     return len(null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS))
 
 
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
-    """Return combinations of a set's rows that vanish, (m, redundancy): forces by which it balances itself."""
+    """Return combinations of a set's rows that vanish, (m, redundancy): its states of self-stress."""
     return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS).T
 
 
 def _minimal_set_around(
     seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]
 ) -> list[str]:
-    """Return a minimal dependent set around one constraint: of all, the farthest are taken out first."""
+    """Return a minimal dependent set around one constraint: starting from all, the farthest are removed first."""
     far = _distances(seed, involved, attached)
     members = list(involved)
     for name in sorted(involved, key=lambda name: -far[name]):

@@ -1,4 +1,4 @@
-"""`diagnose`: freedoms, redundancy, singularity and determinate forces of a mechanism, and its rank along a trajectory."""
+"""`diagnose`: mobility, redundancy, singularities and unique forces of a mechanism, and its rank along a trajectory."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fixes_of
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.timeline import timeline
 
-MOST_FIXES = 64  # of a cure, one after another
+MOST_FIXES = 64  # fixes of a cure, applied in sequence
 
 
 @checked
@@ -31,46 +31,46 @@ def diagnose(
     fixes: bool = True,
     walk: bool = True,
 ) -> Diagnosis:
-    """Say what depends on what in a mechanism, what to do about it, and where its rank changes.
+    """Find dependent constraints, changes that remove them, and configurations where the rank changes.
 
-    The rank is that of the scaled Jacobian J of Psi: lengths over the characteristic one, angles in radians, each row over what
-    moves it; so a mechanism of a micrometre and one of a kilometre get the same diagnosis.
+    The rank is that of the scaled Jacobian J of Psi: lengths are divided by the characteristic length, angles are in radians, and
+    rows are scaled, so that a mechanism of a micrometre and one of a kilometre get the same diagnosis.
 
     Args:
-        mechanism: its numbers are known.
-        state: the configuration; by default the initial guess, or the start of `solution`. It is closed first.
+        mechanism: mechanism with concrete numbers.
+        state: the configuration, closed first; by default the initial guess, or the start of `solution`.
         solution: a trajectory, for the `timeline`.
         t: time (s) of the configuration, for drivers.
-        rank_tol: singular values of J up to so much of the largest count as zero.
-        time_tol: half the width of the brackets of the times of rank changes (s); by default 1e-9 of the characteristic time.
-        fixes: whether to look for, and verify, changes that take redundancy away.
-        walk: whether to follow a mechanism of one degree of freedom, or a driven one, along its path to the next rank change.
+        rank_tol: singular values of J up to this fraction of the largest count as zero.
+        time_tol: half-width of the brackets around times of rank changes (s); by default 1e-9 of the characteristic time.
+        fixes: whether to search for changes that remove redundancy, and verify them.
+        walk: whether to follow a mechanism with one degree of freedom, or a driven one, along its path to the next rank change.
 
     Returns:
-        The `Diagnosis`; print it.
+        The `Diagnosis`, which prints as text.
 
     Raises:
         AssemblyError: the configuration cannot be closed.
         ValueError: numbers of the mechanism are traced.
     """
     if not mechanism.is_concrete:
-        raise ValueError("diagnose takes known numbers: under jit and vmap take uniqueness and singular_values, which are pure")
+        raise ValueError("diagnose needs concrete numbers: under jit and vmap use uniqueness and singular_values, which are pure")
     if state is None and solution is not None:
         state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])
     closure = close(mechanism, t, state)
-    require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # velocities have no part in it
+    require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # the diagnosis does not depend on velocities
     q = np.asarray(closure.state.q, float)
     positions = RankedPositions(mechanism, rank_tol)
     rows = positions.rows
     current = positions.at(float(t), q.ravel())
     neighbours = positions.around(current)
-    ordinary = max([current.rank, *(c.rank for c in neighbours)])
-    usual = [c for c in [current, *neighbours] if c.rank == ordinary]
+    generic_rank = max([current.rank, *(c.rank for c in neighbours)])
+    generic = [c for c in [current, *neighbours] if c.rank == generic_rank]
     owners = [name for name, _ in rows.names]
-    permanent, momentary = _dependencies(mechanism, current, usual, owners)
-    if not neighbours and current.right.size:  # it moves to first order only, which is what these rows leave undecided
+    permanent, momentary = _dependencies(mechanism, current, generic, owners)
+    if not neighbours and current.right.size:  # it moves to first order only, because of dependence in this configuration
         permanent, momentary = [], [*permanent, *momentary]
-    found = _with_fixes(mechanism, positions, usual if fixes else [], permanent)
+    found = _with_fixes(mechanism, positions, generic if fixes else [], permanent)
     found += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
     of_joints = [k for k, name in enumerate(owners) if name in mechanism.joints]
     return Diagnosis(
@@ -80,30 +80,30 @@ def diagnose(
         coordinates=rows.size,
         rows=rows.count,
         rank=current.rank,
-        ordinary_rank=ordinary,
+        ordinary_rank=generic_rank,
         joint_rank=count_rank(singular_values(current.J[of_joints]), rank_tol),
         joint_rows=len(of_joints),
         can_move=bool(neighbours),
         redundancies=tuple(found),
-        cure=_cure(mechanism, positions, usual, found) if fixes else (),
+        cure=_cure(mechanism, positions, generic, found) if fixes else (),
         branches=tuple(branches(mechanism, positions, current)),
         forces=_forces(mechanism, current, owners),
         singular_values=current.sigma,
-        clearance=clearance(positions, current, ordinary, walk),
+        clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
     )
 
 
 def _dependencies(
-    mechanism: Mechanism, here: Configuration, usual: list[Configuration], owners: list[str]
+    mechanism: Mechanism, here: Configuration, generic: list[Configuration], owners: list[str]
 ) -> tuple[list[Dependency], list[Dependency]]:
-    """Return the sets that depend on each other in all positions of ordinary rank, and those that only do so here."""
+    """Return the sets of constraints that are dependent in all generic configurations, and those that are dependent only here."""
     attached = {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
-    best = max(usual, key=lambda c: c.smallest)
+    best = max(generic, key=lambda c: c.smallest)
     permanent = dependencies(best.left, owners, attached)
     if here.rank == best.rank:
         return permanent, []
-    # Here: the combinations that vanish, less those that vanish everywhere, each of which gives up one row.
+    # Combinations of rows that vanish here, without those that vanish everywhere: each of the latter gives up one row.
     spared = choose_dispensable([best.left])
     N = here.left
     for row in spared:
@@ -113,23 +113,23 @@ def _dependencies(
 
 
 def _with_fixes(
-    mechanism: Mechanism, positions: RankedPositions, usual: list[Configuration], sets: list[Dependency]
+    mechanism: Mechanism, positions: RankedPositions, generic: list[Configuration], sets: list[Dependency]
 ) -> list[Redundancy]:
-    """Return sets that depend on each other everywhere, with their fixes in some positions: none, where there are none."""
+    """Return permanently dependent sets with the fixes that help in all of some positions; without fixes if there are none."""
     owners = [name for name, _ in positions.rows.names]
-    at = sorted(usual, key=lambda c: -c.smallest)  # the stress of a set is that of the first
+    at = sorted(generic, key=lambda c: -c.smallest)  # the first one determines the stress of a set
     fixes = [fixes_of(mechanism, positions, at, owners, one) if at else [] for one in sets]
     return [Redundancy(one.constraints, one.redundancy, True, tuple(own)) for one, own in zip(sets, fixes, strict=True)]
 
 
 def _cure(
-    mechanism: Mechanism, positions: RankedPositions, usual: list[Configuration], found: list[Redundancy]
+    mechanism: Mechanism, positions: RankedPositions, generic: list[Configuration], found: list[Redundancy]
 ) -> tuple[Fix, ...]:
-    """Return the best fixes one after another, each found on what the one before has left, until nothing is redundant."""
+    """Return the best fixes in sequence, each found after applying the previous one, until nothing is redundant."""
     done: list[Fix] = []
     sets = [r for r in found if r.permanent]
     best = max((r.fixes[0] for r in sets if r.fixes), key=lambda fix: (fix.removes, fix.conditioning), default=None)
-    at = usual
+    at = generic
     while best is not None:
         done.append(best)
         ranked = RankedPositions(best.mechanism, positions.rank_tol)
@@ -137,13 +137,13 @@ def _cure(
         left = _dependencies(best.mechanism, at[0], at, owners)[0]
         if not left or len(done) == MOST_FIXES:
             return tuple(done)
-        order = sorted(at, key=lambda c: -c.smallest)  # the stress of a set is that of the first
+        order = sorted(at, key=lambda c: -c.smallest)  # the first one determines the stress of a set
         best = best_fix(best.mechanism, ranked, order, owners, left)
     return ()
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
-    """Return the uniqueness of multipliers, by N; and of a pin's force the direction that alone is unique, if there is one."""
+    """Return which multipliers are unique, from N, and for a pin the only direction in which its force is unique, if any."""
     found = {}
     for name, element in mechanism.constraints.items():
         own = [k for k, owner in enumerate(owners) if owner == name]

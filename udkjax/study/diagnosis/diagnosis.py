@@ -14,22 +14,22 @@ from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
 
 LABEL_WIDTH = 14  # characters of a section's title
-MOST_FIXES_SHOWN = 8  # fixes of one set that are printed
-SMALLEST_POSE_NUMBER = 1e-9  # rad, and of the length: smaller numbers of a pose are rounding
+MOST_FIXES_SHOWN = 8  # printed fixes of one set
+SMALLEST_POSE_NUMBER = 1e-9  # rad, and relative to the length: smaller numbers of a pose are rounding
 
 
 class Diagnosis(NamedTuple):
-    """The freedoms, redundancies, singularities and determinate forces of a mechanism in one configuration.
+    """Mobility, redundant constraints, singularities and unique forces of a mechanism in one configuration.
 
     Attributes:
-        mechanism: of which it is.
+        mechanism: the mechanism.
         coordinates: number of coordinates.
-        rows: number of rows, of joints and drivers.
+        rows: number of rows (scalar constraint equations) of joints and drivers.
         joint_rows: number of rows of joints.
-        redundancies: minimal sets of dependent rows, with their fixes.
+        redundancies: minimal sets of dependent constraints, with their fixes.
         branches: motions that meet in a singular configuration.
-        forces: for each joint, which components of its forces are unique.
-        clearance: distance to where the rank changes.
+        forces: for each constraint, which components of its forces are unique.
+        clearance: distance to the next rank change.
         timeline: rank and singular values along a solution; None without one.
     """
 
@@ -39,12 +39,12 @@ class Diagnosis(NamedTuple):
     coordinates: int
     rows: int
     rank: int  # of Psi_q in this configuration
-    ordinary_rank: int  # in closed positions around it
+    ordinary_rank: int  # in nearby closed positions: the generic rank
     joint_rank: int  # of the rows of joints alone, in this configuration
     joint_rows: int
-    can_move: bool  # whether closed positions around it were found
+    can_move: bool  # True if closed positions nearby were found
     redundancies: tuple[Redundancy, ...]
-    cure: tuple[Fix, ...]  # fixes one after another, after which nothing is redundant; empty where nothing helps, or need not
+    cure: tuple[Fix, ...]  # fixes to apply in sequence, after which nothing is redundant; empty if no fix helps or is needed
     branches: tuple[Branch, ...]
     forces: dict[str, JointForces]
     singular_values: np.ndarray  # of the scaled Jacobian
@@ -53,29 +53,29 @@ class Diagnosis(NamedTuple):
 
     @property
     def gruebler(self) -> int:
-        """Coordinates less rows: Gruebler's count, which takes every row for independent."""
+        """Gruebler's count: coordinates minus rows, as if all rows were independent."""
         return self.coordinates - self.rows
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of directions in which the mechanism can move, along the branch that has most, with drivers held."""
+        """Number of degrees of freedom with drivers held, on the branch that has the most."""
         if self.is_singular or not self.can_move:
             return max((branch.degrees_of_freedom for branch in self.branches if branch.followed), default=0)
         return self.coordinates - self.ordinary_rank
 
     @property
     def mobility(self) -> int:
-        """To first order: coordinates less the rank here, with drivers held."""
+        """First-order mobility with drivers held: coordinates minus the rank here."""
         return self.coordinates - self.rank
 
     @property
     def joint_mobility(self) -> int:
-        """To first order, of the joints alone: what drivers have to move."""
+        """First-order mobility of the joints alone, without drivers."""
         return self.coordinates - self.joint_rank
 
     @property
     def is_singular(self) -> bool:
-        """True if the rank here is lower than around it, or it moves to first order only."""
+        """True if the rank is lower here than nearby, or the mechanism moves to first order only."""
         return self.rank < self.ordinary_rank or (self.mobility > 0 and not any(branch.followed for branch in self.branches))
 
     @property
@@ -85,16 +85,16 @@ class Diagnosis(NamedTuple):
 
     @property
     def conditioning(self) -> float:
-        """The largest singular value of the scaled Jacobian over the smallest that counts."""
+        """Condition number of the scaled Jacobian: its largest over its smallest nonzero singular value."""
         return float(self.singular_values[0] / self.singular_values[self.rank - 1]) if self.rank else 1.0
 
     @property
     def cured(self) -> Mechanism | None:
-        """The mechanism after the fixes of `cure`: the same motion, nothing redundant. None where there are none."""
+        """The mechanism after the fixes of `cure`: the same motion, nothing redundant. None if `cure` is empty."""
         return self.cure[-1].mechanism if self.cure else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything as plain numbers, lists and texts, for JSON; angles in rad."""
+        """Return everything as plain numbers, lists and strings, for JSON; angles in rad."""
         found, names, line = plain(self), self.mechanism.body_names, self.timeline
         for branch in found["branches"]:
             branch["tangent"] = dict(zip(names, branch["tangent"], strict=True))
@@ -126,10 +126,10 @@ class Diagnosis(NamedTuple):
 
 
 def _sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
-    """Say everything, title by title, in lines."""
+    """Return the title and the lines of each section that has any."""
     parts = [
-        ("freedoms", _freedoms(found)),
-        ("dependent", [line for r in found.redundancies for line in _redundancy(r)]),
+        ("mobility", _mobility(found)),
+        ("redundancy", [line for r in found.redundancies for line in _redundancy(r)]),
         ("cure", _cure(found)),
         ("singular", _singular(found)),
         ("branches", _branches(found)),
@@ -140,56 +140,60 @@ def _sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
     return [(title, lines) for title, lines in parts if lines]
 
 
-def _freedoms(found: Diagnosis) -> list[str]:
+def _mobility(found: Diagnosis) -> list[str]:
     bodies = f"{found.coordinates // 3} {'body' if found.coordinates == 3 else 'bodies'}"
-    free = plural(found.degrees_of_freedom, "degree") + " of freedom"
+    actual, free = found.coordinates - found.ordinary_rank, plural(found.degrees_of_freedom, "degree") + " of freedom"
     lines = [
-        f"Gruebler's count: 3 x {bodies} - {plural(found.rows, 'row')} = {found.gruebler}",
-        f"true: {found.coordinates} - rank {found.ordinary_rank} = {found.coordinates - found.ordinary_rank}"
-        + (f" ({free})" if found.degrees_of_freedom == found.coordinates - found.ordinary_rank else f"; it moves in {free}"),
+        f"Gruebler's count: 3 x {bodies} - {plural(found.rows, 'row')} (constraint equations) = {found.gruebler}",
+        f"by the rank: {found.coordinates} coordinates - rank {found.ordinary_rank} = {actual}"
+        + (f" ({free})" if found.degrees_of_freedom == actual else f"; it moves with {free}"),
     ]
-    if found.gruebler != found.coordinates - found.ordinary_rank:
-        extra = found.rows - found.ordinary_rank
-        lines.append(
-            f"the count takes every row for independent; {extra} {'says' if extra == 1 else 'say'} what others say already"
-        )
+    if found.gruebler != actual:
+        extra = plural(found.rows - found.ordinary_rank, "row")
+        lines.append(f"Gruebler's count treats every row as independent, but {extra} can be left out without any effect")
     if found.rows > found.joint_rows:
-        lines.append(
-            f"the joints alone leave {found.joint_mobility}, of which drivers hold {found.joint_mobility - found.mobility}"
-        )
+        held = plural(found.joint_mobility - found.mobility, "degree")
+        lines.append(f"without drivers: {plural(found.joint_mobility, 'degree')} of freedom; drivers hold {held} of freedom")
     return lines
 
 
 def _redundancy(r: Redundancy) -> list[str]:
-    when = "everywhere along the motion" if r.permanent else "in this configuration only"
-    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant row')}, {when}"]
+    when = "in every position" if r.permanent else "in this configuration only"
+    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant row')} {when}"]
+    if r.fixes:
+        lines[0] += "; any one of these changes removes it:" if r.count == 1 else "; any one of these changes helps:"
     for fix in r.fixes[:MOST_FIXES_SHOWN]:
-        more = f", takes {fix.removes} redundant rows" if fix.removes > 1 and fix.removes > r.count else ""
-        lines.append(f"  fix {fix.constraint}: {fix.change} (condition {1 / fix.conditioning:.3g}{more})")
+        more = f", removes {fix.removes} redundant rows" if fix.removes > 1 and fix.removes > r.count else ""
+        lines.append(f"  {fix.constraint}: {fix.change} (condition number {1 / fix.conditioning:.3g}{more})")
     lines += [f"  ... {len(r.fixes) - MOST_FIXES_SHOWN} more"] if len(r.fixes) > MOST_FIXES_SHOWN else []
     if r.permanent and not r.fixes:
-        lines.append("  no single change of a joint was found that takes redundancy away and leaves the mobility")
+        lines.append("  no single change of a joint was found that removes redundancy and keeps the mobility")
     return lines
 
 
 def _cure(found: Diagnosis) -> list[str]:
-    return [f"{fix.constraint}: {fix.change}" for fix in found.cure] if len(found.cure) > 1 else []
+    if len(found.cure) < 2:
+        return []
+    return ["these changes together remove all redundancy:", *(f"  {fix.constraint}: {fix.change}" for fix in found.cure)]
 
 
 def _singular(found: Diagnosis) -> list[str]:
     if found.rank < found.ordinary_rank:
         return [
-            f"the rank here is {found.rank}, around it {found.ordinary_rank}; to first order the mobility is {found.mobility}"
+            f"the rank is {found.rank} here, and {found.ordinary_rank} nearby; the first-order mobility is {found.mobility} here"
         ]
     if found.is_singular:
-        return [f"it moves to first order only, in {found.mobility}: no displacement satisfies the constraints to second order"]
+        return [
+            f"the first-order mobility is {found.mobility}, but no displacement satisfies the constraints to second order: "
+            "the mechanism cannot move"
+        ]
     return []
 
 
 def _branches(found: Diagnosis) -> list[str]:
     if not found.is_singular:
         return []
-    lines = [f"{len(found.branches)} meet" if len(found.branches) != 1 else "one goes through"]
+    lines = [f"{len(found.branches)} branches meet here" if len(found.branches) != 1 else "one branch passes through"]
     for k, branch in enumerate(found.branches):
         moving = [
             f"{name} ({', '.join(f'{x:.3g}' if abs(x) > SMALLEST_POSE_NUMBER else '0' for x in row)})"
@@ -197,7 +201,7 @@ def _branches(found: Diagnosis) -> list[str]:
             if np.abs(row).max() > SMALLEST_POSE_NUMBER
         ]
         state = f"rank {branch.rank}" if branch.followed else "not followed: it may end here"
-        lines.append(f"  {k + 1}: {state}; dx, dy, dangle of {'; '.join(moving)}")
+        lines.append(f"  {k + 1}: {state}; direction (dx, dy, dangle): {'; '.join(moving)}")
     return lines
 
 
@@ -208,7 +212,8 @@ def _forces(found: Diagnosis) -> list[str]:
         if all(forces.unique):
             continue
         loose = [row_label(found.mechanism, name, k) for k, unique in enumerate(forces.unique) if not unique]
-        along = "" if forces.direction is None else f"; unique only along {np.rad2deg(forces.direction):.4g} degrees"
+        angle = None if forces.direction is None else np.rad2deg(forces.direction)
+        along = "" if angle is None else f"; only the component along {angle:.4g} degrees is unique"
         groups.setdefault(along, []).extend(loose)
     lines = [f"not unique: {', '.join(loose)}{along}" for along, loose in groups.items()]
     return lines or (["all unique"] if found.rows else [])
@@ -216,9 +221,12 @@ def _forces(found: Diagnosis) -> list[str]:
 
 def _conditioning(found: Diagnosis) -> list[str]:
     c = found.clearance
-    lines = [f"{found.conditioning:.4g}, the largest singular value over the smallest of rank {found.rank}"]
+    lines = [f"{found.conditioning:.4g}: the largest over the smallest nonzero singular value of the scaled Jacobian"]
     if found.rank == found.ordinary_rank and np.isfinite(c.estimate):
-        lines.append(f"next rank change, by the slope of the smallest: {c.estimate:.3g} away (lengths over L, angles in rad)")
+        lines.append(
+            f"next rank change, estimated from the slope of the smallest singular value: {c.estimate:.3g} away "
+            "(rad, and lengths over the characteristic length)"
+        )
     if c.nearest is not None:
         lines.append(
             f"next rank change on the path: {c.nearest.distance:.6g} away, rank {c.nearest.rank}, at {_pose(found, c.nearest)}"
@@ -234,9 +242,10 @@ def _pose(found: Diagnosis, change: RankChange) -> str:
 
 
 def _timeline(line: Timeline) -> list[str]:
-    ordinary = int(line.rank.max(initial=0))
-    lines = [f"{line.ts[0]:g} to {line.ts[-1]:g} s, {len(line.ts)} instants: rank {ordinary}"]
-    lines[0] += f"; the smallest singular value is least at {line.closest[0]:.6g} s: {line.closest[1]:.3g} of the largest"
+    generic_rank = int(line.rank.max(initial=0))
+    lines = [f"{line.ts[0]:g} to {line.ts[-1]:g} s, {len(line.ts)} output times: rank {generic_rank}"]
+    time, smallest = line.closest
+    lines[0] += f"; the smallest nonzero singular value has its minimum, {smallest:.3g} of the largest, at {time:.6g} s"
     for change in line.changes:
         half = (change.latest - change.earliest) / 2
         lines.append(f"  rank {change.rank} at {change.time:.10g} s (+- {half:.1g} s)")

@@ -1,8 +1,8 @@
-"""Changes that cure a redundant constraint: each is tried on the Jacobian, and the best on the mechanism itself.
+"""Changes that remove redundant constraints: each is tried on the Jacobian, and the best on the mechanism itself.
 
-A constraint is relaxed by what its kind can give up: a revolute one direction (it becomes a slot, in either of its bodies), a
-weld or a prismatic joint one of its freedoms, anything all of its rows. That helps where the rows that are given up carry the
-stress by which the constraints of a set hold each other in balance, and frees nothing, since others hold it, too.
+A revolute is relaxed in one direction (it becomes a slot, in either of its bodies), a weld or a prismatic joint in its angle or
+its direction, and any constraint can be removed. A change removes redundancy if the rows given up carry part of the self-stress
+of a dependent set; it keeps the mobility, since other constraints block the same motion.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,32 +17,32 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, count_rank, singular_values
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
-SMALLEST_PIVOT = 1e-3  # the smallest singular value relative to the largest: a fix that leaves less is as good as none
+SMALLEST_PIVOT = 1e-3  # smallest nonzero singular value that a fix may leave, relative to the smallest before it
 
 
 class JointChange(NamedTuple):
-    """One way to relax a constraint: what takes its place, and which of its rows stay."""
+    """One way to relax a constraint: its replacement, and its remaining rows."""
 
     text: str
-    element: Constraint | None  # None: nothing
-    slides: tuple[int, float] | None = None  # of a slot made of a revolute: the body that it is in, and its axis there (rad)
-    rows: tuple[int, ...] = ()  # rows that stay, if it is no slot
+    element: Constraint | None  # None: the constraint is removed
+    slides: tuple[int, float] | None = None  # for a revolute made a slot: number of the slotted body, and axis in its frame (rad)
+    rows: tuple[int, ...] = ()  # remaining rows, if the change is not a slot
 
     def remaining_rows(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
-        """Return the rows of the constraint's Jacobian that stay."""
+        """Return the remaining rows of the constraint's Jacobian."""
         if self.slides is None:
             return rows[list(self.rows)]
         cos, sin = self._direction(q, places)
         return np.array([[-sin, cos]]) @ rows
 
     def alignment(self, force: np.ndarray, q: np.ndarray, places: list[int | None]) -> float:
-        """Return the share of the stress (rows, redundancy) that a slot gives up, 0 to 1; for any other change, 1."""
+        """Return the fraction of the stress (rows, redundancy) that a slot gives up, 0 to 1; 1 for any other change."""
         if self.slides is None:
             return 1.0
         return float(np.linalg.norm(self._direction(q, places) @ force[:2]) / np.linalg.norm(force[:2], 2))
 
     def _direction(self, q: np.ndarray, places: list[int | None]) -> np.ndarray:
-        """Return the line of the slot in ground axes."""
+        """Return the direction of the slot in ground axes."""
         body, axis = self.slides or (0, 0.0)
         place = places[body]
         angle = axis + (0.0 if place is None else q[3 * place + 2])
@@ -50,37 +50,37 @@ class JointChange(NamedTuple):
 
 
 class Fix(NamedTuple):
-    """A verified change of one constraint: the redundancy falls by `removes`, and the mobility stays."""
+    """A verified change of one constraint: it removes `removes` redundant rows, and keeps the mobility."""
 
     constraint: str
     change: str  # in words
     removes: int
-    conditioning: float  # of the scaled Jacobian where it is worst: the smallest singular value that counts over the largest
+    conditioning: float  # smallest nonzero over largest singular value of the scaled Jacobian, in the worst position
     mechanism: Mechanism
 
 
 class Redundancy(NamedTuple):
-    """A minimal set of constraints that depend on each other: take any of them away, and the others do not."""
+    """A minimal set of dependent constraints: without any one of them, the others are independent."""
 
     constraints: tuple[str, ...]
-    count: int  # of their rows that are redundant
-    permanent: bool  # along the motion; otherwise in this configuration only
-    fixes: tuple[Fix, ...]  # verified: each takes redundancy away and leaves the mobility; none of a momentary one
+    count: int  # number of their redundant rows
+    permanent: bool  # True: in every position; False: in this configuration only
+    fixes: tuple[Fix, ...]  # verified: each removes redundancy and keeps the mobility; empty if not permanent
 
 
 class _ChangesOfConstraint(NamedTuple):
-    """The changes of one constraint that help as far as the Jacobian tells, the best first."""
+    """The changes of one constraint that help according to the Jacobian, the best first."""
 
     constraint: str
-    changes: list[tuple[int, float, JointChange]]  # the redundancy that each removes, and the conditioning then
+    changes: list[tuple[int, float, JointChange]]  # redundant rows removed, conditioning after the change, and the change
 
 
 def fixes_of(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[Fix]:
-    """Return for each constraint of a dependent set the best change, verified, the best conditioned first.
+    """Return the best verified change of each constraint of a dependent set, the best conditioned first.
 
-    `at` are positions of ordinary rank, in all of which it must help.
+    `at` are generic configurations; a change must help in all of them.
     """
     candidates = _candidates(mechanism, positions, at, owners, dependency)
     found = [_verify(mechanism, positions, at, one) for one in candidates]
@@ -90,7 +90,7 @@ def fixes_of(
 def best_fix(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], sets: Sequence[Dependency]
 ) -> Fix | None:
-    """Return the best fix of all sets, or None: it alone is verified, for which a mechanism is built."""
+    """Return the best fix of all sets, or None; only the best is verified, since that builds a mechanism."""
     candidates = [one for dependency in sets for one in _candidates(mechanism, positions, at, owners, dependency)]
     candidates.sort(key=lambda one: one.changes[0][:2], reverse=True)
     return next((fix for one in candidates if (fix := _verify(mechanism, positions, at, one))), None)
@@ -119,7 +119,7 @@ def _candidates(
 def _verify(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], candidates: _ChangesOfConstraint
 ) -> Fix | None:
-    """Return the first of a constraint's changes that does on the mechanism what it does on the Jacobian."""
+    """Return the first of a constraint's changes that has the same effect on the mechanism as on the Jacobian."""
     for removes, conditioning, change in candidates.changes:
         changed = apply_change(mechanism, candidates.constraint, change)
         if changed is not None and _removes_redundancy(changed, removes, at, positions.rank_tol):
@@ -128,7 +128,7 @@ def _verify(
 
 
 def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechanism | None:
-    """Return the mechanism with a constraint changed, or None where something else needs it as it is: friction in a revolute."""
+    """Return the mechanism with a constraint changed, or None if another element needs it, such as friction in a revolute."""
     joints, drivers = dict(mechanism.joints), dict(mechanism.drivers)
     if change.element is not None:
         joints[name] = change.element
@@ -146,7 +146,7 @@ def _own(owners: list[str], name: str) -> list[int]:
 
 
 def _places(mechanism: Mechanism, name: str) -> list[int | None]:
-    """Return the places of the bodies of a constraint among all; None: the ground."""
+    """Return the indices of a constraint's bodies; None for the ground."""
     bodies = mechanism.frames_of(mechanism.constraints[name])
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
 
@@ -163,18 +163,18 @@ def changes_of(mechanism: Mechanism, name: str, at: Configuration, force: np.nda
             axis = _half_turn(along - angle)
             other = element.bodies[1 - k]
             slot = Slot((body, other), (element.points[k], element.points[1 - k]), axis=axis)
-            text = f'make it a slot along {np.rad2deg(axis):.4g} degrees of "{body}" for the pin of "{other}"'
+            text = f'make it a slot along {np.rad2deg(axis):.4g} degrees of the frame of "{body}", for a pin of "{other}"'
             yield JointChange(text, slot, (k, axis))
     if isinstance(element, Weld):
         yield JointChange("make it a revolute", Revolute(element.bodies, element.points), None, (0, 1))
     if isinstance(element, Prismatic):
         slot = Slot(element.bodies, element.points, element.axis)
-        yield JointChange("make it a slot: free to turn", slot, None, (0,))
-        yield JointChange("hold the angle alone", Angle(element.bodies, element.angle), None, (1,))
+        yield JointChange("make it a slot, free to turn", slot, None, (0,))
+        yield JointChange("hold only the angle", Angle(element.bodies, element.angle), None, (1,))
 
 
 def _half_turn(angle: float) -> float:
-    """Return the direction of the same line in (-90, 90] degrees, without rounding."""
+    """Return the direction of the same line in (-90, 90] degrees, with rounding removed from multiples of 90 degrees."""
     angle = float(np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2)
     near = round(angle / (np.pi / 2)) * np.pi / 2
     angle = near if abs(angle - near) < 1e-9 else angle
@@ -184,9 +184,10 @@ def _half_turn(angle: float) -> float:
 def _effect(
     own: list[int], places: list[int | None], change: JointChange, at: list[Configuration], rank_tol: float
 ) -> tuple[int, float]:
-    """Return by how much the redundancy falls (-1: the mobility changes, or it falls unevenly), and the conditioning then.
+    """Return the number of redundant rows that a change removes, and the conditioning after it.
 
-    `own` are the rows of the constraint, `places` those of its bodies.
+    The number is -1 if the mobility changes or the number differs between positions. `own` are the rows of the constraint,
+    `places` the indices of its bodies.
     """
     falls, conditioning = -1, np.inf
     for k, position in enumerate(at):
@@ -202,7 +203,7 @@ def _effect(
 
 
 def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
-    """Return True if the changed mechanism is closed in all positions, has the same mobility there, and fewer redundant rows."""
+    """Return True if in all positions the changed mechanism is closed, as mobile as before, and has fewer redundant rows."""
     positions = RankedPositions(after, rank_tol)
     ranked = [positions.at(position.t, position.q) for position in at]
     closed = all(

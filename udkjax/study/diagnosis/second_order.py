@@ -1,9 +1,8 @@
 """The branches that meet at a singular configuration: directions that the constraints allow to second order.
 
-Along a curve q(s) with q' = V x, V spanning the null space of J, Psi = 0 asks of the second derivative J q'' = -H(V x, V x). That
-has a solution if and only if N^T H(V x, V x) = 0: one quadratic form x^T A_i x for each column of N. Its common zeros are the
-tangents of the branches. They are found by Gauss-Newton from many directions at once; each is then walked along, a step, to see
-that there is a motion.
+Along a curve q(s) with q' = V x, V spanning the null space of J, Psi = 0 requires J q'' = -H(V x, V x). This has a solution if
+and only if N^T H(V x, V x) = 0: one quadratic form x^T A_i x for each column of N. The common zeros of the forms are the tangents
+of the branches, found by Gauss-Newton from many directions at once. A step along each verifies that it is a motion.
 """
 
 from typing import NamedTuple
@@ -17,27 +16,27 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
-N_DIRECTIONS = 400  # directions to look from
-GAUSS_NEWTON_STEPS = 60  # of Gauss-Newton: at double zeros each halves the error, to 1e-18
-ZERO_FORM = 1e-10  # of the forms, whose coefficients are at most one
-DOUBLE_ZERO = 1e-7  # of a tangent: a double zero is known to the root of rounding
-SAME_DIRECTION = 1e-4  # rad: directions nearer than that are one
-SEARCH_ANGLE = 0.1  # rad: how far from a zero to look for others
-STEP_LENGTH = 0.02  # of the characteristic length, and rad: how far a branch is walked along
-TANGENT_TOL = 0.2  # of the step: how far its end may be from the tangent; it bends by the step's square
+N_DIRECTIONS = 400  # initial directions
+GAUSS_NEWTON_STEPS = 60  # at double zeros each halves the error, to 1e-18
+ZERO_FORM = 1e-10  # tolerance on the forms, whose coefficients are at most one
+DOUBLE_ZERO = 1e-7  # tolerance on a tangent: a double zero is accurate to the square root of rounding
+SAME_DIRECTION = 1e-4  # rad: closer directions are the same
+SEARCH_ANGLE = 0.1  # rad: distance from a zero at which others are searched for
+STEP_LENGTH = 0.02  # relative to the characteristic length, and rad: step along a branch
+TANGENT_TOL = 0.2  # relative to the step: distance of its end from the tangent, which grows as the step squared
 
 
 class Branch(NamedTuple):
     """One of the motions that start from a singular configuration."""
 
-    tangent: np.ndarray  # (bodies, 3): m, m, rad along it, the largest of a body's turn or of its way over L being one
-    degrees_of_freedom: int  # the dimension of the motions of this branch
-    rank: int  # on it, next to the configuration
-    followed: bool  # whether a closed position was found along it, on both sides
+    tangent: np.ndarray  # (bodies, 3): m, m, rad; scaled so that the largest rotation, or displacement over L, of a body is one
+    degrees_of_freedom: int  # dimension of this branch
+    rank: int  # on the branch, next to the configuration
+    followed: bool  # True if a closed position was found along it, on both sides
 
 
 def branches(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> list[Branch]:
-    """Return the branches that meet at a configuration; of one that is not singular, the directions in which it moves."""
+    """Return the branches that meet at a configuration; if it is not singular, the directions in which it moves."""
     A, N, V = quadratic_forms(mechanism, positions, at), at.left, at.right
     if not V.shape[1]:
         return []
@@ -60,7 +59,7 @@ def _hessian(mechanism, t, q, unit, weights):
 
 
 class Zeros(NamedTuple):
-    """Directions in which all forms vanish: a linear space, or one line of a cone that is none."""
+    """Directions in which all forms vanish: a linear space, or one line of a nonlinear cone."""
 
     space: np.ndarray  # (d, g), orthonormal
     dimension: int  # of the space, or of the cone
@@ -89,18 +88,18 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
 
 
 def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Find zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
+    """Return zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     for _ in range(GAUSS_NEWTON_STEPS):
         residual = np.einsum("kij,si,sj->sk", A, x, x)
-        matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # and a step across x
+        matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # the last row: a step normal to x
         x = x - np.einsum("sij,sj->si", np.linalg.pinv(matrix, rcond=1e-9), np.pad(residual, ((0, 0), (0, 1))))
         x = x / np.linalg.norm(x, axis=1, keepdims=True)
     return x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO_FORM]
 
 
 def _zeros_around(A: np.ndarray, x: np.ndarray) -> Zeros:
-    """Return the zeros around x: the kernel of all A_i x if all forms vanish on it; a cone if others are near; or x alone."""
+    """Return the zeros around x: the null space of all A_i x if all forms vanish on it; a cone if others are near; or x alone."""
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
     kernel = vt[int(np.sum(sigma > SAME_DIRECTION)) :].T
     if kernel.shape[1] > 1:

@@ -1,8 +1,8 @@
-"""The rank of the constraints along a trajectory: singular values at the outputs, and when between them the rank changes.
+"""The rank of the constraints along a trajectory: singular values at the output times, and rank changes between them.
 
-A singular value that vanishes at an instant t* is |t - t*| times something nearby: its samples have a minimum there, and the
-minimum has a kink, so that it can be located to rounding of the time. Between outputs the states are those of the trajectory
-integrated anew from the output before, then of a quintic through q, v and a.
+A singular value that vanishes at t* is proportional to |t - t*| nearby: its samples have a minimum with a kink, which can be
+located to rounding. Between output times the trajectory is integrated again from the previous one, and interpolated by a quintic
+through q, v and a.
 """
 
 from itertools import pairwise
@@ -25,19 +25,19 @@ from udkjax.positions.channels import StateHistory
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 
-SAMPLES_PER_OUTPUT = 4  # samples from one output to the next, to look for minima
-PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated anew
-PARTS_OF_BRACKET = 16  # parts of a bracket, of which two are left by each refinement
-KINK_RATIO = 2.0  # a minimum is one of zero where it is at most so many times the rise to its neighbours
-RENEWED_TOL = 1e-12  # rtol and atol of an interval that is integrated anew
+SAMPLES_PER_OUTPUT = 4  # samples from one output time to the next, to look for minima
+PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated again
+PARTS_OF_BRACKET = 16  # parts of a bracket, of which each refinement keeps two
+KINK_RATIO = 2.0  # a minimum may be zero if it is at most this many times the rise to its neighbours
+RENEWED_TOL = 1e-12  # rtol and atol of an interval that is integrated again
 
 
 class TimedRankChange(NamedTuple):
-    """An instant at which the rank is another one than before and after."""
+    """An instant at which the rank is lower than before and after."""
 
     time: float  # s
-    earliest: float  # the bracket (s)
-    latest: float
+    earliest: float  # start of the bracket (s)
+    latest: float  # its end (s)
     rank: int  # at the instant
     smallest: float  # the singular value that vanishes, at `time`, relative to the largest
 
@@ -49,11 +49,11 @@ class Timeline(NamedTuple):
     singular_values: Float[np.ndarray, "T k"]
     rank: Int[np.ndarray, "T"]
     changes: tuple[TimedRankChange, ...]
-    closest: tuple[float, float]  # the time (s), and the smallest relative singular value that counts, over all samples
+    closest: tuple[float, float]  # time (s) and value of the minimum of `smallest` over all samples
 
     @property
     def smallest(self) -> Float[np.ndarray, "T"]:
-        """The smallest singular value that counts where the rank is ordinary, relative to the largest."""
+        """The smallest singular value that is nonzero at the generic rank, relative to the largest."""
         return self.singular_values[:, max(int(self.rank.max()) - 1, 0)] / self.singular_values[:, 0]
 
 
@@ -62,12 +62,12 @@ def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol:
 
     Args:
         mechanism: the mechanism.
-        solution: ts (T,), q and v (T, bodies, 3); of a `Solution` intervals with a rank change are integrated anew.
-        rank_tol: singular values up to so much of the largest count as zero.
-        tol: half the width of the brackets of times (s); by default 1e-9 of the characteristic time of the scene.
+        solution: ts (T,), q and v (T, bodies, 3); if it is a `Solution`, intervals with a rank change are integrated again.
+        rank_tol: singular values up to this fraction of the largest count as zero.
+        tol: half-width of the brackets around rank changes (s); by default 1e-9 of the scene's characteristic time.
 
     Returns:
-        The `Timeline`. Times are those of the trajectory as it is given: its own errors are not in the brackets.
+        The `Timeline`. Its brackets do not include the errors of the trajectory.
     """
     analysis = analyse(mechanism)
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -79,14 +79,14 @@ def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol:
     sampled = path.singular_values(fine)
     own = np.searchsorted(fine, ts)
     rank = np.sum(sampled > rank_tol * sampled[:, :1], axis=1)
-    ordinary = int(rank.max(initial=0))
-    if not ordinary:
+    generic_rank = int(rank.max(initial=0))
+    if not generic_rank:
         return Timeline(ts, sampled[own], rank[own], (), (float(ts[0]), 1.0))
-    sigma = sampled[:, ordinary - 1] / sampled[:, 0]
+    sigma = sampled[:, generic_rank - 1] / sampled[:, 0]
     changes = []
     for k in _kinks(sigma):
         low, high = fine[max(k - 1, 0)], fine[min(k + 1, len(fine) - 1)]
-        found = _locate(_renew(mechanism, analysis, solution, ts, low, high) or path, low, high, ordinary, rank_tol, tol)
+        found = _locate(_renew(mechanism, analysis, solution, ts, low, high) or path, low, high, generic_rank, rank_tol, tol)
         changes += [] if found is None else [found]
     k = int(np.argmin(sigma))
     least, when = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
@@ -99,14 +99,14 @@ def _tolerance(analysis: Analysis, ts: np.ndarray) -> float:
 
 
 def _kinks(sigma: np.ndarray) -> list[int]:
-    """Return samples at which a singular value has a minimum that may be zero."""
+    """Return indices of samples at which a singular value has a minimum that may be zero."""
     before, after = np.append(np.inf, sigma[:-1]), np.append(sigma[1:], np.inf)
     rise = np.where(np.isfinite(before), before - sigma, 0.0) + np.where(np.isfinite(after), after - sigma, 0.0)
     return np.flatnonzero((sigma < before) & (sigma <= after) & (sigma <= KINK_RATIO * rise)).tolist()
 
 
 def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> TimedRankChange | None:
-    """Return the minimum of a singular value in a bracket, if the rank is lower there."""
+    """Return the minimum of a singular value in a bracket, or None if the rank is not lower there."""
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
         grid = np.linspace(low, high, PARTS_OF_BRACKET + 1)
@@ -127,7 +127,7 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 def _renew(
     mechanism: Mechanism, analysis: Analysis, solution: StateHistory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
-    """Integrate the trajectory between two times anew, from the output before."""
+    """Integrate the trajectory between two times again, from the previous output time."""
     if not isinstance(solution, Solution):
         return None
     first = int(np.searchsorted(ts, low, side="right")) - 1
@@ -140,7 +140,7 @@ def _renew(
 
 
 class _Path:
-    """Singular values at any time between states, by the quintic through q, v and a of two of them."""
+    """Singular values at any time, from quintics through q, v and a of neighbouring states."""
 
     def __init__(self, mechanism: Mechanism, analysis: Analysis, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
         self.mechanism, self.analysis = mechanism.without_origin, analysis

@@ -1,14 +1,14 @@
-"""Identification: parameters of mechanisms, found from measured motion.
+"""Identification of a mechanism's parameters from measured motion.
 
-records, tables, record_reader                     measurements, whatever they come as
-parameters, unknowns                               what is to be found
-prediction, fit_problem, shooting                  what would be measured, and how far it is from what was
-loop_consistency                                   whether parameters fit the mechanism's loops
+records, tables, record_reader                     measurements, from files and tables
+parameters, unknowns                               parameters to identify, and the unknowns of a fit
+prediction, fit_problem, shooting                  predictions and residuals
+loop_consistency                                   parameters that keep closed loops closed
 least_squares, optimizer                           minimization
-growing_records, search                            from guesses that lead to the minimum
-uncertainty, profile_likelihood                    how well the parameters are known
-gradient_check                                     whether derivatives are right
-identification, estimate, experiment_design        what users call, and what they get
+growing_records, search                            search for the right minimum
+uncertainty, profile_likelihood                    standard errors and confidence intervals
+gradient_check                                     check of derivatives against differences
+identification, estimate, experiment_design        the public functions and their results
 """
 
 from udkjax.positions.channels import Quantity as Quantity

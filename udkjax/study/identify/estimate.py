@@ -1,4 +1,4 @@
-"""The result of an identification: values, their uncertainty, what the records do not show, and how it was found."""
+"""The result of an identification: values, their uncertainty, undetermined parameters, and the history of the fit."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ FORMAT = "udkjax identification 1"  # of the dataset
 
 
 class Row(NamedTuple):
-    """A number that was found: a parameter, or by how much an initial state was moved."""
+    """An identified number: a parameter, or the correction of an initial state."""
 
     parameter: str
     value: float
@@ -47,26 +47,26 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
-    """Values of parameters that were identified, and how well they are known. `print` shows a table.
+    """Identified values of parameters with their uncertainty. `print` shows a table.
 
     Attributes:
-        names: of the P parameters; `units` are theirs.
-        values: found for them, in these units.
-        uncertainty: standard errors, correlations, and what the records do not show.
+        names: names of the P parameters; `units` are their units.
+        values: identified values, in these units.
+        uncertainty: standard errors, correlations, and undetermined directions.
         at_bounds: parameters that are at one of their bounds.
-        initial_state_values: of each unknown of an initial state by how much it was moved, and its standard error.
-        predicted, residuals, noise: for each record, by channel, at its times (T,): what the mechanism shows; measured minus
-            predicted; and standard deviations, given or estimated.
-        outliers: measured values too far from what the mechanism shows to be noise; `noise` is that of the others.
-        whiteness: of the residuals of each record's channels, where they are more than rounding.
-        converged: whether the fit has settled.
-        agreeing: number of first guesses that led here, out of `guesses`.
-        ways: ways that were tried to find the fit.
-        history: cost and Gauss-Newton step, evaluation by evaluation of the best fit.
-        evaluations: of a record, each with its derivatives.
-        seconds: time of the identification (s).
+        initial_state_values: correction and standard error of each unknown of an initial state.
+        predicted, residuals, noise: for each record, by channel, at its times (T,): predicted values; measured minus predicted;
+            and standard deviations, given or estimated.
+        outliers: measured values too far from the prediction to be noise; `noise` is that of the other values.
+        whiteness: test of the residuals of each record's channels for white noise, if they exceed integration errors.
+        converged: True if the fit converged.
+        agreeing: number of first guesses that led to this fit, out of `guesses`.
+        ways: strategies that were tried.
+        history: cost and Gauss-Newton step of each evaluation of the best fit.
+        evaluations: number of simulated records, each with its derivatives.
+        seconds: duration of the identification (s).
         tol: tolerances of the integration.
-        z: all K unknowns of the `problem` that was fitted, by the least squares of `loss`.
+        z: all K unknowns of the fitted `problem`, minimizing the squares of `loss`.
     """
 
     names: tuple[str, ...]
@@ -94,7 +94,7 @@ class Estimate:
 
     @cached_property
     def mechanism(self) -> Mechanism:
-        """The mechanism with the values in."""
+        """The mechanism with the identified values."""
         return apply_values(self.problem.mechanism, self.problem.unknowns.targets, jnp.asarray(self.values))
 
     @property
@@ -104,41 +104,41 @@ class Estimate:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """One standard error of each value, by name; inf where the records do not show it."""
+        """Standard errors by name; inf if the records do not determine the parameter."""
         return dict(zip(self.names, self.uncertainty.standard_errors.tolist(), strict=True))
 
     @cached_property
     def initial_states(self) -> tuple[State, ...]:
-        """The states that the records began with, closed."""
+        """The closed initial states of the records."""
         return self.problem.first_states(self.mechanism, self.z)
 
     @property
     def success(self) -> bool:
-        """True if the fit has settled, and the records show every parameter."""
+        """True if the fit converged, and the records determine every parameter."""
         return self.converged and not self.uncertainty.dead and not self.uncertainty.flat
 
     @property
     def message(self) -> str:
-        """Remarks on the estimate, one sentence a line."""
+        """Remarks on the estimate, one sentence per line."""
         prefixes = label_prefixes(self.problem.records)
-        lines = [] if self.converged else ["the fit has not settled: these are the best values that were found"]
+        lines = [] if self.converged else ["the fit has not converged: these are the best values found"]
         lines += self.uncertainty.messages
         lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
         lines += outlier_sentences(self.problem, self.outliers, self.loss is not squares)
         lines += [found.text(prefixes[k] + channel) for (k, channel), found in self.whiteness.items() if not found.white]
         if self.guesses > 1 and self.agreeing == 1 and not all(found.white for found in self.whiteness.values()):
-            lines.append(f"only one of {self.guesses} first guesses led here: there may be a better minimum")
-        return "\n".join(lines) or "every parameter is known from the records"
+            lines.append(f"only one of {self.guesses} first guesses led to this fit: there may be a better minimum")
+        return "\n".join(lines) or "the records determine every parameter"
 
     def profile(self, name: str, level: float = CONFIDENCE) -> ProfileLikelihood:
         """Compute the profile likelihood of a parameter: its confidence interval without a linear model.
 
         Args:
-            name: of a parameter, as in `names`. It is fixed at values beside the estimate, and all others are fitted anew.
-            level: of confidence.
+            name: a parameter, as in `names`. It is fixed at values around the estimate, and all others are refitted.
+            level: confidence level.
 
         Raises:
-            IdentificationError: no such parameter was identified.
+            IdentificationError: `name` is not one of `names`.
         """
         if name not in self.names:
             raise IdentificationError([f"{quote(name)} was not identified{suggestion(name, self.names)}"])
@@ -146,20 +146,20 @@ class Estimate:
         return profile_likelihood(evaluate, self.problem.unknowns, self.z, self.uncertainty, name, level)
 
     def check_gradients(self) -> GradientCheck:
-        """Compare the derivatives at the estimate with differences: see `udkjax.check_gradients`."""
+        """Compare the derivatives at the estimate with finite differences: see `udkjax.check_gradients`."""
         return compare_gradients(self.problem, self.z, self.tol)
 
     # --- as a table
 
     def rows(self) -> list[Row]:
-        """Return the estimates of the parameters in their order; then those of initial states."""
-        known, guess = self.uncertainty, self.problem.unknowns.guess
-        notes = [known.notes(name) + (["at a bound"] if name in self.at_bounds else []) for name in self.names]
-        errors = known.standard_errors.tolist()
+        """Return one row per parameter, followed by those of initial states."""
+        uncertainty, guess = self.uncertainty, self.problem.unknowns.guess
+        notes = [uncertainty.notes(name) + (["at a bound"] if name in self.at_bounds else []) for name in self.names]
+        errors = uncertainty.standard_errors.tolist()
         columns = self.names, self.values.tolist(), errors, self.units, guess.tolist(), map(", ".join, notes)
         units = dict(zip(self.problem.all_names, self.problem.all_units, strict=True))
         states = [
-            Row(name, change, error, units[name], 0.0, "added to the guess of the start")
+            Row(name, change, error, units[name], 0.0, "added to the guess of the initial state")
             for name, (change, error) in self.initial_state_values.items()
         ]
         return [Row(*row) for row in zip(*columns, strict=True)] + states
@@ -177,19 +177,19 @@ class Estimate:
         return PrintedTable(f"{title}: {plural(len(self.names), 'parameter')} from {numbers}", cells, heads, remarks)
 
     def _facts(self) -> dict[str, str]:
-        problem, known = self.problem, self.uncertainty
-        ended = f"{'' if self.converged else 'not '}settled after {plural(self.evaluations, 'evaluation')}"
-        agreed = f", {self.agreeing} of {self.guesses} first guesses led here" if self.guesses > 1 else ""
+        problem, uncertainty = self.problem, self.uncertainty
+        ended = f"{'' if self.converged else 'not '}converged after {plural(self.evaluations, 'evaluation')}"
+        agreed = f", {self.agreeing} of {self.guesses} first guesses led to it" if self.guesses > 1 else ""
         facts = {"fit": f"{ended} in {self.seconds:.1f} s{agreed}"}
         if problem.noise_given.any():
-            facts["chi^2"] = f"{known.chi2:.4g} with {known.degrees_of_freedom} degrees of freedom"
+            facts["chi^2"] = f"{uncertainty.chi2:.4g} with {uncertainty.degrees_of_freedom} degrees of freedom"
         estimated = problem.index[~problem.noise_given]
         channels, first = np.unique(estimated[:, 2], return_index=True)
         found = []
         for channel, record in zip([problem.channels[c] for c in channels], estimated[first, 0], strict=True):
             found.append(f"{channel.name} {np.nanmedian(self.noise[record][channel.name]):.3g} {channel.units}".rstrip())
         if found:
-            facts["noise, estimated"] = join_names(found)
+            facts["estimated noise"] = join_names(found)
         return facts
 
     def __str__(self) -> str:
@@ -204,22 +204,22 @@ class Estimate:
     # --- as data
 
     def to_xarray(self, profiles: Sequence[ProfileLikelihood] = (), level: float = CONFIDENCE) -> "xarray.Dataset":
-        """Return measurements, predictions, and the knowledge of the parameters.
+        """Return measurements, predictions, estimates and their uncertainty as a dataset.
 
         Args:
-            profiles: profile likelihoods that are to be in it.
-            level: of confidence, of their intervals.
+            profiles: profile likelihoods to include.
+            level: confidence level of their intervals.
 
         Returns:
-            A dataset with `measured`, `predicted`, `residual` (the one minus the other) and `noise` along record, sample and
-            channel, at `time` (record, sample), s; not a number where nothing was measured. `correlated` is the probability that
-            white noise leaves residuals as correlated as these. `cost` and `change` (the largest change of an unknown by the next
-            step) are those of each trial. With profiles, `rise` is twice the cost above the least over the noise, at values of
-            each, and `interval` is where it is below the `limit` of the confidence level.
+            A dataset with `measured`, `predicted`, `residual` (measured minus predicted) and `noise` along record, sample and
+            channel, at `time` (record, sample), s; NaN where nothing was measured. `correlated` is the probability that white
+            noise leaves residuals as correlated as these. `cost` and `change` (the largest change of an unknown in the next step)
+            are those of each trial. With profiles, `rise` is twice the increase of the cost above its minimum, relative to the
+            noise, at `profile_value`, and `interval` is where it is below the `limit` of the confidence level.
         """
         with OptionalImport():
             import xarray
-        problem, known, P = self.problem, self.uncertainty, "parameter"
+        problem, uncertainty, P = self.problem, self.uncertainty, "parameter"
         records, names = problem.records, problem.channel_names
         found = dataset_of_fit(records, names, self.predicted, self.residuals, self.noise)
         white = [[getattr(self.whiteness.get((k, name)), "p", np.nan) for name in names] for k in range(len(records))]
@@ -228,8 +228,8 @@ class Estimate:
             "correlated": (("record", "channel"), white),
             "first_guess": (P, problem.unknowns.guess),
             "value": (P, self.values),
-            "standard_error": (P, known.standard_errors),
-            "correlation": ((P, "other_parameter"), known.correlation),
+            "standard_error": (P, uncertainty.standard_errors),
+            "correlation": ((P, "other_parameter"), uncertainty.correlation),
             "cost": ("trial", cost),
             "change": ("trial", change),
         }
@@ -248,21 +248,21 @@ class Estimate:
             "scene": scene_text(self.mechanism),
         }
         found = found.merge(xarray.Dataset(data, coords)).assign_attrs(attributes)
-        return found.merge(profiles_dataset(profiles, self.parameters, known, level)) if profiles else found
+        return found.merge(profiles_dataset(profiles, self.parameters, uncertainty, level)) if profiles else found
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures as plain numbers and texts, as a JSON file has them."""
-        known, rows, P = self.uncertainty, self.rows(), len(self.names)
+        """Return the results as plain numbers, lists and strings, for JSON."""
+        uncertainty, rows, P = self.uncertainty, self.rows(), len(self.names)
         same = ("success", "converged", "message", "at_bounds", "guesses", "agreeing", "ways", "evaluations", "seconds")
         found = {
             "parameters": {
                 r.parameter: {"value": r.value, "standard_error": r.standard_error, "units": r.units} for r in rows[:P]
             },
-            "correlation": known.correlation,
-            "unknown": {"dead": known.dead, "flat": [direction.text for direction in known.flat]},
+            "correlation": uncertainty.correlation,
+            "unknown": {"dead": uncertainty.dead, "flat": [direction.text for direction in uncertainty.flat]},
             "starts": {r.parameter: {"change": r.value, "standard_error": r.standard_error} for r in rows[P:]},
-            "chi2": known.chi2,
-            "degrees_of_freedom": known.degrees_of_freedom,
+            "chi2": uncertainty.chi2,
+            "degrees_of_freedom": uncertainty.degrees_of_freedom,
             "noise": [{channel: np.nanmedian(sigma) for channel, sigma in table.items()} for table in self.noise],
             "outliers": self.outliers,
             "whiteness": [{"record": k, "channel": c, "p": w.p} for (k, c), w in self.whiteness.items()],

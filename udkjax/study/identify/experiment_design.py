@@ -1,10 +1,10 @@
-"""The choice of the next experiment: by what records that are not measured yet would show of parameters.
+"""Design of experiments: the candidate whose measurements would determine the parameters best.
 
-With J the derivatives of what would be measured, each divided by the standard deviation of its noise, a candidate adds J^T J to
-the information M that there is: M^-1 is the covariance of an estimate, to first order in the noise. What is not asked for
-(initial states that are estimated too, other parameters) is eliminated: what is left of J is its part that they cannot make up
-for. The best candidate has the largest det M (criterion "D"), the smallest trace M^-1 ("A"), or the largest least eigenvalue of M
-("E"), in the dimensionless unknowns of `udkjax.study.identify.parameters`. F. Pukelsheim, Optimal Design of Experiments, 2006.
+With J the derivatives of the predicted measurements, divided by the standard deviations of their noise, a candidate adds J^T J to
+the Fisher information M: M^-1 is the covariance of an estimate, to first order in the noise. Nuisance unknowns (initial states,
+other parameters) are eliminated by projecting J on the complement of their columns. The best candidate has the largest det M
+(criterion "D"), the smallest trace M^-1 ("A"), or the largest smallest eigenvalue of M ("E"), in the dimensionless unknowns of
+`udkjax.study.identify.parameters`. F. Pukelsheim, Optimal Design of Experiments, 2006.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,12 +32,12 @@ Criterion = Literal["D", "A", "E"]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An experiment that may be made: what of the scene is different in it (`conditions`, by name), and how it begins.
+    """A possible experiment.
 
     Args:
-        conditions: numbers of the scene that are different in it, by name.
-        initial_state: state at its beginning; None: that of the scene.
-        name: of the experiment, for tables.
+        conditions: numbers of the scene that differ in it, by name.
+        initial_state: its initial state; by default that of the scene.
+        name: its name in tables.
     """
 
     conditions: Mapping[str, ArrayLike] = field(default_factory=dict)
@@ -47,17 +47,17 @@ class Candidate:
 
 @prints_table
 class Design(NamedTuple):
-    """A ranking of N candidates by what they would show of P parameters; each alone, with what was known before.
+    """A ranking of N candidate experiments by how well each, with the prior information, determines P parameters.
 
     Attributes:
         criterion: criterion of the ranking.
-        names: of the parameters.
-        candidates: their names.
-        scores: of the criterion, the larger the better: log det M, -trace M^-1, or the least eigenvalue; -inf, or 0, where a
-            direction is not known.
-        standard_errors: standard errors in the units of the parameters, inf where a candidate does not show one.
-        order: the candidates, the best first.
-        chosen: candidates to make together, the most useful first.
+        names: names of the parameters.
+        candidates: names of the candidates.
+        scores: value of the criterion, the larger the better: log det M, -trace M^-1, or the smallest eigenvalue; -inf, or 0,
+            where a combination of parameters is not determined.
+        standard_errors: standard errors in the units of the parameters; inf where a candidate does not determine one.
+        order: indices of the candidates, the best first.
+        chosen: candidates to carry out together, the most useful first.
         together: standard errors after the first of them, the first two, and so on.
     """
 
@@ -72,13 +72,13 @@ class Design(NamedTuple):
 
     @property
     def best(self) -> int:
-        """The candidate that shows most."""
+        """Index of the best candidate."""
         return self.order[0]
 
     def _table(self) -> PrintedTable:
         errors = [[f"{error:.3g}" for error in self.standard_errors[k]] for k in self.order]
         rows = [(self.candidates[k], f"{self.scores[k]:.4g}", *own) for k, own in zip(self.order, errors, strict=True)]
-        return PrintedTable("experiments, the best first", rows, ("", self.criterion, *self.names))
+        return PrintedTable("experiments, the best first: score and standard errors", rows, ("", self.criterion, *self.names))
 
 
 @checked
@@ -96,24 +96,24 @@ def design_experiment(
     tol: float = MEDIUM_TOL,
     **settings: Any,
 ) -> Design:
-    """Rank experiments by what they would show of parameters, and pick some to be made together.
+    """Rank experiments by how well they would determine parameters, and pick some to be carried out together.
 
     Args:
-        mechanism: with values of the parameters, at which the experiments are predicted.
-        candidates: each a `Candidate`, the conditions of one (a driver's amplitude and frequency by name), or its initial state.
-        parameters: parameters to identify, as for `identify`; their priors count.
+        mechanism: mechanism with the parameter values at which the experiments are predicted.
+        candidates: each a `Candidate`, its conditions (a driver's amplitude and frequency by name), or its initial state.
+        parameters: parameters to identify, as for `identify`, with their priors.
         channels: channels that would be measured in each.
         ts: times (T,) of the measurements, s.
         noise: standard deviation, of all channels or by channel.
-        criterion: "D", the largest det M; "A", the smallest trace M^-1; "E", the largest least eigenvalue of M.
-        pick: number of candidates to choose one after another, each to the best together with those before.
+        criterion: "D", the largest det M; "A", the smallest trace M^-1; "E", the largest smallest eigenvalue of M.
+        pick: number of candidates to choose in sequence, each the best together with the previous ones.
         of: names of the parameters that matter; by default all.
-        given: an estimate whose values the parameters have, and whose records count as made.
+        given: an estimate, whose values are used and whose records count as prior information.
         tol: tolerance of the integration.
-        settings: of `simulate`.
+        settings: further arguments of `simulate`.
 
     Returns:
-        The ranking; a candidate that cannot be simulated shows nothing.
+        The ranking; a candidate that cannot be simulated contributes no information.
 
     Raises:
         IdentificationError: with every mistake.
@@ -180,7 +180,7 @@ def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.nda
 
 
 def _information_of_records(problem: FitProblem, tol: TolerancePair) -> list[np.ndarray]:
-    """Return for each record rows J (., P) whose J^T J is its information; none for one that cannot be computed."""
+    """Return rows J (., P) for each record whose J^T J is its information; no rows if it cannot be computed."""
     P = len(problem.unknowns.names)
     J = problem.evaluate(np.zeros((1, problem.K)), tol).J[0, : len(problem.index)]
     found = []
@@ -194,7 +194,7 @@ def _information_of_records(problem: FitProblem, tol: TolerancePair) -> list[np.
 
 
 def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarray:
-    """Return rows J whose J^T J is known already: from the records of an estimate, and from priors."""
+    """Return rows J whose J^T J is the prior information: from the records of an estimate, and from priors."""
     u = problem.unknowns
     which = problem.priors
     priors = np.zeros((len(which), len(u.names)))
@@ -207,12 +207,12 @@ def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarra
     scale = np.append(given.uncertainty.noise, 1.0)[given.problem.noise_groups()]
     J = given.problem.evaluate(given.z[None], given.tol).J[0] / scale[:, None]
     rows = _eliminate(J, np.arange(P, given.problem.K), INVISIBLE_RATIO * np.linalg.norm(J, 2))
-    same = u.dx_dz(np.zeros(P)) / old.dx_dz(given.z[:P])  # unknowns are measured from other first guesses
+    same = u.dx_dz(np.zeros(P)) / old.dx_dz(given.z[:P])  # the two sets of unknowns have different first guesses
     return rows * same  # the priors of the estimate are among its rows
 
 
 def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
-    """Return the other columns of J, less what these columns can make up for."""
+    """Return the other columns of J, projected on the complement of these columns."""
     rest = np.delete(J, columns, axis=1)
     if not len(columns) or not len(J):
         return rest
@@ -222,11 +222,11 @@ def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
 
 
 def _score(rows: np.ndarray, criterion: Criterion, floor: float) -> tuple[tuple[int, float], np.ndarray]:
-    """Return the number of known directions and their precision; and the standard errors of the unknowns."""
+    """Return the number of determined directions and their score; and the standard errors of the unknowns."""
     K = rows.shape[1]
     _, s, vt = np.linalg.svd(np.concatenate([rows, np.zeros((K, K))]))
-    known = s > floor
-    s, lost = s[known], np.any(np.abs(vt[~known]) > SMALLEST_PART, axis=0)
+    determined = s > floor
+    s, lost = s[determined], np.any(np.abs(vt[~determined]) > SMALLEST_PART, axis=0)
     value = {"D": 2.0 * np.log(s).sum(), "A": -np.sum(s**-2.0), "E": float(np.min(s, initial=np.inf) ** 2) if len(s) else 0.0}
-    errors = np.sqrt(np.sum((vt[known] / s[:, None]) ** 2, axis=0))
-    return (int(known.sum()), float(value[criterion])), np.where(lost, np.inf, errors)
+    errors = np.sqrt(np.sum((vt[determined] / s[:, None]) ** 2, axis=0))
+    return (int(determined.sum()), float(value[criterion])), np.where(lost, np.inf, errors)

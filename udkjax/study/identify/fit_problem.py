@@ -1,10 +1,10 @@
 """The least-squares problem: residuals of all records, weighted by their noise, and of priors; and their Jacobian.
 
-With y what is measured, yhat(z) what the mechanism with the unknowns z would show, and sigma the standard deviation of the noise,
+With y the measured values, yhat(z) the values predicted with the unknowns z, and sigma the standard deviation of the noise,
 
     r = (yhat(z) - y) / sigma,        J = dr/dz,
 
-followed by (x - mean) / sigma of each prior. Every number y that is there is one residual; the order is record, time, channel.
+followed by (x - mean) / sigma of each prior. Every measured number is one residual; the order is record, time, channel.
 """
 
 import inspect
@@ -30,12 +30,12 @@ from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
 
-STILL_DEVIATION = 1e-12  # of the largest number in a channel: with a smaller deviation the channel does not move
-# Of the largest singular value of a Jacobian: directions below it do not show in what was measured. A change that leaves the
-# equations of motion as they are has 1e-16, whatever the tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
+STILL_DEVIATION = 1e-12  # relative to the largest number in a channel: with a smaller deviation the channel is constant
+# Relative to the largest singular value of a Jacobian: measurements do not determine directions with smaller ones. A change that
+# leaves the equations of motion unchanged has 1e-16, at any tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
 INVISIBLE_RATIO = 1e-8
-RESIDUALS_PER_UNKNOWN = 3.0  # in the first part of a record that is fitted, and in a piece: fewer would follow the noise
-# Arguments of `simulate` that an identification decides about.
+RESIDUALS_PER_UNKNOWN = 3.0  # in the first fitted part of a record, and in a piece: fewer would fit the noise
+# Arguments of `simulate` that `identify` sets itself.
 DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")
 Strategy = Literal["auto", "pieces"]
 
@@ -49,7 +49,7 @@ class Residuals(NamedTuple):
 
     @property
     def ok(self) -> np.ndarray:
-        """True (B,) where all of it is finite, of runs that came to their end."""
+        """True (B,) where all runs were completed and all values are finite."""
         return (self.code == Result.successful) & np.isfinite(self.r).all(1) & np.isfinite(self.J).all((1, 2))
 
 
@@ -57,21 +57,21 @@ class FitProblem:
     """The residuals to be minimized, as a function of the unknowns z (K,): P of parameters, then those of initial states.
 
     Attributes:
-        ts: times (records, times) of the records, from their beginning on (s).
-        y: measured values (records, times, channels), not a number where nothing was measured.
-        present: mask of the values that there are; `index` (R, 3) is the record, time and channel of each of these R residuals.
-        sigma: standard deviations (R,) that residuals are divided by; `noise_given` (R,) says which of them were given.
-        channel_scale: the size of what each channel shows (C,).
-        runs: runs to simulate; `run` and `time` (R,) are the run and the place in its times that each residual is of.
-        state_sizes: changes of the unknowns of initial states, in their units, by one of each z (K - P,).
-        columns: places in z of the unknowns of each run's initial state (N, S), -1 where it has none.
+        ts: times (records, times) of the records, from their beginning (s).
+        y: measured values (records, times, channels), NaN where nothing was measured.
+        present: mask of the measured values; `index` (R, 3) is the record, time and channel of each of the R residuals.
+        sigma: standard deviations (R,) of the residuals; `noise_given` (R,) marks those that were given.
+        channel_scale: scale of the values of each channel (C,).
+        runs: runs to simulate; `run` and `time` (R,) are the run and the index of the time of each residual.
+        state_sizes: change of each initial-state unknown, in its units, per unit of z (K - P,).
+        columns: indices in z of the unknowns of each run's initial state (N, S); -1 for unused entries.
         beginnings: the run that each record begins with (records,).
-        priors: indices of the parameters that have a prior; their residuals follow the R.
-        predictor: computes what the channels show, and counts evaluations.
+        priors: indices of the parameters with a prior; their residuals follow the R measured ones.
+        predictor: computes the values of the channels, and counts evaluations.
     """
 
-    extra_rows: int  # residuals that follow those of what was measured
-    constrained: int = 0  # unknowns that extra rows determine, and not what was measured
+    extra_rows: int  # residuals after the measured ones
+    constrained: int = 0  # unknowns that are determined by extra rows, not by measurements
 
     def __init__(
         self, mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any] | None = None
@@ -104,19 +104,19 @@ class FitProblem:
         return float((self.ts[:, -1] - self.ts[:, 0]).max())
 
     def series(self) -> list[np.ndarray]:
-        """Return the indices of the residuals of each channel of each record that has some, in the order of time."""
+        """Return the indices of the residuals of each measured channel of each record, in the order of time."""
         record, _, channel = self.index.T
         pairs = ((k, c) for k in range(len(self.records)) for c in range(len(self.channels)))
         return [places for k, c in pairs if len(places := np.flatnonzero((record == k) & (channel == c)))]
 
     def noise_groups(self) -> Int[np.ndarray, "R"]:
-        """Return for each residual, those of priors too, which noise it shares that is to be estimated; -1 where it is known."""
+        """Return the group of each residual, including priors, that shares an unknown noise level; -1 if the noise was given."""
         _, group = np.unique(np.where(self.noise_given, -1, self.index[:, 2]), return_inverse=True)
         group = group - 1 if self.noise_given.any() else group
         return np.concatenate([group, np.full(self.extra_rows, -1)])
 
     def by_record(self, rows: Float[np.ndarray, "R"]) -> tuple[dict[str, np.ndarray], ...]:
-        """Return numbers of all residuals as tables: of each record, its channels at its times; nan where there is none."""
+        """Arrange one number per residual in a table for each record: channels at its times, NaN where nothing was measured."""
         full = np.full(self.y.shape, np.nan)
         full[self.present] = rows
         found = []
@@ -127,7 +127,7 @@ class FitProblem:
         return tuple(found)
 
     def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
-        """Return the members of B sets of unknowns: all runs of the first, then of the next."""
+        """Return the members of B sets of unknowns: all runs of the first set, then those of the next."""
         sets, (N, S) = len(z), self.columns.shape
         x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), N, axis=0)
         shift = np.where(self.columns < 0, 0.0, z[:, self.columns]).reshape(sets * N, S)
@@ -138,7 +138,7 @@ class FitProblem:
         return found._replace(runs=found.runs._replace(ts=ts))
 
     def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
-        """Return the members of some runs, with these parameters and unknowns of their initial states."""
+        """Return the members of some runs with given parameters and unknowns of their initial states."""
         return Members(x, shift, jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
@@ -147,7 +147,7 @@ class FitProblem:
         Args:
             z: B sets of unknowns.
             tol: tolerances of the integration.
-            horizon: part of each record that counts, s since it began; residuals beyond are zero. None: all of it.
+            horizon: duration of the part of each record that is used (s); later residuals are zero. None: the whole record.
         """
         found = self.predictor(self.members(z, horizon), tol)
         found = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), found)
@@ -163,7 +163,7 @@ class FitProblem:
         return Residuals(r, J, found.code.max(1))
 
     def first_states(self, mechanism: Mechanism, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
-        """Return the states that the records begin with, closed, of a mechanism that has the parameters of z."""
+        """Return the closed initial states of the records for a mechanism with the parameters of z."""
         members, found = self.members(z[None]), []
         for record, run in zip(self.records, self.beginnings, strict=True):
             guess = self.predictor.guess(members, int(run))
@@ -171,7 +171,7 @@ class FitProblem:
         return tuple(found)
 
     def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Iterate over residuals, with Jacobians, that follow those of what was measured: of priors, (x - mean) / sigma."""
+        """Iterate over the residuals after the measured ones, with their Jacobians: those of priors, (x - mean) / sigma."""
         which, u = self.priors, self.unknowns
         if not len(which):
             return
@@ -181,9 +181,9 @@ class FitProblem:
         yield (u.values(z)[:, which] - u.mean[which]) / u.sigma[which], J
 
     def by_unknowns(self, by: np.ndarray, run: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Return derivatives by x and by the state of each row's run, (B, R, P + S), as derivatives by z, (B, R, K)."""
+        """Convert derivatives by x and by the state of each row's run, (B, R, P + S), to derivatives by z, (B, R, K)."""
         P = len(self.unknowns.names)
-        J = np.zeros((*by.shape[:2], self.K + 1))  # the last column takes the derivatives by what is no unknown
+        J = np.zeros((*by.shape[:2], self.K + 1))  # the last column collects the derivatives by unused entries
         columns = self.columns[run] % (self.K + 1)
         np.put_along_axis(J, np.broadcast_to(columns, (len(z), *columns.shape)), by[..., P:], 2)
         J[..., :P] = by[..., :P] * self.unknowns.dx_dz(z[:, :P])[:, None]
@@ -191,7 +191,7 @@ class FitProblem:
 
 
 def _size_of(values: np.ndarray) -> float:
-    """Return the size of what a channel shows: the deviation from its mean; of one that stands still, its size; of zeros, 1."""
+    """Return the scale of a channel: its standard deviation; if it is constant, its absolute value; if it is zero, 1."""
     found = values[np.isfinite(values)]
     size = np.abs(found).max(initial=0.0)
     deviation = found.std() if found.size else 0.0
@@ -199,7 +199,7 @@ def _size_of(values: np.ndarray) -> float:
 
 
 def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
-    """Return the times of a record until so long after it began, padded to the same length."""
+    """Return the times of a record up to `horizon` after its beginning, padded to the same length."""
     last = max(1, int(np.searchsorted(ts - ts[0], horizon, side="right")) - 1)
     return pad_times(ts[: last + 1], len(ts))
 
@@ -219,11 +219,11 @@ def build_problem(
     initial_state: Start | Estimated | None = None,
     tol: float = TIGHT_TOL,
 ) -> FitProblem:
-    """Build the problem that arguments of `identify` pose.
+    """Build the problem from the arguments of `identify`.
 
     Raises:
-        IdentificationError: with every mistake in them.
-        AssemblyError: the mechanism cannot be closed with the first guess, nor with any near it.
+        IdentificationError: lists every mistake in them.
+        AssemblyError: the mechanism cannot be closed with the first guess or any guess near it.
     """
     unknowns, records = _collect(
         lambda: _check_settings(mechanism, settings),
@@ -234,7 +234,7 @@ def build_problem(
 
 
 def _collect(*steps: Callable[[], Any]) -> list[Any]:
-    """Return the results of some steps; if any of them raises `IdentificationError`, raise one with the mistakes of all."""
+    """Return the results of some steps; if any raise `IdentificationError`, raise a single one with all mistakes."""
     found, problems = [], []
     for step in steps:
         try:
@@ -254,11 +254,11 @@ def _with_initial_state(records: Sequence[Record], given: Start | Estimated | No
 
 
 def _check_settings(mechanism: Mechanism, settings: Mapping[str, Any]) -> None:
-    known = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
+    allowed = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
     problems = [
-        f"{name}: no setting of simulate that can be given here{suggestion(name, known)}"
+        f"{name}: not an argument of simulate that can be given here{suggestion(name, allowed)}"
         for name in settings
-        if name not in known
+        if name not in allowed
     ]
     problems += argument_problems(simulate, {"mechanism": mechanism, **settings})
     if problems:
@@ -268,10 +268,9 @@ def _check_settings(mechanism: Mechanism, settings: Mapping[str, Any]) -> None:
 def _closable_problem(
     mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any], seed: int, tol: float
 ) -> FitProblem:
-    """Build the problem at the first guess; where that cannot be closed, at the nearest that can.
+    """Build the problem at the first guess, or at the nearest guess that can be closed.
 
-    Whether a mechanism without redundant rows closes is seen by the first run, which the fit begins with: to look before would
-    cost more than the run.
+    A mechanism without redundant rows is checked by its first run, with which the fit begins: a separate check would cost more.
     """
     if unknowns.at_scene_values and analyse(mechanism).redundant_rows == ():
         try:

@@ -1,13 +1,13 @@
-"""Derivatives against differences: whether those that identification uses are right, as far as differences can show.
+"""Check of the derivatives that identification uses against finite differences.
 
-With y(z) what the mechanism with the unknowns z would show, J d is compared with differences of y along directions d: each
-unknown by itself, and some in which all of them move. Each evaluation closes the mechanism anew. J has an error of its own, being
-that of the motion as it was integrated: by how much it changes at another tolerance. The floor up to which both can agree is that
-error and those of the differences, noise and truncation (see `differences`), at the step where they are least. None of this looks
-at how far they are apart; where that is more than the floor, the derivative is wrong, or there is none.
+With y(z) the values predicted with the unknowns z, J d is compared with differences of y along directions d: each unknown by
+itself, and some random combinations of all. Each evaluation closes the mechanism again. J has an integration error, estimated by
+its change at another tolerance. The floor up to which both can agree is the sum of this error and those of the differences, noise
+and truncation (see `differences`), at the step where they are smallest. It does not depend on the discrepancy: if that exceeds
+the floor, the derivative is wrong, or does not exist.
 
-Along a chaotic motion even the smallest step leads to quite another one, and there is nothing to compare with. So steps are left
-out whose h J d is more than all that a channel shows, if it moves at all.
+Along a chaotic motion even the smallest step leads to an entirely different motion, with which there is nothing to compare. So
+steps are excluded for which h J d exceeds the values of a channel, if it moves at all.
 """
 
 from collections.abc import Sequence
@@ -31,15 +31,15 @@ from udkjax.study.identify.prediction import TIGHT_TOL, TolerancePair
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 
-AGREEMENT = 3.0  # floors: a floor is a sum of sizes, each of which was measured once
-USEFUL_PRECISION = 0.1  # of the derivative's size: where the floor is higher, agreement says little
-RANDOM_DIRECTIONS = 3  # in which all unknowns move
-OTHER_TOL = 0.01, 10.0  # of the tolerance: where errors are measured; the second where runs fail at the first
-SMALLEST_TOL = 1e-14  # below it, step control follows rounding errors
+AGREEMENT = 3.0  # floors up to which a discrepancy is agreement: the parts of a floor are single samples of errors
+USEFUL_PRECISION = 0.1  # relative to the derivative: with a higher floor agreement means little
+RANDOM_DIRECTIONS = 3  # directions in which all unknowns change
+OTHER_TOL = 0.01, 10.0  # relative to the tolerance: at which errors are estimated; the second if runs fail at the first
+SMALLEST_TOL = 1e-14  # below it, the step controller follows rounding errors
 
 
 class DisagreementPlace(NamedTuple):
-    """A time (s) at which a derivative differs most from its difference; both are in units of the channel per unit of z."""
+    """The time (s) at which a derivative and its difference (channel units per unit of z) disagree most."""
 
     record: int
     channel: str
@@ -50,24 +50,24 @@ class DisagreementPlace(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GradientCheck:
-    """A comparison of derivatives with differences, in D directions of z and S series: what one channel of one record shows.
+    """A comparison of derivatives with finite differences, in D directions of z and S series (one channel of one record).
 
-    All sizes are root mean squares over the times of a series, in the channel's units per unit of z; not a number where runs did
-    not come to their end. `print` shows, for each direction, the series that agrees worst.
+    All sizes are root mean squares over the times of a series, in the channel's units per unit of z; NaN if runs failed. `print`
+    shows the series with the worst agreement for each direction.
 
     Attributes:
         title: the name of the mechanism.
-        names: of the directions.
-        directions: each of length one.
-        series: record and channel; `labels` are what messages call it, `units` those of the channel.
-        steps: of the differences.
-        discrepancy: between derivatives and differences, by step.
+        names: names of the directions.
+        directions: the directions, of unit length.
+        series: record and channel of each series; `labels` are their names in messages, `units` the channels' units.
+        steps: steps of the differences.
+        discrepancy: discrepancy between derivatives and differences, by step.
         noise, truncation: errors of the differences, by step.
         derivative_error: errors of the derivatives.
-        size: of the derivatives.
-        places: places where each is furthest off (D, S).
+        size: size of the derivatives.
+        places: times of the worst disagreement (D, S).
         tol: tolerances of the integration.
-        other_tol: tolerances that errors were measured with.
+        other_tol: tolerances at which errors were estimated.
     """
 
     title: str
@@ -88,49 +88,49 @@ class GradientCheck:
 
     @property
     def ok(self) -> bool:
-        """True if derivatives and differences agree, up to the floor."""
+        """True if derivatives and differences agree in all directions and series."""
         return bool(self.agrees.all())
 
     @property
     def agrees(self) -> Bool[np.ndarray, "D S"]:
-        """For each direction and series, True if they agree."""
+        """True for each direction and series if the discrepancy is at most `AGREEMENT` floors."""
         return self.ratio <= AGREEMENT
 
     @cached_property
     def best(self) -> Int[np.ndarray, "D S"]:
-        """The number of the step at which differences are best; -1 where there is none."""
+        """Index of the step with the most accurate differences; -1 if all failed."""
         return best_steps(self.noise + self.truncation)
 
     def at_best(self, values: Float[np.ndarray, "D S H"]) -> Float[np.ndarray, "D S"]:
-        """Return of values by step those at the best step."""
+        """Return the values at the best step."""
         found = np.take_along_axis(values, np.maximum(self.best, 0)[..., None], -1)[..., 0]
         return np.where(self.best < 0, np.nan, found)
 
     @property
     def step(self) -> Float[np.ndarray, "D S"]:
-        """The step at which differences are best."""
+        """The step with the most accurate differences."""
         return self.at_best(np.broadcast_to(self.steps, self.noise.shape))
 
     @property
     def floor(self) -> Float[np.ndarray, "D S"]:
-        """Up to what derivatives and differences can agree: noise, truncation, and the error of the derivative."""
+        """Discrepancy that errors explain: noise, truncation, and the error of the derivative."""
         return self.at_best(self.noise + self.truncation) + self.derivative_error
 
     @property
     def ratio(self) -> Float[np.ndarray, "D S"]:
-        """The discrepancy over the floor; not a number where one of them is not known."""
+        """The discrepancy over the floor; NaN where one of them is unknown."""
         discrepancy, floor = self.at_best(self.discrepancy), self.floor
         return np.where(discrepancy == 0.0, 0.0, discrepancy / np.where(floor == 0.0, np.finfo(float).tiny, floor))
 
     @property
     def worst(self) -> Int[np.ndarray, "D"]:
-        """For each direction, the series that agrees worst."""
+        """Index of the series with the worst agreement, for each direction."""
         return np.nan_to_num(self.ratio, nan=np.inf).argmax(1)
 
     @property
     def message(self) -> str:
-        """Remarks on the check, one sentence a line."""
-        return "\n".join(_sentences(self)) or "derivatives agree with differences as far as differences can tell"
+        """Remarks on the check, one sentence per line."""
+        return "\n".join(_sentences(self)) or "derivatives agree with finite differences, to within the errors of both"
 
     def __str__(self) -> str:
         return text_table(table := _table(self), len(table.rows))
@@ -153,32 +153,32 @@ def check_gradients(
     seed: int = 0,
     **settings: Any,
 ) -> GradientCheck:
-    """Compare the derivatives that `identify` uses with differences, at the first guess of the parameters.
+    """Compare the derivatives that `identify` uses with finite differences, at the first guess of the parameters.
 
-    Directions are each unknown by itself, and a few in which all of them move; in each, the mechanism is closed anew and run
-    forty times. At an estimate there is `Estimate.check_gradients`.
+    The directions are each unknown by itself, and a few random combinations; in each, the mechanism is closed and simulated forty
+    times. For the same check at an estimate, see `Estimate.check_gradients`.
 
     Args:
-        mechanism: with first guesses.
+        mechanism: mechanism with the first guesses.
         data: records, as for `identify`; only times, names of channels and initial states matter.
         parameters: parameters, as for `identify`.
         tol: tolerance of the integration, relative and absolute.
         ignore: columns of tables that are not read.
-        seed: of the directions in which all unknowns move.
-        settings: of `simulate`.
+        seed: seed of the random directions.
+        settings: further arguments of `simulate`.
 
     Returns:
-        The comparison: `ok` says whether all derivatives agree, `print` shows a table.
+        The comparison: `ok` is True if all derivatives agree, `print` shows a table.
 
     Raises:
-        IdentificationError: as `identify` does, and where the motion itself does not come to its end.
+        IdentificationError: as for `identify`, and if the motion itself cannot be simulated to its end.
     """
     problem = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed)
     return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed)
 
 
 def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, seed: int = 0) -> GradientCheck:
-    """Compare the derivatives of a problem at z with differences, at tolerances of the integration."""
+    """Compare the derivatives of a problem at z with finite differences, at given tolerances of the integration."""
     rows, names = len(problem.index), problem.all_names[: problem.K - problem.constrained]
     _, residuals = _evaluate_first(problem, z, [tol])
     smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
@@ -217,20 +217,20 @@ def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Toler
 
 
 def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[TolerancePair]) -> tuple[TolerancePair, Residuals]:
-    """Return the first of some tolerances at which runs come to their end, and the residuals with it."""
+    """Return the first of some tolerances at which all runs are completed, and the residuals at it."""
     for tol in tols:
         found = problem.evaluate(z[None], tol)
         if found.code[0] == Result.successful and np.isfinite(found.r[0]).all():
             return tol, found
     code = Result(int(found.code[0]))
-    cause = "some of its channels are not numbers" if code == Result.successful else CAUSES[code]
-    raise IdentificationError([f"there are no derivatives to be checked: {cause}"])
+    cause = "some channels are NaN" if code == Result.successful else CAUSES[code]
+    raise IdentificationError([f"there are no derivatives to check: {cause}"])
 
 
 def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B R"]:
-    """Return the predictions of channels, in their units; nan where a run does not come to its end."""
+    """Return the predicted values of channels, in their units; NaN if a run fails."""
     rows = len(problem.index)
-    # Few at a time, so that they are computed one by one: lanes would have to be compiled.
+    # So few at a time that they are computed one by one: vector lanes would have to be compiled.
     together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))
     parts = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
     r, code = np.concatenate([part.r for part in parts]), np.concatenate([part.code for part in parts])
@@ -264,36 +264,36 @@ def _sentences(check: GradientCheck) -> list[str]:
 
 
 def _sentence(check: GradientCheck, d: int, s: int) -> str:
-    """Return a sentence on a direction and a series; nothing where all is well."""
+    """Return a sentence about a problem in a direction and a series; empty if there is no problem."""
     floor, size = check.floor[d, s], check.size[d, s]
     if np.isnan(check.noise[d, s]).all():
-        return "cannot be compared, since runs beside it do not come to their end"
+        return "cannot be compared, since runs with nearby values fail"
     if check.best[d, s] < 0:
-        return "cannot be compared, since differences do not settle: the motion jumps, or is too sensitive"
+        return "cannot be compared, since differences do not converge: the motion jumps, or is too sensitive"
     if not check.agrees[d, s]:
         place, times = check.places[d][s], check.ratio[d, s]
         of = f" of {check.labels[s]}" if len(check.series) > 1 else ""
         values = f"the derivative is {place.derivative:.6g}, by differences {place.difference:.6g}"
-        remark = f": {times:.2g} times as far apart as errors of both explain" if np.isfinite(times) else ""
+        remark = f": {times:.2g} times the discrepancy that the errors of both explain" if np.isfinite(times) else ""
         return f"at t = {place.time:.6g} s{of} {values}{remark}"
     if floor > size:
-        return f"the derivative is below {floor:.1g} {check.units[s]}".rstrip() + ", which is all that differences tell of it"
+        return f"the derivative is smaller than the accuracy of differences, {floor:.1g} {check.units[s]}".rstrip()
     if floor > USEFUL_PRECISION * size:
-        return f"differences tell the derivative to {floor / size:.0%}; with a smaller tolerance they tell more"
+        return f"differences are accurate to {floor / size:.0%} only; a smaller tolerance makes them more accurate"
     return ""
 
 
 def _table(check: GradientCheck) -> PrintedTable:
     several = len(check.series) > 1
     where = ["worst in"] if several else []
-    cells, heads = [], ("direction", *where, "size", "differs by", "noise", "truncation", "own error", "step", "")
+    cells, heads = [], ("direction", *where, "size", "differs by", "noise", "truncation", "its error", "step", "")
     parts = [check.at_best(x) for x in (check.discrepancy, check.noise, check.truncation)]
     for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
         size = check.size[d, s]
-        whole = np.fmax(size, parts[0][d, s]) or 1.0  # a derivative of zero differs by all of what differences are
+        whole = np.fmax(size, parts[0][d, s]) or 1.0  # a zero derivative differs by the whole difference
         relative = [f"{part[d, s] / whole:.1e}" for part in (*parts, check.derivative_error)]
-        verdict = "agrees" if check.agrees[d, s] else "not known" if check.best[d, s] < 0 else "DIFFERS"
+        verdict = "agrees" if check.agrees[d, s] else "unknown" if check.best[d, s] < 0 else "DIFFERS"
         where = [check.labels[s]] if several else []
         cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))
-    title = f"{check.title}: derivatives against differences, at a tolerance of {check.tol[0]:.1g}"
+    title = f"{check.title}: derivatives against finite differences, at a tolerance of {check.tol[0]:.1g}"
     return PrintedTable(title, cells, heads, check.message.splitlines())

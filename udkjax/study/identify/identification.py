@@ -1,4 +1,4 @@
-"""Identify: from a mechanism, records and the names of parameters to an estimate."""
+"""`identify`: from a mechanism, records and the names of parameters to an estimate."""
 
 import time
 from collections.abc import Sequence
@@ -25,9 +25,9 @@ from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.noise import Whiteness, whiteness_of
 
-MOST_REWEIGHTINGS = 2  # fits, each with the noise that the one before left
-SAME_WEIGHT_RATIO = 1.05  # ratio of weights, compared with each other, that moves no estimate by what counts beside its error
-INTEGRATION_ERROR = 1e-8  # of what a channel shows: smaller residuals are errors of the integration, which need not be noise
+MOST_REWEIGHTINGS = 2  # further fits, each weighted by the residuals of the previous one
+SAME_WEIGHT_RATIO = 1.05  # change of relative weights that shifts an estimate by a negligible part of its standard error
+INTEGRATION_ERROR = 1e-8  # relative to a channel's scale: smaller residuals are integration errors, not noise
 
 
 @checked
@@ -49,41 +49,42 @@ def identify(
     progress: ProgressOption = None,
     **settings: Any,
 ) -> Estimate:
-    """Find the values of parameters with which a mechanism moves as was measured.
+    """Identify parameters of a mechanism from measured motion.
 
-    With y what was measured and yhat(z) what the mechanism shows, sum ((yhat(z) - y) / sigma)^2 is minimized by SciPy's
-    `least_squares` with exact forward derivatives, through the closure of all loops. Where the first guess does not lead to a
-    fit that explains the records, as it is wrong by a swing somewhere, they are fitted as they grow, each time as far as what is
-    known by then predicts them; then from other guesses, up to a factor of 2.5 away. Where none leads to a fit, as along chaotic
-    motion, the records are cut into pieces that are held together.
+    With y the measured and yhat(z) the predicted values, sum ((yhat(z) - y) / sigma)^2 is minimized by SciPy's `least_squares`,
+    with exact forward derivatives through the closure of all loops. If the fit from the first guess does not explain the records,
+    as when a predicted oscillation gets out of phase, growing parts of the records are fitted, each as long as the previous fit
+    can predict; then the same from other guesses, up to a factor of 2.5 away. If no guess leads to a fit, as with chaotic motion,
+    the records are cut into pieces (multiple shooting).
 
     Args:
         mechanism: the scene, with first guesses.
-        data: a `Record`, a mapping of times ("time") and channels, a table of pandas or a dataset of xarray, the path of a CSV or
-            NetCDF file, or a sequence of these: records, each with an initial state of its own.
-        parameters: names of numbers of the scene, `length`s, ties in text (`body.a.mass = body.b.mass`), or `Parameter`s with
+        data: a `Record`, a mapping of times ("time") and channels, a pandas table, an xarray dataset, the path of a CSV or NetCDF
+            file, or a sequence of these. Each record has its own initial state.
+        parameters: names of numbers of the scene, `length`s, ties as text (`body.a.mass = body.b.mass`), or `Parameter`s with
             bounds and priors.
-        noise: standard deviation, in SI units, of all channels or of each by channel; where none is given it is estimated from
-            the residuals of the fit.
-        initial_state: the `Start` of every record, or what of it is to be estimated ("position", "velocity", "both"); by default
-            the records' own, and for those of tables the scene's.
-        n_starts: most further first guesses to follow, the best of eight times as many; 0: none.
-        guesses: first guesses (B, P) to try besides the first, in place of `n_starts`.
-        loss: "least_squares"; "huber" or "soft_l1", for which single wrong numbers count less; or a function of the weighted
-            residuals (R,) by JAX (standard errors stay those of squares).
-        optimizer: of optax, instead of SciPy's least squares (for a loss of your own: of L-BFGS); one without a line search.
-        strategy: "pieces" cuts the records into pieces at once; "auto": only where nothing else leads to a fit.
-        tol: tolerance of the integration at the end, relative and absolute.
-        seed: of further first guesses.
+        noise: standard deviation, in SI units, of all channels or of each by channel; by default estimated from the residuals of
+            the fit.
+        initial_state: the `Start` of every record, or the parts of it to estimate ("position", "velocity", "both"); by default
+            the records' own, and for tables the scene's.
+        n_starts: maximum number of further first guesses to follow, the best of eight times as many samples; may be 0.
+        guesses: further first guesses (B, P), instead of `n_starts`.
+        loss: "least_squares"; "huber" or "soft_l1", which reduce the influence of outliers; or a JAX function of the weighted
+            residuals (R,), whose standard errors are those of least squares.
+        optimizer: an optax optimizer without a line search; by default SciPy's least squares, or L-BFGS for a function `loss`.
+        strategy: "pieces" cuts the records into pieces at once; "auto" does so only if nothing else leads to a fit.
+        tol: tolerance of the final integration, relative and absolute.
+        seed: seed of the further first guesses.
         ignore: columns of tables that are not read.
-        progress: None or "auto" shows a line after two seconds, True at once, False none; a callable gets each `Progress`.
-        settings: further ones of `simulate`.
+        progress: None or "auto" shows a line after two seconds, True at once, False never; a callable gets each `Progress`.
+        settings: further arguments of `simulate`.
 
     Returns:
-        The estimate. What the records do not show is no error: `Estimate.success` is false, and `Estimate.message` names it.
+        The estimate. If the records do not determine every parameter, `Estimate.success` is False and `Estimate.message` names
+        the undetermined ones.
 
     Raises:
-        IdentificationError: with every mistake; also where a parameter would open a loop that has more constraints than it needs.
+        IdentificationError: lists every mistake, including parameters that would open a loop with redundant constraints.
     """
     start = time.perf_counter()
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
@@ -98,20 +99,20 @@ def identify(
     return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - start)
 
 
-MOST_STARTS = 10**6  # first guesses: of more, not even their numbers fit into memory at once
+MOST_STARTS = 10**6  # first guesses: more would not fit into memory
 
 
 def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
-    """Return first guesses of all unknowns."""
+    """Return first guesses of all unknowns, those of initial states being zero."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
     if not 0 <= n_starts <= MOST_STARTS:
-        raise IdentificationError([f"n_starts: must be a number of guesses from 0 on, {MOST_STARTS:,} at most, is {n_starts}"])
+        raise IdentificationError([f"n_starts: must be a number of guesses between 0 and {MOST_STARTS:,}, is {n_starts}"])
     if guesses is None:
         return first
     given = np.asarray(guesses, float)
     if given.ndim != 2 or given.shape[1] != P or not np.isfinite(given).all():
         raise IdentificationError(
-            [f"guesses: must be of shape (B, {P}), one finite value a parameter; is of shape {given.shape}"]
+            [f"guesses: must be of shape (B, {P}), one finite value per parameter; is of shape {given.shape}"]
         )
     z = problem.unknowns.z_of(given)
     if not np.isfinite(z).all():
@@ -123,14 +124,14 @@ def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None
 def _require_finite(problem: FitProblem, found: SearchResult) -> None:
     if not np.isfinite(found.fit.cost):
         code = problem.evaluate(found.fit.z[None], (LOOSE_TOL, LOOSE_TOL)).code[0]
-        raise IdentificationError([f"no first guess could be simulated along the records: {CAUSES[Result(int(code))]}"])
+        raise IdentificationError([f"the records cannot be simulated with any first guess: {CAUSES[Result(int(code))]}"])
 
 
 # --- the end of a fit
 
 
 def _refit(found: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tuple[Fit, CostHistory]:
-    """Fit to the end, each channel weighted by the noise that it has turned out to have."""
+    """Fit to the final tolerance, each channel weighted by the noise estimated from its residuals."""
     problem = found.problem
     fit = minimizer.minimize(problem, found.fit.z, tol)
     history = [*found.history, *fit.history]
@@ -145,10 +146,10 @@ def _refit(found: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tup
 
 
 def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, loss: Loss, least: float = 0.0) -> bool:
-    """Take what a fit leaves of each channel as its noise, where that is not known, and `least` of what the channel shows.
+    """Set the noise of channels for which it was not given from their residuals, but to at least `least` times their scale.
 
     Returns:
-        Whether residuals weigh otherwise now, compared with each other.
+        True if the relative weights of residuals changed, so that another fit is needed.
     """
     before = problem.sigma.copy()
     rows = len(problem.index)
@@ -157,7 +158,7 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, 
     for c in range(len(problem.channels)):
         own = (problem.index[:, 2] == c) & ~problem.noise_given & kept
         if own.any():
-            # Unknowns take their part of each channel's freedom.
+            # Each channel loses its part of the degrees of freedom to the unknowns.
             freedom = own.sum() * (1.0 - (problem.K - problem.constrained) / rows)
             size = np.sqrt(left[own] @ left[own] / max(freedom, 1.0))
             every = (problem.index[:, 2] == c) & ~problem.noise_given
@@ -174,7 +175,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
     plain, rows = problem.evaluate(z[None], tol), len(problem.index)
     weighted = loss(plain)
     outlying, robust = find_outlier_rows(problem, plain.r[0, :rows]), loss is not squares
-    # By a robust loss outliers hardly count, and are left out here; squares count them, and so do standard errors.
+    # Outliers hardly count in a robust loss and are left out here; least squares counts them, and so do standard errors.
     kept = np.concatenate([~outlying | (not robust), np.ones(problem.extra_rows, bool)])
     groups = problem.noise_groups()
     values = UnknownValues(
@@ -218,7 +219,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
         noise=problem.by_record(sigma),
         outliers=list_outliers(problem, outlying, left, sigma),
         whiteness=white,
-        converged=fit.settled,
+        converged=fit.converged,
         agreeing=found.agreeing,
         guesses=found.guesses,
         ways=found.ways,
@@ -233,7 +234,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
 
 
 def _residuals_of_others(problem: FitProblem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
-    """Return the residuals of a fit without the outliers, to first order; nan in the place of outliers."""
+    """Return the residuals of a fit without the outliers, to first order; NaN at the outliers."""
     r, J, kept = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
     left = r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE_RATIO)[0]
     return np.where(outlying, np.nan, left[: len(outlying)])

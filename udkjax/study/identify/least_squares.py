@@ -1,7 +1,7 @@
-"""Least squares: the trust-region method of SciPy, ended by steps that are known to be small enough.
+"""Least squares by SciPy's trust-region method, with a convergence test on the Gauss-Newton step.
 
-Within a radius around a point z the residuals are taken to be linear, r + J dz. Where the cost falls as that promises, the radius
-grows, and it shrinks where it does not, or where a trial cannot be computed. Near a minimum steps are those of Gauss and Newton.
+Within a trust radius around a point z the residuals are approximated by r + J dz. The radius grows if the cost falls as
+predicted, and shrinks if it does not, or if a trial cannot be computed. Near a minimum the steps are Gauss-Newton steps.
 
 Source: M. A. Branch, T. F. Coleman & Y. Li, SIAM Journal on Scientific Computing 21 (1999) 1.
 """
@@ -17,29 +17,29 @@ from scipy.linalg import lstsq
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
 from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN
 
-# Gauss-Newton steps, the largest change of a dimensionless unknown, at which a fit has settled: on the way; where the integration
-# is loose too; where costs have to be exact to the square of it; and at the end, where smaller steps change nothing that shows.
+# Gauss-Newton steps (largest change of a dimensionless unknown) at which a fit has converged: of a part of the records; with
+# loose integration; with costs exact to the square of the step; and of the final fit, where smaller steps have no visible effect.
 COARSE_STEP, LOOSE_STEP, FINE_STEP, EXACT_STEP = 1e-3, 1e-5, 1e-6, 1e-10
-# Steps at most: on the way or beside a minimum; from a first guess, which if it has not settled then is on its way to nowhere;
-# and to the end.
+# Maximum number of steps: of a part of the records, or near a minimum; from a first guess, which is hopeless if it has not
+# converged by then; and of the final fit.
 FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
-# Cosine of the angle between residuals and what the unknowns can change of them, at which a fit has settled: times the root of
-# their number it is a Gauss-Newton step in standard errors, of which a thousandth changes nothing either.
+# Cosine of the angle between the residuals and the range of J at which a fit has converged: times the square root of the number
+# of residuals it is the Gauss-Newton step in standard errors, of which a thousandth is negligible.
 ORTHOGONAL_COSINE = 1e-5
-MOST_REFUSED_STEPS = 8  # steps one after another, before a fit is given up
-ROUNDING = 4 * float(np.finfo(float).eps)  # of the unknowns: shorter steps change nothing
+MOST_REFUSED_STEPS = 8  # successive rejected steps before a fit is given up
+ROUNDING = 4 * float(np.finfo(float).eps)  # relative to the unknowns: shorter steps are rounding
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
-ReportStep: TypeAlias = Callable[[str], None]  # is called with a text after each step
-CostHistory: TypeAlias = list[tuple[float, float]]  # cost, and largest change of an unknown by the next step: after each step
+ReportStep: TypeAlias = Callable[[str], None]  # called with a text after each step
+CostHistory: TypeAlias = list[tuple[float, float]]  # after each step: cost, and largest change of an unknown in the next step
 
 
 class Fit(NamedTuple):
-    """The end of a fit: unknowns, cost r.r / 2, whether it settled, and how it went."""
+    """The result of a fit."""
 
-    z: Float[np.ndarray, "K"]
-    cost: float
-    settled: bool
+    z: Float[np.ndarray, "K"]  # unknowns
+    cost: float  # r.r / 2
+    converged: bool
     history: CostHistory
 
 
@@ -47,14 +47,14 @@ def minimize_squares(
     evaluate: Objective,
     z: Float[np.ndarray, "K"],
     steps: int = STEPS,
-    settled: float = EXACT_STEP,
+    step_tol: float = EXACT_STEP,
     report: ReportStep = lambda text: None,
 ) -> Fit:
-    """Minimize r.r / 2 from a first guess. A fit has settled where its Gauss-Newton step is below `settled` (dimensionless)."""
+    """Minimize r.r / 2 from a first guess, until the (dimensionless) Gauss-Newton step is at most `step_tol`."""
     from scipy.optimize import least_squares
 
-    fit = _TrustRegionFit(evaluate, z, settled, report)
-    # `Descent` says when a fit ends, but for its steps.
+    fit = _TrustRegionFit(evaluate, z, step_tol, report)
+    # `Descent` decides when a fit ends, except for the number of steps.
     choices: dict[str, Any] = {"jac": fit.jacobian, "ftol": None, "gtol": None, "xtol": ROUNDING, "max_nfev": steps}
     with suppress(StopIteration):
         least_squares(fit.residuals, np.zeros(len(z)), **choices)
@@ -62,33 +62,33 @@ def minimize_squares(
 
 
 class Descent:
-    """One fit, whose best point is `end`; StopIteration ends it."""
+    """One fit in progress, whose best point is `end`; StopIteration ends it."""
 
-    def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], settled: float, report: ReportStep):
-        self.evaluate, self.guess, self.settled, self.report = evaluate, guess, settled, report
+    def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], step_tol: float, report: ReportStep):
+        self.evaluate, self.guess, self.step_tol, self.report = evaluate, guess, step_tol, report
         self.end, self.size = Fit(guess, np.inf, False, []), np.inf
 
-    def note(self, size: float) -> None:
-        """Note the length of the step that the best point asks for; end where that is short enough."""
+    def record(self, size: float) -> None:
+        """Record the length of the next step from the best point; end the fit if it is short enough."""
         self.size = size
         self.end.history.append((self.end.cost, size))
         self.report(f"step {len(self.end.history)}, cost {self.end.cost:.4g}")
-        if size <= self.settled:
+        if size <= self.step_tol:
             self.stop(True)
 
-    def stop(self, settled: bool) -> NoReturn:
+    def stop(self, converged: bool) -> NoReturn:
         """End the fit."""
-        self.end = self.end._replace(settled=settled)
+        self.end = self.end._replace(converged=converged)
         raise StopIteration
 
 
 class _TrustRegionFit(Descent):
-    """Residuals and Jacobians at changes of a guess, as SciPy asks for them."""
+    """Residuals and Jacobians at changes of a guess, as callbacks of SciPy."""
 
-    refused = 0  # trials since the last better one
+    refused = 0  # trials since the last improvement
 
     def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R"]:
-        """Return the residuals; infinite ones where they cannot be computed."""
+        """Return the residuals; infinite if they cannot be computed."""
         z = self.guess + change
         self.found = self.evaluate(z[None])
         r, ok = self.found.r[0], self.found.ok[0] and np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN
@@ -97,23 +97,23 @@ class _TrustRegionFit(Descent):
             self.end, self.refused = self.end._replace(z=z, cost=cost), 0
             return r
         self.refused += 1
-        is_finest = self.size <= FINE_STEP and self.refused >= 2  # better by rounding alone
+        is_finest = self.size <= FINE_STEP and self.refused >= 2  # further improvements are rounding
         if not self.end.history or is_finest or self.refused >= MOST_REFUSED_STEPS:
             self.stop(is_finest)
         return r if ok else np.full_like(r, np.inf)
 
     def jacobian(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R K"]:
-        """Return the Jacobian of the residuals that were asked for last."""
+        """Return the Jacobian of the latest residuals."""
         J = self.found.J[0]
         size, cosine = gauss_newton(self.found.r[0], J)
-        self.note(size)
+        self.record(size)
         if cosine <= ORTHOGONAL_COSINE:
             self.stop(True)
         return J
 
 
 def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:
-    """Return the largest entry of the Gauss-Newton step in directions that show, and the cosine of the angle of r to J."""
+    """Return the largest entry of the Gauss-Newton step in determined directions, and the cosine of the angle between r and J."""
     step, _, rank, _ = lstsq(J, r, cond=INVISIBLE_RATIO, lapack_driver="gelsy")
     if not rank:
         return np.inf, np.inf

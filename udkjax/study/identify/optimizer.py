@@ -1,4 +1,4 @@
-"""Losses of a fit, and their minimization: least squares, plain or robust; losses of the user's own by their gradients."""
+"""Losses of a fit and their minimization: plain or robust least squares, and user-defined losses by their gradients."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,30 +26,30 @@ from udkjax.study.identify.least_squares import (
 from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.records import IdentificationError
 
-if TYPE_CHECKING:  # imported where a fit begins: it takes a second
+if TYPE_CHECKING:  # imported only when needed: it takes a second
     import optax
 
-GRADIENT_STEPS = 2000  # at most, of an optimizer that knows no curvature
-FAILED_COST = 100.0  # times the first cost, in place of a cost that cannot be computed
-TUNING_CONSTANT = 1.345  # standard deviations: of noise that is Gaussian after all, estimates lose a twentieth of their precision
+GRADIENT_STEPS = 2000  # maximum number of steps of a first-order optimizer
+FAILED_COST = 100.0  # times the first cost, substituted for a cost that cannot be computed
+TUNING_CONSTANT = 1.345  # standard deviations: for Gaussian noise, estimates lose 5 % of their efficiency
 
-Loss: TypeAlias = Callable[[Residuals], Residuals]  # residuals whose squares are minimized, of plain ones
+Loss: TypeAlias = Callable[[Residuals], Residuals]  # transforms plain residuals into those whose squares are minimized
 UserLoss: TypeAlias = Callable[[Array], Array]
 Optimizer: TypeAlias = "optax.GradientTransformation | None"
 
 
 class GradientMethod(NamedTuple):
-    """An optimizer of optax (None: L-BFGS of scipy), and the loss that it minimizes: rho(r) of the residuals (None: r.r / 2)."""
+    """An optax optimizer (None: SciPy's L-BFGS), and the loss rho(r) of the residuals that it minimizes (None: r.r / 2)."""
 
     optimizer: Optimizer
     loss: UserLoss | None = None
 
 
 def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod | None:
-    """Return the method for an optimizer and a loss: None is least squares.
+    """Return the gradient method for an optimizer and a loss; None for least squares.
 
     Raises:
-        IdentificationError: the optimizer searches along lines, for which it would have to call the loss itself.
+        IdentificationError: the optimizer has a line search, for which it would have to call the loss itself.
     """
     if optimizer is None:
         return GradientMethod(None, loss) if callable(loss) else None
@@ -57,7 +57,7 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod 
     try:
         jax.eval_shape(lambda z: _update(optimizer, optimizer.init(z), z, jnp.zeros(()), z), jnp.zeros(1))
     except TypeError as error:
-        cure = "take one without a line search, as optax.lbfgs(linesearch=None) is, or leave it out"
+        cure = "use one without a line search, such as optax.lbfgs(linesearch=None), or leave it out"
         raise IdentificationError([f"optimizer: needs more than the value and gradient of the loss ({error}); {cure}"]) from None
     return method
 
@@ -66,12 +66,12 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod 
 
 
 def squares(found: Residuals) -> Residuals:
-    """Return plain residuals: the loss of least squares."""
+    """Return the residuals unchanged: the loss of least squares."""
     return found
 
 
 def named_loss(name: str, residuals: int) -> Loss:
-    """Return the loss of a name, for the first `residuals` of a problem: priors are not outliers."""
+    """Return the loss with a name, for the first `residuals` of a problem: priors are not outliers."""
     if name == "least_squares":
         return squares
     if name in ROBUST:
@@ -80,9 +80,9 @@ def named_loss(name: str, residuals: int) -> Loss:
 
 
 def robust(found: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
-    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J: the sum of its squares, and their gradient, are those of rho.
+    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J: its sum of squares and their gradient are those of rho.
 
-    `rho` returns rho and half of its derivative, of |r|.
+    `rho` returns rho(|r|) and half of its derivative.
     """
     r = found.r[:, :residuals]
     size = np.abs(r)
@@ -118,21 +118,21 @@ ROBUST = {"huber": huber, "soft_l1": soft_l1}
 
 
 class Evaluated(Protocol):
-    """An object that has residuals and a Jacobian: a `FitProblem`, or what is made of one."""
+    """An object with residuals and a Jacobian: a `FitProblem`, or a wrapper of one."""
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian: see `Problem.evaluate`."""
+        """Compute residuals and their Jacobian: see `FitProblem.evaluate`."""
         ...
 
 
 def weighted_residuals(problem: Evaluated, tol: TolerancePair, loss: Loss, horizon: float | None = None) -> Objective:
-    """Return the residuals whose squares are minimized, of the first `horizon` seconds of each record (None: all of it)."""
+    """Return the residuals whose squares are minimized, for the first `horizon` seconds of each record (None: all of it)."""
     return lambda z: loss(problem.evaluate(z, tol, horizon))
 
 
 @dataclass(frozen=True)
 class Minimizer:
-    """The method of all fits of an identification: least squares (None), or by gradients."""
+    """The method of all fits of an identification: least squares (None), or a gradient method."""
 
     method: GradientMethod | None = None
     loss: Loss = squares
@@ -145,17 +145,17 @@ class Minimizer:
         tol: TolerancePair,
         horizon: float | None = None,
         steps: int = STEPS,
-        settled: float = EXACT_STEP,
+        step_tol: float = EXACT_STEP,
     ) -> Fit:
         """Fit the first `horizon` seconds of each record (None: all of it) from a first guess: see `minimize_squares`."""
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if self.method is not None:
-            return minimize_by_gradient(self.method, evaluate, z, settled=settled, report=self.report)
-        return minimize_squares(evaluate, z, steps, settled, self.report)
+            return minimize_by_gradient(self.method, evaluate, z, step_tol=step_tol, report=self.report)
+        return minimize_squares(evaluate, z, steps, step_tol, self.report)
 
-    def with_label(self, what: str) -> "Minimizer":
-        """Return the same one, with reports that begin with what is fitted."""
-        return replace(self, report=lambda text: self.report(f"{what}: {text}"))
+    def with_label(self, label: str) -> "Minimizer":
+        """Return the same minimizer with reports that begin with a label."""
+        return replace(self, report=lambda text: self.report(f"{label}: {text}"))
 
 
 def minimize_by_gradient(
@@ -163,15 +163,16 @@ def minimize_by_gradient(
     evaluate: Objective,
     z: Float[np.ndarray, "K"],
     steps: int = GRADIENT_STEPS,
-    settled: float = FINE_STEP,
+    step_tol: float = FINE_STEP,
     report: ReportStep = lambda text: None,
 ) -> Fit:
-    """Minimize a loss rho(r) by an optimizer that knows its gradient J^T d rho / dr, from a first guess.
+    """Minimize a loss rho(r) by its gradient J^T d rho / dr, from a first guess.
 
-    A fit has settled where (J^T J)^-1 J^T d rho / dr is small, but no smaller than first-order methods come. Derivatives are
-    taken forward here too: in reverse mode a gradient costs a fifth of it with 20 unknowns, but takes 20 to 40 s to compile.
+    A fit has converged if (J^T J)^-1 J^T d rho / dr is at most `step_tol`, but at least as large as first-order methods reach.
+    Derivatives are forward here, too: with 20 unknowns a gradient in reverse mode takes a fifth of the time, but 20 to 40 s to
+    compile.
     """
-    descent = _LossDescent(method.loss or _half_square, evaluate, z, max(settled, FINE_STEP), report)
+    descent = _LossDescent(method.loss or _half_square, evaluate, z, max(step_tol, FINE_STEP), report)
     with suppress(StopIteration):
         _descend(method.optimizer, descent, steps)
     return descent.end
@@ -191,7 +192,7 @@ def _descend(optimizer: Optimizer, descent: "_LossDescent", steps: int) -> None:
 
 
 def _update(optimizer: "optax.GradientTransformation", state, at, value, gradient):
-    """Return the next unknowns of an optimizer of optax, and its state then."""
+    """Return the next unknowns and state of an optax optimizer."""
     with OptionalImport():
         import optax
     change, state = optax.with_extra_args_support(optimizer).update(gradient, state, at, value=value, grad=gradient)
@@ -199,7 +200,7 @@ def _update(optimizer: "optax.GradientTransformation", state, at, value, gradien
 
 
 class _LossDescent(Descent):
-    """A loss and its gradient, as optimizers ask for them."""
+    """A loss and its gradient, as a callback of optimizers."""
 
     def __init__(self, rho: UserLoss, *fit: Any):
         super().__init__(*fit)
@@ -221,7 +222,7 @@ class _LossDescent(Descent):
             shows = s > INVISIBLE_RATIO * s.max(initial=0.0)
             size = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
             self.end = self.end._replace(z=z.copy(), cost=value)
-        self.note(size)
+        self.record(size)
         return value, gradient
 
 

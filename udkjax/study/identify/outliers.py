@@ -1,4 +1,4 @@
-"""Single wrong numbers in records: residuals that are too large for the noise of the others."""
+"""Outliers in records: residuals that are too large for the noise of the others."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -11,27 +11,24 @@ from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.records import label_prefixes, output_times
 from udkjax.study.noise import outlier_rows
 
-NOISE_FLOOR = 1e-6  # of what a channel shows: residuals below it are not of measurements, and count alike
-MOST_OUTLIERS_NAMED = 5  # of a channel, the largest; the others are counted
+NOISE_FLOOR = 1e-6  # relative to a channel's scale: least noise of measurements
+MOST_OUTLIERS_NAMED = 5  # outliers listed per channel, the largest; the others are counted
 
 
 class Outlier(NamedTuple):
-    """A measured value that is not noise: which one, and how far from what the mechanism shows.
-
-    `row` is its place in the record, from 0 on; `deviations` is the residual over the noise of the channel's other values.
-    """
+    """A measured value too far from the prediction to be noise."""
 
     record: int
     channel: str
-    row: int
+    row: int  # index in the record, from 0
     time: float
     residual: float
     units: str
-    deviations: float
+    deviations: float  # residual over the noise of the channel's other values
 
 
 def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
-    """Return a mask of the outliers, by weighted residuals: each channel by its own, of all records together."""
+    """Return a mask of the outliers from weighted residuals, channel by channel over all records."""
     found, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
     shows = np.abs(r * problem.sigma) > NOISE_FLOOR * problem.channel_scale[channel]
     for c in range(len(problem.channels)):
@@ -43,7 +40,7 @@ def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np
 def list_outliers(
     problem: FitProblem, rows: Bool[np.ndarray, "R"], residuals: Float[np.ndarray, "R"], sigma: Float[np.ndarray, "R"]
 ) -> tuple[Outlier, ...]:
-    """List the outliers among measured numbers, with residuals in the units of their channels and the noise of the others."""
+    """Return the outliers, with residuals in the units of their channels and the noise of the other values."""
     found = []
     for k in np.flatnonzero(rows).tolist():
         record, time, c = problem.index[k].tolist()
@@ -54,7 +51,7 @@ def list_outliers(
 
 
 def outlier_sentences(problem: FitProblem, outliers: Sequence[Outlier], robust: bool) -> Iterator[str]:
-    """Iterate over sentences that name the outliers of each channel of each record, with the cure."""
+    """Iterate over sentences that list the outliers of each channel of each record, with advice."""
     prefixes = label_prefixes(problem.records)
     for k, name in dict.fromkeys((one.record, one.channel) for one in outliers):
         own = sorted((one for one in outliers if (one.record, one.channel) == (k, name)), key=lambda one: -one.deviations)
@@ -65,9 +62,9 @@ def outlier_sentences(problem: FitProblem, outliers: Sequence[Outlier], robust: 
         ]
         more = f" and {len(own) - MOST_OUTLIERS_NAMED} more" if len(own) > MOST_OUTLIERS_NAMED else ""
         cure = (
-            "by the loss this counts little"
+            "the robust loss gives outliers little weight"
             if robust
-            else "this moves the estimate, and standard errors take it for noise: put nan there, or give loss='huber'"
+            else "outliers shift the estimate and enlarge the standard errors: replace them by nan, or use loss='huber'"
         )
-        where = f"{prefixes[k]}{name}: {plural(len(own), 'value')} far from what the mechanism shows"
+        where = f"{prefixes[k]}{name}: {plural(len(own), 'outlier')} far from the prediction"
         yield f"{where}, {'; '.join(named)}{more}: {cure}"

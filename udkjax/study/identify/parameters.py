@@ -1,4 +1,4 @@
-"""Parameters to be identified: how they are asked for, and what of a mechanism they change."""
+"""Parameters to be identified: how users name them, and the numbers of the mechanism that they set."""
 
 import re
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
 
 
 def length(*bodies: str, as_rod: bool = False) -> Length:
-    """Name the length of a link as a parameter, or the common length of several: attachments and centre of mass move together.
+    """Return the length of a link as a parameter, or the common length of several; it moves attachments and centre of mass.
 
     Args:
         *bodies: the names of the links.
@@ -38,16 +38,16 @@ class Parameter:
     """A parameter to be identified.
 
     Attributes:
-        of: the name of a number of the scene (`body.link1.mass`, `joint.A.points[1][0]`), a `length`, several of either that are
-            tied, or a pure function (mechanism, value) -> mechanism. As text, ties are written with equals signs
+        of: the name of a number of the scene (`body.link1.mass`, `joint.A.points[1][0]`), a `length`, several tied names or
+            lengths, or a pure function (mechanism, value) -> mechanism. As text, ties are written with equals signs
             (`body.a.mass = body.b.mass`, `length(a) = length(b)`), a shared factor as `scale(body.a.mass, body.b.mass)`.
         name: its name; by default the text.
         guess: the first guess, in SI units; by default the scene's value. A function needs one.
         bounds: (low, high), between which the value stays.
-        prior: (mean, standard deviation), what was known of it before.
-        transform: "positive", "bounded" or "free"; by default what must not be negative stays positive.
-        scale: the typical size of a change of a free one; by default its own size, or 1 SI unit.
-        share: "value": tied parameters have one value; "scale": they have one factor by which the scene's values are multiplied.
+        prior: (mean, standard deviation) of the prior knowledge.
+        transform: "positive", "bounded" or "free"; by default "bounded" with bounds, and "positive" for numbers that must be.
+        scale: typical size of a change of a free parameter; by default its own size, or 1 SI unit.
+        share: "value": tied parameters have the same value; "scale": the scene's values are multiplied by the same factor.
     """
 
     of: str | Length | Sequence[str] | Setter
@@ -65,11 +65,11 @@ ParametersLike = TypeAliasType("ParametersLike", ParameterLike | Sequence[Parame
 
 
 class _Part(NamedTuple):
-    """The target of one unknown, the scene's value of it, and whether all that is tied has that value."""
+    """The target of one unknown, and its value in the scene."""
 
     target: Target
     value: float | None
-    same: bool
+    same: bool  # True if all tied numbers have this value
 
 
 def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
@@ -82,22 +82,22 @@ def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
     problems: list[str] = []
     found = [unknown for item in items for unknown in _entries(mechanism, item, problems)]
     if not items:
-        problems.append("parameters: there is none to identify; name some, such as body.link1.mass")
+        problems.append("parameters: the list is empty; name at least one, such as body.link1.mass")
     names = [unknown.name for unknown in found]
-    problems += [f"{quote(n)}: is there {names.count(n)} times" for n in dict.fromkeys(names) if names.count(n) > 1]
-    owner: dict[str, str] = {}  # of each number of the scene, the parameter that contains it
+    problems += [f"{quote(n)}: is given {names.count(n)} times" for n in dict.fromkeys(names) if names.count(n) > 1]
+    owner: dict[str, str] = {}  # the parameter that contains each number of the scene
     for unknown in found:
         for number in unknown.target.names:
             other = owner.setdefault(number, unknown.name)
             if other != unknown.name:
-                problems.append(f"{quote(unknown.name)}: {number} is a part of {quote(other)} already; tie them, or take one")
+                problems.append(f"{quote(unknown.name)}: {number} is also part of {quote(other)}; tie them, or give only one")
     if problems:
         raise IdentificationError(problems)
     return Unknowns.of(found)
 
 
 def _entries(mechanism: Mechanism, item: ParameterLike, problems: list[str]) -> list[Unknown]:
-    """Return a parameter as unknowns: of an array, each of its entries."""
+    """Return the unknowns of a parameter: one for each entry of an array."""
     p = item if isinstance(item, Parameter) else Parameter(item)
     try:
         parts = _parts(mechanism, p)
@@ -123,7 +123,11 @@ def _name(target: Target) -> str:
 
 
 def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unknown:
-    """Return one unknown; raise ValueError where its first guess, bounds, prior, transform or scale cannot be."""
+    """Return one unknown.
+
+    Raises:
+        ValueError: its first guess, bounds, prior, transform or scale is invalid.
+    """
     target, given = part.target, part.value if p.guess is None else p.guess
     if given is None:
         raise ValueError("needs a first guess: Parameter(..., guess=...)")
@@ -136,11 +140,11 @@ def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unkn
         raise ValueError(f"transform must be one of {', '.join(get_args(Transform))}, is {kind!r}")
     low, high = p.bounds if p.bounds is not None else (np.nan, np.nan)
     if p.bounds is not None and not np.isfinite(p.bounds).all():
-        raise ValueError(f'bounds must be two finite numbers, are ({low}, {high}); what has no upper one can be "positive"')
+        raise ValueError(f'bounds must be two finite numbers, are ({low}, {high}); without an upper bound, use "positive"')
     if low >= high:
         raise ValueError(f"bounds must be (low, high), the lower one first, are ({low}, {high})")
     if kind == "bounded" and not low < guess < high:
-        raise ValueError(f"the first guess {guess:g} must be between the bounds ({low}, {high}): move the one or the others")
+        raise ValueError(f"the first guess {guess:g} must be between the bounds ({low}, {high}): change the guess or the bounds")
     if kind == "positive" and not guess > 0:
         raise ValueError(f'the first guess {guess:g} must be > 0; give another one, or transform="free"')
     mean, sigma = p.prior if p.prior is not None else (np.nan, np.nan)
@@ -160,15 +164,15 @@ def _units(mechanism: Mechanism, target: Target) -> str:
 
 
 def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
-    """Return whether a value must stay positive."""
+    """Return True if a value must stay positive."""
     if target.function is not None:
         return isinstance(target.function, Length)
     return guess > 0 and (target.scaled or all(_must_be_positive(mechanism, name) for name in target.names))
 
 
 def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
-    known = parameters_of(mechanism)
-    found = known[split_index(name, known)[0]]
+    numbers = parameters_of(mechanism)
+    found = numbers[split_index(name, numbers)[0]]
     if not found.path:
         return False
     metadata = keys(type(owner_of(mechanism, found)))[found.path[-1]].metadata
@@ -180,7 +184,7 @@ def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
 
 
 def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
-    """Return the numbers that a parameter refers to: of an array, each of its entries."""
+    """Return the numbers that a parameter refers to: each entry of an array."""
     of, scaled = p.of, p.share == "scale"
     if p.share not in ("value", "scale"):
         raise ValueError(f'share must be "value" or "scale", is {p.share!r}')
@@ -191,17 +195,17 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
         return [_Part(Target(function=of), lengths[0], len(set(lengths)) == 1)]
     if callable(of):
         return [_Part(Target(function=of), None, False)]
-    known = parameters_of(mechanism)
+    numbers = parameters_of(mechanism)
     names = tuple(of)
     problems = []
     for name in names:
-        owner, _ = split_index(name, known)
-        if owner not in known:
-            problems.append(f"no parameter {quote(name)}{suggestion(name, known)}")
-        elif known[owner].value is None:
+        owner, _ = split_index(name, numbers)
+        if owner not in numbers:
+            problems.append(f"no parameter {quote(name)}{suggestion(name, numbers)}")
+        elif numbers[owner].value is None:
             problems.append(f"{quote(name)} is absent from the scene: set it there first")
     if problems or not names:
-        raise ValueError("; ".join(problems) or "names nothing")
+        raise ValueError("; ".join(problems) or "contains no name")
     values = [np.asarray(parameter_value(mechanism, name)) for name in names]
     if len({v.shape for v in values}) > 1:
         raise ValueError(f"cannot be tied: their shapes are {', '.join(str(v.shape) for v in values)}")
@@ -218,7 +222,7 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
 
 
 def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple[str, ...], bool]:
-    """Read the text of a parameter: names or lengths with equals signs between them, or a shared scale of names."""
+    """Parse the text of a parameter: names or lengths separated by equals signs, or names with a common scale."""
     text = text.strip()
     if text.startswith("scale(") and text.endswith(")"):
         return tuple(part.strip() for part in text[6:-1].split(",") if part.strip()), True
@@ -232,7 +236,7 @@ def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple
 
 
 def _length(mechanism: Mechanism, text: str) -> tuple[str, ...]:
-    """Return the bodies of `length(a, b)` or `a.length`; none where the text is no length."""
+    """Return the bodies of `length(a, b)` or `a.length`; empty if the text is not a length."""
     if text.startswith("length(") and text.endswith(")"):
         return tuple(body.strip().strip("\"'") for body in text[7:-1].split(","))
     owner, dot, field = text.rpartition(".")

@@ -1,8 +1,8 @@
-"""Predictions of what members would show, with exact derivatives by everything that is to be found.
+"""Predictions of measured values, with exact derivatives by all unknowns.
 
-A member is a mechanism with parameters of its own on the way of one record. Parameters, initial states, times and tolerances are
-numbers; a mechanism, its targets, its channels and the length of a record are compiled for. Derivatives are taken forward, of all
-members at once.
+A member is one run: a mechanism with its own parameters along one record. Parameters, initial states, times and tolerances are
+inputs of a compiled program; the mechanism's structure, the targets, the channels and the length of a record are static.
+Derivatives are forward, of all members together.
 """
 
 from collections import OrderedDict
@@ -25,27 +25,27 @@ from udkjax.study.channel_values import measure
 from udkjax.study.identify.unknowns import Target, apply_values
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Program
 
-# Tolerances of the integration, relative and absolute: of final estimates (parameters are known to that much where there is no
-# noise); where singular values or the continuity of pieces are all that is asked for; and on the way to a fit.
+# Tolerances of the integration, relative and absolute: of final estimates (the accuracy of parameters without noise); where only
+# singular values or the continuity of pieces matter; and during the search for a fit.
 TIGHT_TOL, MEDIUM_TOL, LOOSE_TOL = 1e-11, 1e-9, 1e-7
-FEWEST_IN_LANES = 1024  # members that are computed together in vector lanes; fewer one by one, which needs no second compilation
-CACHE_SIZE, CACHE_BYTES = 6, 2**24  # predictions stored, since a fit goes back to its best one, and the largest of them
+FEWEST_IN_LANES = 1024  # fewer members are computed one by one, not in vector lanes, which needs no second compilation
+CACHE_SIZE, CACHE_BYTES = 6, 2**24  # number of stored predictions (a fit returns to its best one), and the largest size of one
 
 TolerancePair: TypeAlias = tuple[float, float]  # relative and absolute
 
 
 class Runs(NamedTuple):
-    """N runs that show what was measured, each a record or a piece of one. S >= 0: unknowns of an initial state."""
+    """N runs, each along a record or a piece of one, with S >= 0 unknowns of the initial state."""
 
-    ts: np.ndarray  # (N, T) s; the first is when the motion begins
-    q: np.ndarray | None  # (N, bodies, 3) the guess of the initial state; None: that of the scene
+    ts: np.ndarray  # (N, T) s; the motion begins at the first
+    q: np.ndarray | None  # (N, bodies, 3) guess of the initial state; None: that of the scene
     v: np.ndarray | None
-    bases: np.ndarray  # (N, 2, 3 bodies, S) how each unknown of the initial state changes q and v
+    bases: np.ndarray  # (N, 2, 3 bodies, S) derivatives of q and v by the unknowns of the initial state
     conditions: Mapping[str, np.ndarray]  # values by name, (N, ...)
 
 
 class Members(NamedTuple):
-    """The numbers of M members, by which a compiled prediction varies: parameters, and the run of each."""
+    """The inputs of a compiled prediction for M members: parameters, and the run of each."""
 
     x: NumericArray  # (M, P) parameters
     shift: NumericArray  # (M, S) unknowns of the initial state
@@ -53,20 +53,17 @@ class Members(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Values that would be measured of members, their derivatives by (x, shift), and how the runs ended.
-
-    The last two are the states at the first and at the last time, and their derivatives, where these are asked for.
-    """
+    """Predicted values of members, with derivatives by (x, shift), and the results of the runs."""
 
     y: Float[np.ndarray, "M T C"]
     dy: Float[np.ndarray, "M T C P+S"]
     code: Int[np.ndarray, "M"]
-    ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies)
-    d_ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies, P + S)
+    ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies): states at the first and last time, if requested
+    d_ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies, P + S): their derivatives
 
 
 class Predictor:
-    """Predicts what `channels` of members show: of a mechanism with values in `targets`."""
+    """Predicts the values of `channels` for members: the mechanism with parameters assigned to `targets`."""
 
     def __init__(
         self,
@@ -82,7 +79,7 @@ class Predictor:
         self._run = _MemberRun(static, targets, channels, ends)
 
     def __call__(self, members: Members, tol: TolerancePair) -> Prediction:
-        """Predict members, integrated with these tolerances."""
+        """Predict members, integrated with the given tolerances."""
         size = len(members.x)
         key = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves((members, tol)))
         if key in self._cache:
@@ -100,18 +97,18 @@ class Predictor:
         return found
 
     def guess(self, members: Members, which: int) -> State:
-        """Return the state from which the initial state of a member is closed."""
+        """Return the guess from which the initial state of a member is closed."""
         member = jax.tree.map(lambda leaf: leaf[which], members)
         return jax.tree.map(np.asarray, _guess(self._run, self._arrays, member))
 
 
 class _MemberRun:
-    """The computation of one member. Equal ones have the same programs, whatever their numbers are."""
+    """The computation of one member, hashable by its static part: equal ones share programs."""
 
     def __init__(self, static: PyTree, *choices: Hashable):
         leaves, structure = jax.tree.flatten(static)
         self._key = (structure, tuple(leaves), choices)
-        self._hash = hash(self._key)  # stored: it takes as long as a short run
+        self._hash = hash(self._key)  # stored, since computing it takes as long as a short run
         self._static = static
         self.targets, self.channels, self.ends = cast(tuple[tuple[Target, ...], tuple[Channel | Quantity, ...], bool], choices)
 
@@ -122,13 +119,13 @@ class _MemberRun:
         return self is other or (isinstance(other, _MemberRun) and self._key == other._key)
 
     def place(self, arrays: PyTree, member: Members) -> tuple[Mechanism, State, dict[str, Any]]:
-        """Return the mechanism of a member, the state from which its initial state is closed, and settings."""
+        """Return the mechanism of a member, the guess from which its initial state is closed, and settings."""
         run = member.runs
         mechanism, settings = eqx.combine(arrays, self._static)
         base = mechanism.with_parameters(run.conditions) if run.conditions else mechanism
         found = guess = apply_values(base, self.targets, member.x)
         if run.q is not None and run.v is not None:
-            # Lengths move the guess: that of the record, while the scene's own decides about the constants.
+            # Lengths move the record's guess, too; constants are computed from the scene's own.
             guess = apply_values(_with_state(base, run.q, run.v), self.targets, member.x)
         q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", run.bases, member.shift))
         return found, State(guess.q0 + q, guess.v0 + v), settings
@@ -149,7 +146,7 @@ class _MemberRun:
 
 @lru_cache(maxsize=MOST_PROGRAMS)
 def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Program:
-    """Return the program of what is computed of members with numbers of these shapes."""
+    """Return the program for members with inputs of these shapes."""
     del shapes
     return Program(run, slopes, piece)
 

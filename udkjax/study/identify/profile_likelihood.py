@@ -1,11 +1,11 @@
-"""The profile likelihood of one unknown: how far it can go while all others make up for it.
+"""The profile likelihood of one unknown: the rise of the cost as it is varied and all others are refitted.
 
-With C(z) = r.r / 2 and one unknown z_k fixed, the others fitted anew, the curve
+With C(z) = r.r / 2, one unknown z_k fixed and the others refitted, the curve
 
     psi = +-(2 (C(z_k) - C_min) / s^2)^(1/2)
 
 is a straight line for a linear model, psi = (z_k - estimate) / standard error. All z_k with psi^2 below the quantile of chi^2
-with one degree of freedom are a confidence interval that needs no linear model: it may be longer on one side, and it may be open.
+with one degree of freedom form a confidence interval that needs no linear model; it may be asymmetric, and it may be open.
 (Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.)
 """
 
@@ -25,15 +25,15 @@ from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN, Unknowns
 if TYPE_CHECKING:
     import xarray
 
-CONFIDENCE = 0.95  # of an interval, where none is given: the usual one, two standard errors to either side
-STEPS_TO_END = 4.0  # from the estimate to the end of the interval, where the curve is a straight line
-UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: taken for a standard error that is not known
-MOST_STRETCH, MOST_SHRINK = 2.0, 0.1  # by how much a step may be longer than the one before, and by how much shorter
-END_DISTANCE = 1e-3  # of psi at the end of the interval: near enough to it
-MOST_FITS = 30  # to one side: a straight curve takes STEPS_TO_END of them, and one that bends more
-BETTER_FIT = 1e-6  # of the rise: costs that are lower than the estimate's by this are not rounding, nor a fit's last digits
+CONFIDENCE = 0.95  # default level: about two standard errors to either side
+STEPS_TO_END = 4.0  # steps from the estimate to the end of the interval, if the curve is a straight line
+UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: substituted for an unknown standard error
+MOST_STRETCH, MOST_SHRINK = 2.0, 0.1  # limits of the ratio of successive steps
+END_DISTANCE = 1e-3  # relative to psi at the end of the interval: tolerance on the end
+MOST_FITS = 30  # on each side: a straight curve takes STEPS_TO_END of them, a bent one more
+BETTER_FIT = 1e-6  # relative to the rise: a cost lower than the estimate's by this is not rounding
 
-_AT_BOUND = "the end of what was looked at"
+_AT_BOUND = "the limit of the search"
 
 FitOthers: TypeAlias = Callable[[int, float, np.ndarray], tuple[np.ndarray, float]]
 
@@ -45,23 +45,23 @@ class ProfileLikelihood(NamedTuple):
     values: Float[np.ndarray, "N"]  # x
     costs: Float[np.ndarray, "N"]  # r.r / 2
     z: Float[np.ndarray, "N K"]  # all unknowns
-    interval: tuple[float, float]  # an end is infinite where the curve does not rise as far
-    best: int  # the index of the lowest cost: not the estimate's where a better fit was met
+    interval: tuple[float, float]  # an end is infinite if the curve does not rise to the limit
+    best: int  # index of the lowest cost: that of the estimate unless a better fit was found
     text: str
 
 
 class _Side(NamedTuple):
-    """One side of a profile: fixed values z_k, all unknowns, costs; where the interval ends; why it is open, or nothing."""
+    """One side of a profile."""
 
-    fixed: list[float]
-    z: list[np.ndarray]
+    fixed: list[float]  # values of z_k
+    z: list[np.ndarray]  # all unknowns
     costs: list[float]
-    end: float
-    open: str
+    end: float  # end of the interval
+    open: str  # the reason if the interval is open, else empty
 
 
 def fix_unknown(evaluate: Objective, index: int, value: float) -> Objective:
-    """Return residuals as a function of all unknowns but one, which has a value."""
+    """Return the residuals as a function of all unknowns but one, which is fixed at `value`."""
 
     def evaluate_others(z: Float[np.ndarray, "B K-1"]) -> Residuals:
         found = evaluate(np.insert(z, index, value, axis=-1))
@@ -78,14 +78,14 @@ def profile_likelihood(
     name: str,
     level: float = CONFIDENCE,
 ) -> ProfileLikelihood:
-    """Compute the profile likelihood of a parameter at an estimate z: the others are fitted anew beside it."""
+    """Compute the profile likelihood of a parameter around an estimate z."""
     k, P = unknowns.names.index(name), len(unknowns.names)
 
     def fit(index: int, fixed: float, z0: np.ndarray) -> tuple[np.ndarray, float]:
         others = np.delete(z0, index)
         if not others.size:
             return z0, _cost(evaluate(z0[None]))
-        found = minimize_squares(fix_unknown(evaluate, index, fixed), others, settled=FINE_STEP)
+        found = minimize_squares(fix_unknown(evaluate, index, fixed), others, step_tol=FINE_STEP)
         return np.insert(found.z, index, fixed), found.cost
 
     def value(fixed: float) -> float:
@@ -102,14 +102,14 @@ def profile_likelihood(
 
 
 def _cost(found: Residuals) -> float:
-    """Return r.r / 2 of the first set of unknowns; infinite where it cannot be computed."""
+    """Return r.r / 2 of the first set of unknowns; infinite if it cannot be computed."""
     return float(0.5 * found.r[0] @ found.r[0]) if found.ok[0] else np.inf
 
 
 def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
-    """Return the noise over what residuals are divided by, and degrees of freedom where it was estimated.
+    """Return the noise relative to the assumed noise, and the degrees of freedom if it was estimated.
 
-    Where several channels have a noise of their own, residuals were divided by it, and the factors are 1 but for the last digits.
+    If several channels have their own estimated noise, residuals were divided by it, and the factors are 1 up to rounding.
     """
     scales = uncertainty.noise
     return (float(scales.mean()), uncertainty.degrees_of_freedom) if scales.size else (1.0, None)
@@ -158,16 +158,16 @@ def trace_profile(
     units: str = "",
     steps: int = MOST_FITS,
 ) -> ProfileLikelihood:
-    """Walk from an estimate z of the cost r.r / 2 both ways along the unknown `index`, to the ends of its confidence interval.
+    """Walk from an estimate z with cost r.r / 2 in both directions along the unknown `index`, to the ends of its interval.
 
     Args:
-        fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns from z0 on; a cost that is not finite is a
-            failure, before which the walk ends.
-        index: of the unknown, whose estimate has the `cost`, and whose standard error is about a first `step`.
-        noise: ratio of the noise that was estimated to what residuals were divided by; then it leaves
-            `degrees_of_freedom`, and the quantile is that of F.
-        value: x of z_k, which increases between the `bounds` of z_k.
-        steps: fits at most, to one side.
+        fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns, starting from z0; the walk ends before a
+            failed fit, whose cost is not finite.
+        index: index of the unknown, whose standard error is about a first `step`.
+        noise: ratio of the estimated to the assumed noise; if estimated, it has `degrees_of_freedom`, and the quantile is that
+            of F.
+        value: x as a function of z_k, increasing between the `bounds` of z_k.
+        steps: maximum number of fits on each side.
     """
     limit = quantile(level, degrees_of_freedom)
     rise = limit * noise**2
@@ -185,22 +185,22 @@ def trace_profile(
     better = costs[best] < cost - BETTER_FIT * rise
     text = _text(name, units, level, ends, (low, high), value)
     if better:
-        text += f"; a better fit was met at {values[best]:.6g}{f' {units}' if units else ''}: identify again from there"
+        text += f"; a better fit was found at {values[best]:.6g}{f' {units}' if units else ''}: identify again from that guess"
     return ProfileLikelihood(name, values, costs, every, ends, best if better else len(low.fixed), text)
 
 
 def quantile(level: float, degrees_of_freedom: float | None) -> float:
-    """Return psi^2 at the ends of the interval: of chi^2 with one degree of freedom; of F, where the noise was estimated."""
+    """Return psi^2 at the ends of the interval: the quantile of chi^2 with one degree of freedom, or of F for estimated noise."""
     return float(chdtri(1, 1.0 - level) if degrees_of_freedom is None else fdtri(1, degrees_of_freedom, level))
 
 
 def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:
-    """Walk along one side by steps that raise psi by equal parts; once past the end, between the two points beside it."""
+    """Walk along one side by steps that raise psi equally; once past the end, search between the two points around it."""
     end, sign = np.sqrt(rise), np.sign(step)
-    inside: tuple[np.ndarray, float] = z, 0.0  # the last point within the interval, and its psi
-    before, outside = None, None  # the point within before that one; the nearest beyond
+    inside: tuple[np.ndarray, float] = z, 0.0  # the last point inside the interval, and its psi
+    before, outside = None, None  # the previous point inside; the nearest point outside
     found: list[tuple[np.ndarray, float]] = []
-    reason = f"not in {steps} steps"
+    reason = f"not reached in {steps} steps"
     step = step / STEPS_TO_END
     if sign == 0.0:
         return _Side([], [], [], z[index], _AT_BOUND)
@@ -228,12 +228,12 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
             inside, reason = (trial, reached), ""
             break
         if reached > end:
-            outside, reason = (trial, reached), "" if narrow else f"not in {steps} steps"
-            if narrow:  # it jumps
+            outside, reason = (trial, reached), "" if narrow else f"not reached in {steps} steps"
+            if narrow:  # psi jumps at the end
                 break
             continue
         slope = (reached - psi) / abs(fixed - current[index])
-        # Where the curve falls there may be another minimum: no longer steps there.
+        # A falling curve may lead to another minimum: do not lengthen the step.
         wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, np.finfo(float).tiny)
         step = sign * np.clip(wanted, MOST_SHRINK * abs(step), MOST_STRETCH * abs(step))
         before, inside = current, (trial, reached)
@@ -247,18 +247,18 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
 
 
 def _text(name: str, units: str, level: float, ends: tuple[float, float], sides: tuple[_Side, _Side], value: Callable) -> str:
-    """Return the interval in words, with how far was looked where it is open."""
+    """Return the interval in words; if it is open, with the limits of the search."""
     unit = f" {units}" if units else ""
     if np.isfinite(ends).all():
         low, high = (f"{end:.{_digits(ends)}g}" for end in ends)
         return f"{name} is between {low} and {high}{unit} ({100 * level:g} %)"
-    known = [f"{word} {end:.4g}{unit}" for word, end in zip(("above", "below"), ends, strict=True) if np.isfinite(end)]
-    looked = [
-        f"no {which} end as far as {value(side.end):.4g}{unit} ({side.open})"
+    limited = [f"{word} {end:.4g}{unit}" for word, end in zip(("above", "below"), ends, strict=True) if np.isfinite(end)]
+    searched = [
+        f"no {which} end up to {value(side.end):.4g}{unit} ({side.open})"
         for which, side in zip(("lower", "upper"), sides, strict=True)
         if side.open
     ]
-    return f"{name} {f'is {known[0]} ({100 * level:g} %)' if known else 'is not known'}: {', '.join(looked)}"
+    return f"{name} {f'is {limited[0]} ({100 * level:g} %)' if limited else 'is undetermined'}: {', '.join(searched)}"
 
 
 def _digits(ends: tuple[float, float]) -> int:

@@ -1,4 +1,4 @@
-"""Reads measurements into records, whatever they come as: every mistake is named with its file, row and column."""
+"""Reads measurements into records, from any kind of table; every mistake is reported with its file, row and column."""
 
 import math
 import os
@@ -16,45 +16,45 @@ from udkjax.study.identify.records import ByChannel, ChannelKey, IdentificationE
 from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
-MOST_SHOWN = 3  # mistakes of one kind in a column; the others are counted
+MOST_SHOWN = 3  # mistakes of one kind listed per column; the others are counted
 T = TypeVar("T")
 
 
 def records_of(
     mechanism: Mechanism, data: Data, noise: Noise = None, ignore: Sequence[str] = (), quantities: Sequence[Quantity] = ()
 ) -> tuple[Record, ...]:
-    """Read data into records, in SI units, their channels named as `channel_of` names them.
+    """Read data into records in SI units, with the canonical names of channels.
 
-    A CSV file has one line of headings, after lines that begin with "#" if there are any. Everywhere
+    A CSV file has one line of headings, after optional lines that begin with "#". In all tables
 
     * a heading may name units in brackets, `time [ms]`, `body.crank.angle [deg]` (in xarray: the attribute `units`);
     * an empty cell, or one that is not a number ("nan"), is a gap;
-    * `CHANNEL.noise` holds the standard deviation of a channel, in the channel's units if it names none;
-    * `record` says which record a row belongs to (in xarray: a dimension).
+    * `CHANNEL.noise` is the standard deviation of a channel, in the channel's units unless it names its own;
+    * `record` is the name of the record that a row belongs to (in xarray: a dimension).
 
     Args:
         mechanism: the mechanism whose bodies, joints and drivers headings name.
         data: a `Record`; a mapping of "time" and channels to numbers (T,); a pandas DataFrame with such columns; an xarray
-            Dataset with such variables along "time", or with q and v as `Solution.to_xarray` has them; the path of a .csv or a
-            .nc file; or a list of such.
-        noise: standard deviation, in SI units, of what has none in the data: of all channels, or by channel.
-        ignore: columns that are not read; any other that is no channel is a mistake.
-        quantities: the user's own channels that headings may name; in Python they may themselves stand in place of names.
+            Dataset with such variables along "time", or with q and v as written by `Solution.to_xarray`; the path of a .csv or
+            .nc file; or a list of these.
+        noise: standard deviation, in SI units, of channels without noise in the data: of all channels, or by channel.
+        ignore: columns that are not read; any other column that is not a channel is a mistake.
+        quantities: user-defined channels that headings may name; in Python they may also be used in place of names.
 
     Raises:
-        IdentificationError: with every mistake, each with its file, line and column.
+        IdentificationError: lists every mistake with its file, line and column.
     """
     reader = _DataReader(mechanism, tuple(ignore), _quantities_by_name(quantities))
     found = [reader.with_usual_names(record) for record in reader.read(data, "data")]
     if not found and not reader.problems:
-        reader.problems.append("data: there are no records")
+        reader.problems.append("data: contains no records")
     measured = {channel for record in found for channel in record.values}
     given: dict[ChannelKey, ArrayLike | None] = dict.fromkeys(measured)
     if isinstance(noise, Mapping):
         given = reader.by_channel(noise, "noise")
     elif noise is not None:
         given = dict.fromkeys(measured, noise)
-    reader.problems += [f"noise: {quote(str(c))} is measured in no record" for c in given if c not in measured]
+    reader.problems += [f"noise: {quote(str(c))} is not measured in any record" for c in given if c not in measured]
     records = [reader.with_noise(record, given) for record in found]
     if reader.problems:
         raise IdentificationError(reader.problems)
@@ -65,7 +65,7 @@ def records_of(
 
 
 class _TableReader:
-    """Reads the records of one table. `channel` finds channels by name, or raises ValueError; mistakes go to `problems`."""
+    """Reads the records of one table. `channel` finds channels by name or raises ValueError; mistakes are added to `problems`."""
 
     def __init__(self, table: Table, channel: Callable[[str], Channel | Quantity], ignore: Sequence[str], problems: list[str]):
         self.table, self.channel, self.problems = table, channel, problems
@@ -102,7 +102,7 @@ class _TableReader:
             try:
                 channel = self.channel(heading)
             except ValueError as error:
-                self.add(heading, f"{error} (what is not to be read must be listed in `ignore`)")
+                self.add(heading, f"{error} (list columns that are not to be read in `ignore`)")
                 continue
             if (key := key_of(channel)) in found:
                 self.add(heading, f"is the same channel as {quote(found[key][0])}")
@@ -113,7 +113,7 @@ class _TableReader:
         return values, {key: self.numbers(h + NOISE, units, self.columns[h].units) for key, (h, units) in with_noise.items()}
 
     def numbers(self, heading: str, wanted: str, units: str | None = None) -> np.ndarray:
-        """Return the numbers of a column in SI units, which it has in its own or these `units`; gaps are not a number."""
+        """Return the numbers of a column, given in its own or these `units`, in SI units; gaps are NaN."""
         cells, own = self.columns[heading]
         scale, count, units = 1.0, len(self.table.rows), own or units
         try:
@@ -122,15 +122,15 @@ class _TableReader:
             self.add(heading, str(error))
         kind, shape = (cells.dtype.kind, cells.shape) if isinstance(cells, np.ndarray) else ("O", (len(cells),))
         if kind in "mM" or shape != (count,):
-            what = f"type {np.asarray(cells).dtype}" if kind in "mM" else f"shape {shape}"
-            self.add(heading, f"must be {count} numbers, is of {what}")
+            found = f"type {np.asarray(cells).dtype}" if kind in "mM" else f"shape {shape}"
+            self.add(heading, f"must be {count} numbers, is of {found}")
             return np.full(count, np.nan)
         found = np.asarray(cells, float) if kind in "iuf" else np.array([_number(cell) for cell in cells], float)
         self.add_each(heading, np.flatnonzero(np.isinf(found)), lambda k: f"must be a number, is {abbreviate(cells[k])}")
         return scale * found
 
     def rows_by_record(self) -> list[tuple[str, np.ndarray]]:
-        """Return the records by name, and which rows they have."""
+        """Return the names of the records, each with the indices of its rows."""
         if RECORD not in self.columns:
             return [(self.table.name, np.arange(len(self.table.rows)))]
         labels = [_label(cell) for cell in self.columns[RECORD].values]
@@ -138,13 +138,13 @@ class _TableReader:
         return [(label, np.flatnonzero(np.array(labels) == label)) for label in dict.fromkeys(labels)]
 
     def check_times(self, time: str, times: np.ndarray, places: np.ndarray) -> None:
-        """Note times that are missing or do not increase."""
+        """Report times that are missing or do not increase."""
         missing = np.isnan(times[places])
         self.add_each(time, places[missing], lambda k: "is empty")
         present = places[~missing]
         late = np.flatnonzero(np.diff(times[present]) <= 0) + 1
         before = dict(zip(present[1:], times[present[:-1]], strict=True)) if len(present) else {}
-        self.add_each(time, present[late], lambda k: f"{times[k]:g} s does not exceed the one before, {before[k]:g} s")
+        self.add_each(time, present[late], lambda k: f"{times[k]:g} s does not exceed the previous time, {before[k]:g} s")
 
     def record(
         self,
@@ -154,7 +154,7 @@ class _TableReader:
         values: dict[ChannelKey, np.ndarray],
         noise: dict[ChannelKey, np.ndarray],
     ) -> Iterator[Record]:
-        """Make a record of some rows, of those channels that were measured in it."""
+        """Make a record of some rows, with the channels that were measured in them."""
         measured = [name for name, x in values.items() if not np.isnan(x[places]).all()]
         if self.table.padded and measured:
             some = np.flatnonzero(~np.isnan(np.stack([values[name][places] for name in measured])).all(0))
@@ -166,19 +166,19 @@ class _TableReader:
             self.problems += [f"{self.table.source}: {problem}" for problem in error.problems]
 
     def add(self, heading: str, problem: str) -> None:
-        """Note a mistake of a column."""
+        """Report a mistake in a column."""
         self.problems.append(f"{self.table.source}, column {quote(heading)}: {problem}")
 
     def add_each(self, heading: str, rows: Sequence[int] | np.ndarray, problem: Callable[[int], str]) -> None:
-        """Note the same mistake in some rows: the first few, and how many more."""
+        """Report the same mistake in several rows: the first few, and the number of the others."""
         for k in rows[:MOST_SHOWN]:
             self.problems.append(f"{self.table.source}, {self.table.rows[k]}, column {quote(heading)}: {problem(k)}")
         if len(rows) > MOST_SHOWN:
-            self.add(heading, f"and so in {len(rows) - MOST_SHOWN} more rows")
+            self.add(heading, f"the same in {len(rows) - MOST_SHOWN} more rows")
 
 
 def _number(cell: str | float | None) -> float:
-    """Return a cell as a number: infinite where it is none."""
+    """Return the number in a cell: NaN if it is empty, infinite if it is not a number."""
     if cell is None or (isinstance(cell, str) and not cell.strip()):
         return math.nan
     try:
@@ -188,7 +188,7 @@ def _number(cell: str | float | None) -> float:
 
 
 def _label(cell: str | float | None) -> str:
-    """Return a cell as the name of a record: empty where it is none."""
+    """Return the name of a record in a cell; empty if the cell is empty."""
     if isinstance(cell, str):
         return cell.strip()
     return "" if cell is None or cell != cell else f"{cell:g}"
@@ -198,19 +198,19 @@ def _label(cell: str | float | None) -> str:
 
 
 def _quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
-    """Return those of some channels that are the user's own, by name."""
+    """Return the user-defined channels among some, by name."""
     return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}
 
 
 class _DataReader:
-    """Reads data for a mechanism, and gathers every mistake in `problems`."""
+    """Reads data for a mechanism, and collects every mistake in `problems`."""
 
     def __init__(self, mechanism: Mechanism, ignore: tuple[str, ...], quantities: dict[str, Quantity]):
         self.mechanism, self.ignore, self.quantities = mechanism, ignore, quantities
         self.problems: list[str] = []
 
     def read(self, data: Data, source: str) -> Iterator[Record]:
-        """Iterate over the records in anything that holds some."""
+        """Iterate over the records in any kind of data."""
         if isinstance(data, Record):
             yield data
         elif isinstance(data, list | tuple):
@@ -223,12 +223,16 @@ class _DataReader:
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: ChannelKey) -> Channel | Quantity:
-        """Return the channel of a name, or the user's own. Raises ValueError."""
+        """Return the channel with a name, or the user-defined one.
+
+        Raises:
+            ValueError: there is no such channel.
+        """
         own = given if isinstance(given, Quantity) else self.quantities.get(str(given))
         return channel_of(self.mechanism, str(given)) if own is None else own
 
     def by_channel(self, given: ByChannel[T], place: str) -> dict[ChannelKey, T]:
-        """Return the same values under the usual names of the channels; those of the user go by themselves."""
+        """Return the values by the canonical names of the channels; user-defined channels are their own keys."""
         found: dict[ChannelKey, T] = {}
         for text, value in given.items():
             try:
@@ -237,12 +241,12 @@ class _DataReader:
                 self.problems.append(f"{place}, {quote(str(text))}: {error}")
                 continue
             if key in found:
-                self.problems.append(f"{place}, {quote(str(text))}: {quote(str(key))} is there twice")
+                self.problems.append(f"{place}, {quote(str(text))}: {quote(str(key))} is given twice")
             found[key] = value
         return found
 
     def with_usual_names(self, record: Record) -> Record:
-        """Return the record with the usual names of its channels."""
+        """Return the record with the canonical names of its channels."""
         place = f"record {quote(record.name)}" if record.name else "record"
         values = self.by_channel(record.values, place)
         if list(values) == list(record.values) or len(values) != len(record.values):
@@ -251,7 +255,7 @@ class _DataReader:
         return record.changed(values=values, noise=noise)
 
     def with_noise(self, record: Record, given: dict[ChannelKey, ArrayLike | None]) -> Record:
-        """Return the record with the `given` standard deviation for those channels that have none of their own."""
+        """Return the record with the `given` standard deviations for channels without their own."""
         if all(own is not None or given.get(channel) is None for channel, own in record.noise.items()):
             return record
         noise = {channel: given.get(channel) if own is None else own for channel, own in record.noise.items()}

@@ -1,4 +1,4 @@
-"""Records: tables of times and of what was measured then, and the state that each of them began with."""
+"""Records: times, measured values, and the initial state of the motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from udkjax.scene.requirements import describe
 if TYPE_CHECKING:
     import xarray
 
-PADDING = 1e-9  # of the length of a record: the distance of the times that pad it; so short a step costs nothing
+PADDING = 1e-9  # relative to the length of a record: the spacing of times that pad it, so short that their steps cost nothing
 Estimated = Literal["nothing", "position", "velocity", "both"]
-ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a quantity of the user's own
+ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a user-defined quantity
 T = TypeVar("T")
 ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[ChannelKey, T]
 Noise = TypeAliasType(
@@ -29,7 +29,7 @@ Noise = TypeAliasType(
 
 
 class IdentificationError(Mistakes):
-    """Data, parameters or settings do not fit the mechanism, or each other. `problems` lists every mistake, with its place.
+    """Data, parameters or settings are inconsistent with the mechanism or each other.
 
     Attributes:
         problems: every mistake, each with its place.
@@ -41,13 +41,13 @@ class IdentificationError(Mistakes):
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The state that a record begins with: what is known of it, and what of it is to be estimated.
+    """The initial state of a record: a guess, and which parts of it to estimate.
 
     Attributes:
-        state: the guess that is closed; by default the scene's own.
-        estimate: parts of it to estimate. The unknowns are as many coordinates ("position") or rates ("velocity") as the
-            mechanism has degrees of freedom there.
-        name: starts of one name are tied: they are the same state, estimated from all of their records.
+        state: the guess, closed before use; by default the scene's own.
+        estimate: "nothing", "position", "velocity" or "both". The unknowns are one coordinate (position) or rate (velocity) for
+            each degree of freedom.
+        name: starts of the same name are one state, estimated from all of their records.
     """
 
     state: State | None = None
@@ -62,17 +62,17 @@ class Start:
 
 
 class Record:
-    """Values measured at some times, and the state that the motion began with.
+    """Values measured at some times, and the initial state of the motion.
 
     Args:
         times: increasing (T,), s.
-        values: arrays (T,) by channel, not a number where nothing was measured. Channels are named as in
-            `udkjax.positions.channels` ("body.crank.angle"), or `Quantity`s of the user's own.
-        noise: standard deviation of all channels, or of each by channel, a number or (T,). Where it is not given, it is estimated
-            from the residuals of the fit.
+        values: arrays (T,) by channel, NaN where nothing was measured. Channels are named as in `udkjax.positions.channels`
+            ("body.crank.angle"), or are user-defined `Quantity`s.
+        noise: standard deviation of all channels, or of each by channel, a number or (T,); by default estimated from the
+            residuals of the fit.
         initial_state: the `State` or `Start` at t0; by default the scene's own.
-        t0: time when the motion begins (s); by default at the first time.
-        conditions: values, by name of a parameter, that are known to have held in this record: a payload, a driver's amplitude.
+        t0: time when the motion begins (s); by default the first time.
+        conditions: values of parameters, by name, in this record only: a payload, a driver's amplitude.
         name: name in messages.
 
     Raises:
@@ -101,20 +101,20 @@ class Record:
         self.start = initial_state if isinstance(initial_state, Start) else Start(initial_state)
         self.conditions = {name: np.asarray(value, float) for name, value in (conditions or {}).items()}
         if not self.values:
-            problems.append("nothing was measured: there is no channel")
+            problems.append("there is no channel: nothing was measured")
         for channel, value in self.values.items():
             if not np.isfinite(value).any() and value.size:
-                problems.append(f"{quote(str(channel))}: holds no number; leave the channel out")
+                problems.append(f"{quote(str(channel))}: contains no number; leave the channel out")
             elif np.isinf(value).any():
                 problems.append(
-                    f"{quote(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; a gap is nan"
+                    f"{quote(str(channel))}: entry {int(np.flatnonzero(np.isinf(value))[0])} is infinite; write a gap as nan"
                 )
         if problems:
             raise IdentificationError([self.place + problem for problem in problems])
 
     @property
     def place(self) -> str:
-        """The text that messages about it begin with."""
+        """The beginning of messages about this record."""
         return f"record {quote(self.name)}: " if self.name else ""
 
     def changed(self, **changes: Any) -> "Record":
@@ -132,9 +132,9 @@ class Record:
         elif not np.isfinite(self.times).all():
             problems.append(f"time: entry {int(np.flatnonzero(~np.isfinite(self.times))[0])} is not a finite number")
         elif not (steps := np.diff(self.times) > 0).all():
-            problems.append(f"time: must increase, but entry {int(np.argmin(steps)) + 1} does not exceed the one before")
+            problems.append(f"time: must increase, but entry {int(np.argmin(steps)) + 1} does not exceed the previous one")
         elif t0 is not None and not t0 <= self.times[0]:
-            problems.append(f"t0: the motion begins at {t0} s, after the first time measured, {self.times[0]} s")
+            problems.append(f"t0: the motion begins at {t0} s, after the first measurement at {self.times[0]} s")
 
     def _noise(self, given: Noise, problems: list[str]) -> dict[ChannelKey, Float[np.ndarray, "T"] | None]:
         by_channel = {key_of(c): s for c, s in given.items()} if isinstance(given, Mapping) else dict.fromkeys(self.values, given)
@@ -156,24 +156,24 @@ class Record:
 
 
 def labels(records: Sequence[Record]) -> list[str]:
-    """Return the names of records; those without a name, or with one that another has too, are numbered."""
+    """Return the names of records, numbered if missing or not unique."""
     names = [record.name for record in records]
     return [name if name and names.count(name) == 1 else f"{name or 'record'} {k + 1}" for k, name in enumerate(names)]
 
 
 def output_times(record: Record) -> tuple[Float[np.ndarray, "T"], int]:
-    """Return the times of a record from its initial state on, and which of them is the first that was measured."""
+    """Return the times of a record starting with that of its initial state, and the index of the first measurement."""
     return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
 
 
 def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "length"]:
-    """Return the times with as many after them, hardly later, as make up a length."""
+    """Return the times padded to a length with slightly later ones."""
     span = max(ts[-1] - ts[0], PADDING)
     return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
 
 
 def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Arrange records in tables of one length: times (records, T), values and their noise (records, T, C), nan where unknown."""
+    """Arrange records in tables of equal length: times (records, T), values and noise (records, T, C), NaN where unknown."""
     times = [output_times(record) for record in records]
     length = max(2, *(len(ts) for ts, _ in times))
     y, sigma = np.full((2, len(records), length, len(keys)), np.nan)
@@ -187,7 +187,7 @@ def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.
 
 
 def label_prefixes(records: Sequence[Record]) -> list[str]:
-    """Return the beginning of names of channels in messages: the name of their record, if there are several."""
+    """Return the prefix of channel names in messages for each record: its name, if there are several records."""
     return [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
 
 
@@ -198,7 +198,7 @@ def dataset_of_fit(
     residuals: Sequence[Mapping[str, np.ndarray]],
     noise: Sequence[Mapping[str, np.ndarray]],
 ) -> "xarray.Dataset":
-    """Return measurements and predictions of a fit, along record, sample and channel; nan where nothing was measured."""
+    """Return measurements and predictions of a fit along record, sample and channel; NaN where nothing was measured."""
     with OptionalImport():
         import xarray
     shape = len(records), max(len(record.times) for record in records), len(channels)
@@ -215,7 +215,7 @@ def dataset_of_fit(
 
 
 def key_of(channel: ChannelKey | Channel) -> ChannelKey:
-    """Return the key of a channel in a record: its name, or the user's own quantity."""
+    """Return the key of a channel in a record: its name, or the user-defined quantity itself."""
     return channel if isinstance(channel, Quantity) else str(getattr(channel, "name", channel))
 
 

@@ -1,8 +1,8 @@
-"""The search of a fit: first guesses, and parts of the records along which they are followed, no more than it needs.
+"""Search for a fit that explains the records, by strategies of increasing cost.
 
-A fit that does not explain the whole records from its first guess, since phases were wrong by too much, begins with their first
-parts and follows them as they grow: see `growing_records`. Where that fails too, it does so from other guesses beside the first,
-one after another until one explains the records. What is left are records of chaotic motion: see `shooting`.
+If the fit of the whole records from the first guess does not explain them, since phases are wrong by too much, growing parts of
+the records are fitted: see `growing_records`. If that fails, too, the same is done from other guesses, until one explains the
+records. For records of chaotic motion, where all of these fail, see `shooting`.
 """
 
 from collections.abc import Sequence
@@ -12,36 +12,36 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Strategy
-from udkjax.study.identify.growing_records import Known, fit_growing_records
+from udkjax.study.identify.growing_records import EarlierFits, fit_growing_records
 from udkjax.study.identify.least_squares import LOOSE_STEP, SOME_STEPS, CostHistory, Fit
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import LOOSE_TOL, MEDIUM_TOL, TolerancePair
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
 from udkjax.study.identify.unknowns import sample_guesses
 
-N_STARTS = 15  # guesses besides the first, where it does not lead to a fit
+N_STARTS = 15  # further guesses, if the first does not lead to a fit
 MOST_GUESSES_IN_PIECES = 4  # guesses from which the records are fitted in pieces
-SAMPLES_PER_GUESS = 8  # times as many guesses are looked at: one evaluation each, where a fit takes some fifty; many begin alike
-ENOUGH_AGREEING = 4  # guesses that lead to the best fit: where it shows most of the motion, others will hardly find a better one
-SHOWN_PART = 0.3  # of what the channels show: residuals below it are of a fit that shows most of the motion
-PART_GROWTH = 2.0  # from one part of the records by which guesses are ranked to the next
-SHORTEST_PART = 1e-6  # of the records: the first of these, where all was measured when they began
-CHAOTIC_GROWTH = 100.0  # of derivatives, from the first halves of records to the second: t^2 makes 4 of it
-EXPLAINED_PART = 1e-3  # of what the channels show: smaller residuals are taken for a fit, where their noise is not known
-LIKELY_SQUARE = 2.0  # mean square of residuals whose noise is known, up to which they are taken for a fit
-WHITE_CORRELATION = 4.0  # standard deviations of the correlation of neighbours, up to which residuals are taken for noise
-SAME_MINIMUM_DISTANCE = 1e-4  # of an unknown: fits this near are at one minimum
+SAMPLES_PER_GUESS = 8  # sampled guesses for each that is followed: sampling costs one evaluation, a fit some fifty
+ENOUGH_AGREEING = 4  # guesses that lead to the best fit: if it reproduces most of the motion, a better one is unlikely
+SHOWN_PART = 0.3  # relative to the channels' scales: a fit with smaller residuals reproduces most of the motion
+PART_GROWTH = 2.0  # ratio of successive parts of the records by which guesses are ranked
+SHORTEST_PART = 1e-6  # relative to the records: the first part, if everything was measured at the beginning
+CHAOTIC_GROWTH = 100.0  # growth of derivatives from the first half of a record to the second: for t^2 it is 4
+EXPLAINED_PART = 1e-3  # relative to the channels' scales: smaller residuals are a fit, if the noise is unknown
+LIKELY_SQUARE = 2.0  # mean square of residuals with known noise up to which they are a fit
+WHITE_CORRELATION = 4.0  # standard deviations of the correlation of neighbours up to which residuals are noise
+SAME_MINIMUM_DISTANCE = 1e-4  # change of an unknown: closer fits are at the same minimum
 
 
 class SearchResult(NamedTuple):
-    """The best fit, how many of how many first guesses led there, and what was tried, in words."""
+    """The best fit, the number of first guesses that led to it out of all, and the strategies that were tried."""
 
     fit: Fit
     agreeing: int
     guesses: int
     ways: tuple[str, ...]
     history: CostHistory
-    problem: FitProblem  # the problem of these unknowns
+    problem: FitProblem  # the problem that the fit is of
 
 
 def search(
@@ -55,9 +55,9 @@ def search(
 ) -> SearchResult:
     """Find the unknowns that explain the records best.
 
-    Where the guesses z do not lead to a fit, `more` are tried beside the first. Where none does, and they do not agree or the
-    motion is chaotic, the records are cut into pieces; with the strategy "pieces" at once. The tolerances `tol` are those at the
-    end: on the way they are looser.
+    If the guesses z do not lead to a fit, `more` others are tried. If these fail, too, and do not agree or the motion is chaotic,
+    the records are cut into pieces; with the strategy "pieces" at once. `tol` are the final tolerances; those of the search are
+    looser.
     """
     loose = max(tol[0], LOOSE_TOL), max(tol[1], LOOSE_TOL)
     if strategy == "pieces":
@@ -65,13 +65,13 @@ def search(
         if found := fit_in_pieces(problem, np.array([along.z, *z]), tol, minimizer):
             return found._replace(history=along.history + found.history)
     ways, tried = ["whole records"], list(z)
-    known: Known = []
+    earlier: EarlierFits = []
     whole = minimizer.with_label("whole records")
     fits = [whole.minimize(problem, guess, loose, None, SOME_STEPS, LOOSE_STEP) for guess in z]
     history = list(_best(fits).history)
     if not explains(problem, _best(fits), loose):
         ways.append("growing records")
-        grown = [fit_growing_records(problem, guess, loose, minimizer, known) for guess in z]
+        grown = [fit_growing_records(problem, guess, loose, minimizer, earlier) for guess in z]
         tried += [one.z for one in grown]
         history += [row for one in grown for row in one.history]
         fits = [_best(pair) for pair in zip(fits, grown, strict=True)]
@@ -79,19 +79,19 @@ def search(
         ways.append("more first guesses")
         sampled = sample_guesses(problem.unknowns, z[0], SAMPLES_PER_GUESS * more, seed)
         for guess in rank_guesses(problem, sampled, loose):
-            one = fit_growing_records(problem, guess, loose, minimizer, known)
+            one = fit_growing_records(problem, guess, loose, minimizer, earlier)
             history += one.history
             tried.append(one.z)
             fits.append(one)
             if (
                 explains(problem, _best(fits), loose)
-                or len(known) >= len(z) + more
+                or len(earlier) >= len(z) + more
                 or (_count_agreeing(fits) >= ENOUGH_AGREEING and _shows_most(problem, _best(fits)))
             ):
                 break
     best, agreeing = _best(fits), _count_agreeing(fits)
     if more and not explains(problem, best, loose):
-        # Where half of the guesses agree, the mechanism does not move like that.
+        # If half of the guesses agree, the model itself cannot reproduce the records.
         chaotic = is_chaotic(problem, best.z, loose)
         pieces = MOST_GUESSES_IN_PIECES if chaotic else 2 * agreeing < len(fits)
         found = fit_in_pieces(problem, np.array(tried), tol, minimizer, pieces)
@@ -105,14 +105,14 @@ def _best(fits: Sequence[Fit]) -> Fit:
 
 
 def _count_agreeing(fits: Sequence[Fit]) -> int:
-    """Return the number of fits at the best minimum."""
+    """Return the number of fits that are at the best minimum."""
     best = _best(fits).z
     near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best).max())
     return sum(bool(np.isfinite(fit.cost)) and bool(np.abs(fit.z - best).max() <= near) for fit in fits)
 
 
 def _shows_most(problem: FitProblem, fit: Fit) -> bool:
-    """Return whether a fit shows most of the motion."""
+    """Return True if a fit reproduces most of the motion."""
     scale = problem.channel_scale[problem.index[:, 2]] / problem.sigma
     return bool(2.0 * fit.cost < SHOWN_PART**2 * np.sum(scale**2))
 
@@ -120,9 +120,9 @@ def _shows_most(problem: FitProblem, fit: Fit) -> bool:
 def fit_in_pieces(
     problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair, minimizer: Minimizer, most: int = MOST_GUESSES_IN_PIECES
 ) -> SearchResult | None:
-    """Fit the records in pieces, from the `most` promising guesses until one explains them; None: none does.
+    """Fit the records in pieces, from the `most` promising guesses until one explains them; None if they all fail.
 
-    Where the motion is not so chaotic that whole records are beyond the errors of their integration, the fit is of these.
+    The fit returned is that of the whole records, unless the motion is too chaotic to integrate them accurately.
     """
     loose = max(tol[0], MEDIUM_TOL), max(tol[1], MEDIUM_TOL)
     for k, guess in enumerate(rank_guesses(problem, z, loose)[:most] if most else ()):
@@ -141,7 +141,7 @@ def fit_in_pieces(
 
 
 def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair) -> bool:
-    """Return whether derivatives grow along a record faster than where motions only fall out of step: like t or t^2."""
+    """Return True if derivatives grow along a record faster than t or t^2, as they do for motions that only change phase."""
     record, time, _ = problem.index.T
     late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
     J = np.abs(problem.evaluate(z[None], tol).J[0, : len(problem.index), : len(problem.unknowns.names)])
@@ -150,18 +150,18 @@ def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePai
 
 
 def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B K"]:
-    """Return guesses, the best first: those that leave least of the records and of their first parts, which all count alike."""
+    """Return guesses sorted from the best: by the residuals of the records and of their first parts, all weighted equally."""
     record, time, _ = problem.index.T
     r, since = problem.evaluate(z, tol).r[:, : len(record)], problem.ts[record, time] - problem.ts[record, 0]
     with np.errstate(divide="ignore"):
         logs = [np.log(np.sum(np.square(r[:, since <= part]), axis=1)) for part in horizons(problem)]
-    # A run that fails on its way counts as one that shows nothing from there on.
+    # A failed run counts as one that predicts nothing.
     worst = np.log(np.sum((problem.channel_scale[problem.index[:, 2]] / problem.sigma) ** 2))
     return z[np.argsort(np.sum(np.nan_to_num(logs, nan=worst), axis=0), kind="stable")]
 
 
 def horizons(problem: FitProblem) -> list[float]:
-    """Return parts of the records, s since their beginnings, one longer than the other: the last is all of them."""
+    """Return increasing durations (s) of parts of the records from their beginning; the last is that of the whole records."""
     record, time, _ = problem.index.T
     passed = np.sort(problem.ts[record, time] - problem.ts[record, 0])
     enough = min(int(RESIDUALS_PER_UNKNOWN * problem.K), len(passed) - 1)
@@ -172,8 +172,8 @@ def horizons(problem: FitProblem) -> list[float]:
 
 
 def explains(problem: FitProblem, fit: Fit, tol: TolerancePair) -> bool:
-    """Return whether a fit leaves nothing but noise."""
-    if not (np.isfinite(fit.cost) and fit.settled):
+    """Return True if the residuals of a fit are only noise."""
+    if not (np.isfinite(fit.cost) and fit.converged):
         return False
     found = problem.evaluate(fit.z[None], tol)
     if not found.ok[0]:
@@ -187,6 +187,6 @@ def explains(problem: FitProblem, fit: Fit, tol: TolerancePair) -> bool:
 
 
 def is_white(r: np.ndarray) -> bool:
-    """Return whether residuals in the order of time are not correlated with those before them."""
+    """Return True if residuals in the order of time are not correlated with their predecessors."""
     power = r @ r
     return len(r) < 3 or power == 0.0 or abs(r[1:] @ r[:-1]) / power <= WHITE_CORRELATION / np.sqrt(len(r))

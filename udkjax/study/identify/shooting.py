@@ -1,13 +1,12 @@
-"""Multiple shooting: records in pieces, each with an initial state of its own, that are held together while they are fitted.
+"""Multiple shooting: records cut into pieces, each with its own initial state, and fitted with penalties on the gaps.
 
-Along a chaotic record errors grow like exp(lambda t), so what a whole record says of a parameter has as many minima as it has
-digits. A piece that is shorter than 1 / lambda has one. With s_p the state that piece p begins with, and F_p where it
-leads, the fit is of
+Along a chaotic record errors grow like exp(lambda t), so the cost of a whole record has very many minima in a parameter. A piece
+shorter than 1 / lambda has one. With s_p the initial state of piece p, and F_p its final state, the fit minimizes
 
     sum r_p(z, s_p)^2 + w^2 sum (F_p(z, s_p) - s_{p+1})^2,
 
-whose w grows from where pieces go their own ways to where they are one motion up to the errors of its integration. The first
-state is that of the record; of each other one as many positions and rates are unknown as the mechanism has degrees of freedom.
+with a weight w that grows from nearly independent pieces to one motion, continuous up to integration errors. The first state is
+that of the record; of each other one, a position and a rate are unknown for each degree of freedom.
 H. G. Bock, Recent advances in parameter identification techniques for ODE, 1983; the growing weight: H. Voss, J. Timmer and
 J. Kurths, Nonlinear dynamical system identification from uncertain and indirect measurements, 2004.
 """
@@ -35,16 +34,17 @@ from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Runs, TolerancePair
 from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
 
-MOST_PIECES = 60  # of all records: the algebra is that of dense matrices
-# Of the largest singular value: what a piece shows less of its initial state stays as the piece before leads to.
+MOST_PIECES = 60  # pieces of all records: the linear algebra is dense
+# Relative to the largest singular value: components of a piece's initial state that it determines less stay where the previous
+# piece ends.
 CONTINUED_PART = 1e-2
-LEAST_MOTION = 1e-3  # of the largest: how little a coordinate is taken to move in a piece
-# w of defects over how far coordinates move in a piece, where residuals are over how far their channels move.
+LEAST_MOTION = 1e-3  # relative to the largest: least motion of a coordinate in a piece
+# w, with gaps relative to the motion of coordinates in a piece, and residuals relative to the scales of their channels.
 WEIGHTS = tuple(10.0**k for k in range(-2, 5))
 
 
 class Piece(NamedTuple):
-    """A part of a record: which record, and its samples from `first` up to `end`, which begins the next."""
+    """A part of a record: its samples from `first` up to `end`, which is the first of the next piece."""
 
     record: int
     first: int
@@ -52,16 +52,16 @@ class Piece(NamedTuple):
 
 
 class MultipleShooting(FitProblem):
-    """A problem in pieces. Its first residuals are those of the whole problem, in the same order; defects follow.
+    """A problem in pieces. Its first residuals are those of the whole problem, in the same order, followed by the defects (gaps).
 
-    The unknowns z are those of the whole problem, then those of the initial states of pieces.
+    The unknowns z are those of the whole problem, followed by those of the initial states of pieces.
 
     Attributes:
-        whole: the problem that is cut.
-        weight: w of the defects, over how far coordinates move in a piece.
-        pieces: N parts of records, which are the runs; `following` are those that another leads to.
-        guess: the first guess (K,): pieces along the records.
-        scale: distance that coordinates move in a piece (S,).
+        whole: the problem that is cut into pieces.
+        weight: weight w of the defects, relative to the motion of coordinates in a piece.
+        pieces: N parts of records, one run each; `following` are the indices of those that continue another.
+        guess: the first guess (K,), with pieces along the records.
+        scale: typical motion of the coordinates in a piece (S,).
     """
 
     def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, samples: float = RESIDUALS_PER_UNKNOWN):
@@ -94,26 +94,26 @@ class MultipleShooting(FitProblem):
         self.guess, self.scale = self._guess_along(z, tol)
 
     def _unknowns_at(self, record: int, x: np.ndarray, t: float, guess: State | None) -> InitialStateUnknowns:
-        """Return the unknowns of a state of a record with parameters x, at a time beside a guess."""
+        """Return the unknowns of a state of a record at a time t, with parameters x, near a guess."""
         mech = apply_values(with_conditions(self.mechanism, self.records[record]), self.unknowns.targets, x)
         return state_unknowns(mech, t, guess, "both", "start")
 
     def _begin_at(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
-        """Let a piece begin beside a closed state (2, n)."""
+        """Set the guess of a piece's initial state to a closed state (2, n)."""
         q, v = state.reshape(2, -1, 3)
         basis = self._unknowns_at(self.pieces[p].record, x, float(self.runs.ts[p, 0]), State(q, v)).basis
         self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
         assert self.runs.q is not None and self.runs.v is not None
         self.runs.q[p], self.runs.v[p] = q, v
-        for _ in range(2):  # compensate beforehand for how far the parameters will move the guess
+        for _ in range(2):  # compensate for the change of the guess by the parameters
             found = self.predictor.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
             self.runs.q[p] += q - found.q
             self.runs.v[p] += v - found.v
 
     def _guess_along(self, z: np.ndarray, tol: TolerancePair) -> tuple[np.ndarray, np.ndarray]:
-        """Find initial states of the pieces one after another, and how far the coordinates move in a piece (S,).
+        """Return initial states of the pieces, found in sequence, and the typical motion of the coordinates in a piece (S,).
 
-        Each begins where the piece before leads to, moved to fit what was measured in its own.
+        Each is the final state of the previous piece, corrected to fit the piece's measurements.
         """
         P = len(self.unknowns.names)
         x = self.unknowns.values(z[:P])
@@ -122,7 +122,7 @@ class MultipleShooting(FitProblem):
         for p, piece in enumerate(self.pieces):
             columns = self.columns[p]
             if piece.first:
-                self._begin_at(p, ends[1], x)  # the piece before is of the same record
+                self._begin_at(p, ends[1], x)  # the previous piece is of the same record
                 fit = minimize_squares(self._residuals_of_piece(p, x, tol), np.zeros(self.S), FEW_STEPS, COARSE_STEP)
                 found[columns] = fit.z if np.isfinite(fit.cost) else 0.0
             ends = np.asarray(self._predict_piece(p, x, np.where(columns < 0, 0.0, found[columns])[None], tol).ends)[0]
@@ -134,11 +134,11 @@ class MultipleShooting(FitProblem):
         return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
 
     def _predict_piece(self, p: int, x: np.ndarray, shift: Float[np.ndarray, "B S"], tol: TolerancePair) -> Prediction:
-        """Predict a piece with parameters x, from B initial states."""
+        """Predict a piece with parameters x from B initial states."""
         return self.predictor(self.members_of(np.full(len(shift), p), np.tile(x, (len(shift), 1)), shift), tol)
 
     def _residuals_of_piece(self, p: int, x: np.ndarray, tol: TolerancePair) -> Objective:
-        """Return residuals of a piece as a function of its initial state, held near to where the piece before leads to."""
+        """Return the residuals of a piece as a function of its initial state, damped towards the end of the previous piece."""
         rows, S, damping = np.flatnonzero(self.run == p), self.S, None
         at, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.y[self.present][rows]
 
@@ -169,17 +169,17 @@ class MultipleShooting(FitProblem):
 
     @property
     def _defect_weight(self) -> float:
-        """The weight of defects over the scale of coordinates, where residuals are in standard deviations."""
+        """Weight of defects relative to the scale of coordinates, for residuals in standard deviations."""
         return float(self.weight / np.median(self.sigma / self.channel_scale[self.index[:, 2]]))
 
     def gaps(self, z: np.ndarray, tol: TolerancePair) -> np.ndarray:
-        """Return the largest defect (B,), over how far coordinates move in a piece."""
+        """Return the largest defect (B,), relative to the motion of coordinates in a piece."""
         r = self.evaluate(z, tol).r[:, len(self.index) + self.whole.extra_rows :]
         return np.abs(r).max(1, initial=0.0) / self._defect_weight
 
 
 class PieceFailed(Exception):
-    """A piece could not be computed with the first guess: it says nothing of where the next begins."""
+    """A piece cannot be simulated with the first guess, so that the initial state of the next is unknown."""
 
 
 def fit_pieces(
@@ -191,24 +191,26 @@ def fit_pieces(
 ) -> tuple[MultipleShooting, Fit]:
     """Fit the records in pieces, from unknowns z of the problem; return the problem in pieces, and the fit of its unknowns.
 
-    A piece has at least as many `samples` as that for each unknown of its initial state. Where one cannot be computed along the
-    first guess, `PieceFailed` is raised.
+    Each piece has at least `samples` residuals for each unknown of its initial state.
+
+    Raises:
+        PieceFailed: a piece cannot be simulated with the first guess.
     """
     shooting = MultipleShooting(problem, z, tol, samples)
     fit, history = Fit(shooting.guess, np.inf, False, []), []
     for weight in WEIGHTS:
         shooting.weight = weight
-        one = minimizer.with_label(f"pieces held together by {weight:.0e}")
-        steps, settled = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
-        fit = one.minimize(shooting, fit.z, tol, None, steps, settled)
+        one = minimizer.with_label(f"pieces, weight of the gaps {weight:.0e}")
+        steps, step_tol = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
+        fit = one.minimize(shooting, fit.z, tol, None, steps, step_tol)
         history += fit.history
-        if weight > WEIGHTS[0] and not fit.settled:  # with larger weights they would only be farther from a minimum
+        if weight > WEIGHTS[0] and not fit.converged:  # larger weights would only be farther from a minimum
             break
     return shooting, fit._replace(history=history)
 
 
 def cut_records(problem: FitProblem, least: float) -> tuple[Piece, ...]:
-    """Cut the records into pieces of at least as many residuals."""
+    """Cut the records into pieces of at least `least` residuals."""
     found = []
     for k in range(len(problem.records)):
         numbers = problem.present[k].sum(1)
@@ -225,7 +227,7 @@ def cut_records(problem: FitProblem, least: float) -> tuple[Piece, ...]:
 
 
 def _piece_tables(problem: FitProblem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times of all pieces, padded, the last where the next piece begins; and the piece and time of each residual."""
+    """Return the padded times of all pieces, each ending where the next begins; and the piece and time index of each residual."""
     length = max(piece.end - piece.first for piece in pieces) + 1
     record, time, _ = problem.index.T
     ts, which, at = [], np.zeros(len(record), int), np.zeros(len(record), int)
@@ -233,6 +235,6 @@ def _piece_tables(problem: FitProblem, pieces: Sequence[Piece]) -> tuple[np.ndar
         own = problem.ts[piece.record, piece.first : piece.end + 1]
         between = np.linspace(own[-2], own[-1], length - len(own) + 2)
         ts.append(np.concatenate([own[:-2], between]))
-        own_rows = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next takes back what is its own
+        own_rows = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next piece overwrites its own
         which[own_rows], at[own_rows] = p, np.where(time[own_rows] == piece.end, length - 1, time[own_rows] - piece.first)
     return np.stack(ts), which, at

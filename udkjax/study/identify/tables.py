@@ -1,6 +1,6 @@
-"""Tables of measurements from files, pandas, xarray and mappings: columns under their headings, nothing interpreted.
+"""Tables of measurements from files, pandas, xarray and mappings: columns by their headings, without interpretation.
 
-Files are read by the standard library: messages name the line of each mistake, which the reader of pandas does not.
+CSV files are read by the standard library so that messages name the line of each mistake; pandas does not give it.
 """
 
 import csv
@@ -19,32 +19,32 @@ from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.study.identify.records import ByChannel
 
-if TYPE_CHECKING:  # neither is needed before somebody hands over one of its tables
+if TYPE_CHECKING:  # imported only if one of their tables is given
     import pandas
     import xarray
 
 TableData: TypeAlias = "ByChannel[ArrayLike] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
-TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and what follows that of a channel
+TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and the suffix of a channel's noise
 _DELIMITERS = (";", "\t", ",")
 # Coordinates of what `Solution.to_xarray` writes, as channels of bodies.
 _STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
 
 
 class TableColumn(NamedTuple):
-    """The values under one heading, numbers or text, and their units if the heading names some."""
+    """The values under one heading, numbers or text, and their units if the heading names them."""
 
     values: Sequence[str | float | None] | np.ndarray
     units: str | None
 
 
 class Table(NamedTuple):
-    """Columns by their names; `source` and `rows` are what messages call the table and its rows."""
+    """Columns by name; `source` and `rows` are the names of the table and its rows in messages."""
 
     source: str
     columns: Mapping[str, TableColumn]
     rows: Sequence[str]
-    name: str = ""  # of the record, where the table holds one
-    padded: bool = False  # whether rows at the ends in which nothing was measured are there for longer records
+    name: str = ""  # name of the record, if the table contains a single one
+    padded: bool = False  # True if empty rows at the ends only pad the record to the length of others
 
 
 def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: list[str]) -> Iterator[Table]:
@@ -58,8 +58,8 @@ def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: l
     elif isinstance(data, Mapping):
         yield _table_of_columns(source, [(str(key), value) for key, value in data.items()], problems)
     else:
-        what = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of such"
-        problems.append(f"{source}: must be {what}, is {type(data).__name__}")
+        kinds = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of these"
+        problems.append(f"{source}: must be {kinds}, is {type(data).__name__}")
 
 
 def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterator[Table]:
@@ -69,7 +69,7 @@ def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterat
         elif path.suffix.lower() == ".nc":
             with OptionalImport():
                 import xarray
-            data = xarray.load_dataset(path, decode_times=False)  # else xarray makes durations of seconds
+            data = xarray.load_dataset(path, decode_times=False)  # otherwise xarray converts seconds to durations
             yield from _read_dataset(data, bodies, str(path), problems, path.stem)
         else:
             problems.append(f"{path}: must be a .csv or a .nc file")
@@ -78,11 +78,11 @@ def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterat
 
 
 def _read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
-    """Iterate over the table of a CSV file: a header, after lines of comments if there are any, and rows of cells."""
+    """Iterate over the table of a CSV file: optional comment lines, a header, and rows of cells."""
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if first is None:
-        problems.append(f"{path}: holds no header")
+        problems.append(f"{path}: has no header")
         return
     delimiter = next((d for d in _DELIMITERS if d in lines[first]), ",")
     reader = csv.reader(lines[first:], delimiter=delimiter, skipinitialspace=True)
@@ -101,7 +101,7 @@ def _read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
 
 
 def _cut_empty_end(cells: list[str]) -> list[str]:
-    """Cut off empty cells at the end of a row: spreadsheets write such."""
+    """Remove empty cells from the end of a row, as spreadsheets write them."""
     return cells[: max((k + 1 for k, cell in enumerate(cells) if cell.strip()), default=0)]
 
 
@@ -117,7 +117,7 @@ def _join_points(cells: Sequence[str], delimiter: str) -> list[str]:
 
 
 def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -> Table:
-    """Return the table of a pandas DataFrame; its index is a column if it is called a time or a record."""
+    """Return the table of a pandas DataFrame; its index is a column if it is named as a time or a record."""
     indexed = data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME, RECORD)
     columns = [data.index.to_series()] if indexed else []
     columns += [data.iloc[:, k] for k in range(data.shape[1])]
@@ -128,13 +128,13 @@ def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) 
 def _table_of_columns(
     source: str, given: Sequence[tuple[str, ArrayLike]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
-    """Return the table of columns whose headings may name their units; one value stands for all rows."""
+    """Return the table of columns whose headings may name units; a single value stands for all rows."""
     columns: dict[str, TableColumn] = {}
     for text, values in given:
         heading, units = _heading(text)
         if heading in columns or not heading:
-            what = f"there are two columns {quote(heading)}" if heading else "a column has no heading"
-            problems.append(f"{source}: {what}")
+            problem = f"there are two columns {quote(heading)}" if heading else "a column has no heading"
+            problems.append(f"{source}: {problem}")
         else:
             cells = np.asarray(values) if hasattr(values, "dtype") else cast("Sequence[str | float | None]", values)
             columns[heading] = TableColumn(cells, units)
@@ -146,7 +146,7 @@ def _table_of_columns(
 
 
 def _heading(text: str) -> tuple[str, str | None]:
-    """Split `body.link1.angle [deg]` into a name and its units."""
+    """Split `body.link1.angle [deg]` into a name and units."""
     match = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text.strip())
     return (match[1].strip(), match[2].strip() or None) if match else (text.strip(), None)
 
@@ -157,7 +157,7 @@ def _heading(text: str) -> tuple[str, str | None]:
 def _read_dataset(
     data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str = ""
 ) -> Iterator[Table]:
-    """Iterate over the tables of an xarray Dataset: one for each of its records."""
+    """Iterate over the tables of an xarray Dataset, one per record."""
     if RECORD not in data.dims:
         yield _read_record(data, bodies, source, problems, name)
         return

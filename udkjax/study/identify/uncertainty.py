@@ -1,13 +1,13 @@
-"""The uncertainty of unknowns that are found from measured motion, and those that do not show in it at all.
+"""The uncertainty of identified unknowns, and the directions that the measurements do not determine.
 
 With r the residuals (R,) divided by the standard deviations of the noise, and J = dr/dz (R, K), the Fisher information is J^T J,
-and the covariance of the unknowns z its inverse; both from the singular values of J = U S V^T. A direction of z whose singular
-value is as small as the errors of J does not show in what was measured. Nothing is known of a parameter that takes part in one;
-of the others, what the pseudoinverse says. Unknowns that nobody asked for, such as those of initial states, are columns of J like
-all others: leaving them out of the covariance afterwards is the Schur complement.
+and the covariance of the unknowns z is its inverse, both computed from the singular values of J = U S V^T. A direction of z whose
+singular value is as small as the errors of J is not determined by the measurements. A parameter that takes part in such a
+direction is unknown; the variance of the others follows from the pseudoinverse. Nuisance unknowns, such as those of initial
+states, are columns of J like all others: omitting them from the covariance afterwards is the Schur complement.
 
-Where the noise of some residuals is not known, it is estimated from them, s^2 = chi^2 / (R - gamma), with gamma the number of
-unknowns that these residuals determine (MacKay, Neural Computation 4 (1992) 415): all K of them where there is nothing else.
+If the noise of some residuals is unknown, it is estimated from them, s^2 = chi^2 / (R - gamma), with gamma the number of unknowns
+that these residuals determine (MacKay, Neural Computation 4 (1992) 415): all K if there are no other residuals.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,18 +23,18 @@ from udkjax.scene.wording import join_names
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
 
-POOR_ERROR = 0.5  # standard error relative to the value; of a parameter of either sign, to its scale
-HIGH_CORRELATION = 0.98  # of two parameters: their difference is known ten times worse than their sum
-LEAST_NOISE = 1e-15  # of what residuals were divided by: noise below it is rounding
-NOISE_ITERATIONS, EQUAL_NOISE = 50, 1e-10  # of the noise and what is determined with such noise, in turn, until both stay
-# Of the largest coefficient of a direction: unknowns with less of it take no part. Directions are that exact where their singular
-# value is that much above the errors of the Jacobian.
+POOR_ERROR = 0.5  # standard error relative to the value, or to the scale of a parameter of either sign
+HIGH_CORRELATION = 0.98  # of two parameters: one combination of them is ten times less accurate than the other
+LEAST_NOISE = 1e-15  # relative to the assumed noise: smaller noise is rounding
+NOISE_ITERATIONS, EQUAL_NOISE = 50, 1e-10  # alternating updates of the noise and of gamma, and their relative tolerance
+# Relative to the largest coefficient of a direction: unknowns with smaller ones take no part in it. Directions are as accurate as
+# this if their singular value exceeds the errors of the Jacobian by the inverse factor.
 SMALLEST_PART = 1e-3
-COMMON_FACTOR_TOL = 1e-2  # relative: by how much factors may differ that are called a common one
+COMMON_FACTOR_TOL = 1e-2  # relative difference of factors that are called a common factor
 
 
 class UnknownValues(NamedTuple):
-    """The K unknowns at an estimate: parameters first, then those that nobody asked for.
+    """The K unknowns at an estimate: parameters first, then nuisance unknowns.
 
     `kinds` are "positive", "bounded" or "free", as in `parameters`; `dx_dz` are derivatives by the dimensionless unknowns.
     """
@@ -46,12 +46,12 @@ class UnknownValues(NamedTuple):
     kinds: Sequence[str]
 
     def typical(self, k: int) -> float:
-        """Return the scale of a standard error: the value; of a parameter of either sign, its scale."""
+        """Return the scale to compare a standard error with: the value, or the scale of a parameter of either sign."""
         return float(abs(self.x[k]) or abs(self.dx_dz[k])) if self.kinds[k] == "bounded" else float(abs(self.dx_dz[k]))
 
 
 class Direction(NamedTuple):
-    """A change of unknowns that no measured quantity shows: the coefficients in z (N,), and the same in words."""
+    """A change of unknowns that affects no measured quantity: coefficients in z (N,), and a description."""
 
     names: tuple[str, ...]
     coefficients: Float[np.ndarray, "N"]
@@ -64,18 +64,18 @@ class Uncertainty:
 
     Attributes:
         values: all K unknowns at the estimate.
-        standard_errors: of the parameters, in their units; inf where a parameter is not known.
-        covariance: of the parameters, not a number where one is not known.
-        correlation: of their errors.
+        standard_errors: standard errors of the parameters, in their units; inf for undetermined parameters.
+        covariance: covariance of the parameters; NaN for undetermined ones.
+        correlation: correlation of their errors.
         singular: singular values of J over all unknowns z.
         directions: right singular vectors of J.
-        dead: parameters on which no measured quantity depends.
-        flat: further directions that no measured quantity shows.
-        chi2: sum of squares of residuals divided by their noise, given or estimated.
-        degrees_of_freedom: residuals minus directions that they show.
-        noise: for each group of residuals whose noise was estimated, how many times larger it is than what they were divided by.
-        projection: U, the part of the residuals that the fit removes.
-        state_errors: standard errors of the other unknowns, those of initial states.
+        dead: parameters that no measured quantity depends on.
+        flat: further directions that affect no measured quantity.
+        chi2: sum of squares of the residuals divided by their noise, given or estimated.
+        degrees_of_freedom: number of residuals minus number of determined directions.
+        noise: for each group of residuals with unknown noise, its estimate relative to the assumed noise.
+        projection: U, whose columns span the part of the residuals that the fit removes.
+        state_errors: standard errors of the unknowns of initial states.
     """
 
     values: UnknownValues
@@ -105,25 +105,25 @@ class Uncertainty:
 
     @property
     def correlated(self) -> tuple[tuple[str, str, float], ...]:
-        """Pairs of parameters that are hardly known apart, and their correlation."""
+        """Pairs of highly correlated parameters, and their correlation."""
         with np.errstate(invalid="ignore"):
             pairs = np.argwhere(np.triu(np.abs(self.correlation) > HIGH_CORRELATION, 1))
         return tuple((self.names[i], self.names[j], float(self.correlation[i, j])) for i, j in pairs)
 
     def notes(self, name: str) -> list[str]:
-        """Return the remarks on the knowledge of a parameter, a few words each."""
+        """Return remarks on the uncertainty of a parameter, a few words each."""
         sizes = [len(flat.names) for flat in self.flat if name in flat.names]
         notes = {
-            "shows in nothing that was measured": name in self.dead,
-            "cannot be told from others": max(sizes, default=0) > 1,
-            "unknown": max(sizes, default=0) == 1,
-            "poorly known": name in self.poor,
+            "affects no measured quantity": name in self.dead,
+            "undetermined together with others": max(sizes, default=0) > 1,
+            "undetermined": max(sizes, default=0) == 1,
+            "poorly determined": name in self.poor,
         }
         return [note for note, holds in notes.items() if holds]
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Remarks on what to know before the numbers are used, one sentence each; none where all is well."""
+        """Warnings about the numbers, one sentence each."""
         return tuple(_sentences(self))
 
 
@@ -135,11 +135,11 @@ def estimate_uncertainty(
     parameters: int | None = None,
     priors: int = 0,
 ) -> Uncertainty:
-    """Compute how well unknowns are known: covariance (J^T J)^-1, and the directions that J does not show.
+    """Compute the uncertainty of unknowns: the covariance (J^T J)^-1, and the directions that J does not determine.
 
-    `noise_group` says for each residual whose common noise is to be estimated (0, 1, ...), or -1 where it is known (all by
-    default). The first `parameters` unknowns are asked for, by default all. The last rows are those of `priors`: what only they
-    show is as known as they say, however much better other directions are measured.
+    `noise_group` is the group (0, 1, ...) of residuals with a common unknown noise, or -1 if the noise is known (the default).
+    The first `parameters` unknowns, by default all, are the parameters. The last rows are those of `priors`: directions that only
+    they determine have the priors' uncertainty, however much better others are measured.
     """
     K, P = len(values.names), len(values.names) if parameters is None else parameters
     size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
@@ -147,8 +147,8 @@ def estimate_uncertainty(
     group = np.full(len(r), -1) if noise_group is None else np.asarray(noise_group, int)
     noise = _noise_scales(J[:, alive], r, group)
     scale = np.append(noise, 1.0)[group]
-    known = np.isfinite(scale).all()
-    u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if known else 1.0), full_matrices=False)
+    noise_known = np.isfinite(scale).all()
+    u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if noise_known else 1.0), full_matrices=False)
     shown = sigma > INVISIBLE_RATIO * sigma.max(initial=0.0)
     sigma, vt, u, shown = _with_priors(before[:, alive], sigma, vt, u, shown)
     x, dx_dz = (np.asarray(part, float)[alive] for part in (values.x, values.dx_dz))
@@ -157,7 +157,7 @@ def estimate_uncertainty(
     lost = np.any(flats != 0.0, axis=0)
     lost[np.setdiff1d(np.arange(K), alive)] = True
     root = directions[shown].T / sigma[shown] * np.asarray(values.dx_dz)[:, None]  # (K, D)
-    every = root @ root.T * (1.0 if known else np.nan)
+    every = root @ root.T * (1.0 if noise_known else np.nan)
     every[lost] = every[:, lost] = np.nan
     every_error = np.where(lost, np.inf, np.sqrt(np.diag(every)))
     errors, covariance = every_error[:P], every[:P, :P]
@@ -184,14 +184,14 @@ def estimate_uncertainty(
 def _with_priors(
     before: np.ndarray, sigma: np.ndarray, vt: np.ndarray, u: np.ndarray, shown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Add to the singular values and vectors those that no measurement shows, but priors do: by their own size."""
-    none = null_space(vt[shown], 0.5)
-    if not len(none) or not len(before):
+    """Add singular values and vectors of the directions that only priors determine, relative to the priors' own size."""
+    unshown = null_space(vt[shown], 0.5)
+    if not len(unshown) or not len(before):
         return sigma, vt, u, shown
-    _, own, w = np.linalg.svd(before @ none.T, full_matrices=False)
+    _, own, w = np.linalg.svd(before @ unshown.T, full_matrices=False)
     some = own > INVISIBLE_RATIO * np.linalg.norm(before, axis=1).max(initial=0.0)
-    rows = np.concatenate([np.zeros((len(u) - len(before), int(some.sum()))), (before @ none.T @ w[some].T) / own[some]])
-    sigma, vt = np.concatenate([sigma[shown], own[some]]), np.concatenate([vt[shown], w[some] @ none])
+    rows = np.concatenate([np.zeros((len(u) - len(before), int(some.sum()))), (before @ unshown.T @ w[some].T) / own[some]])
+    sigma, vt = np.concatenate([sigma[shown], own[some]]), np.concatenate([vt[shown], w[some] @ unshown])
     return sigma, vt, np.concatenate([u[:, shown], rows], axis=1), np.ones(len(sigma), bool)
 
 
@@ -202,10 +202,10 @@ def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.nda
 
 
 def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the factor s of each group of residuals; nan where it has no more residuals than it determines unknowns."""
+    """Return the factor s of each group of residuals; NaN if it has no more residuals than unknowns that it determines."""
     groups = [np.flatnonzero(group == g) for g in range(group.max(initial=-1) + 1)]
     sums, counts = np.array([r[g] @ r[g] for g in groups]), np.array([len(g) for g in groups], float)
-    # R of QR stands for the rows of a group: all that is asked of them is J^T J.
+    # The factor R of QR replaces the rows of a group: only their J^T J is needed.
     parts = [np.linalg.qr(J[g], mode="r") for g in (*groups, np.flatnonzero(group < 0))]
     s2 = sums / np.maximum(counts, 1.0)
     for _ in range(NOISE_ITERATIONS if groups else 0):
@@ -224,7 +224,7 @@ def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray
 def simplest_basis(
     free: Float[np.ndarray, "D K"], x: Float[np.ndarray, "K"], dx_dz: Float[np.ndarray, "K"], kinds: Sequence[str]
 ) -> Float[np.ndarray, "D K"]:
-    """Return rows of few unknowns each that span the same as the orthonormal rows `free`; a common factor first, if it is one."""
+    """Return sparse rows with the same span as the orthonormal rows `free`, the first a common factor if that is in the span."""
     found = echelon(free, SMALLEST_PART)
     relative = np.array([kind != "free" for kind in kinds], bool) & (x != 0.0) & np.any(found != 0.0, axis=0)
     if len(found) < 2 or not relative.any():
@@ -233,7 +233,7 @@ def simplest_basis(
     outside = factor - free.T @ (free @ factor)
     if np.linalg.norm(outside) > SMALLEST_PART * np.linalg.norm(factor):
         return found
-    # The factor takes the place of the direction that it is most of.
+    # The factor replaces the direction that contributes most to it.
     share = np.abs(np.linalg.lstsq(found.T, factor, rcond=None)[0]) * np.linalg.norm(found, axis=1)
     return np.concatenate([factor[None], np.delete(found, int(np.argmax(share)), axis=0)])
 
@@ -241,45 +241,46 @@ def simplest_basis(
 # --- words
 
 
-def _sentences(known: Uncertainty) -> Iterator[str]:
-    values = known.values
-    if known.dead:
-        yield f"no measured quantity depends on {join_names(known.dead)}: leave out what does not show, or measure what does"
-    for flat in known.flat:
-        one = "fix one of them, give one a prior, or measure more" if len(flat.names) > 1 else "fix it, or measure more"
-        yield f"no measured quantity shows {flat.text}: {one}"
-    if not np.isfinite(known.noise).all():
+def _sentences(found: Uncertainty) -> Iterator[str]:
+    values = found.values
+    if found.dead:
+        it = "it" if len(found.dead) == 1 else "them"
+        yield f"no measured quantity depends on {join_names(found.dead)}: do not identify {it}, or measure other quantities"
+    for flat in found.flat:
+        cure = "fix one of them, give one a prior, or measure more" if len(flat.names) > 1 else "fix it, or measure more"
+        yield f"no measured quantity changes with {flat.text}: {cure}"
+    if not np.isfinite(found.noise).all():
         yield (
-            f"{known.projection.shape[0]} residuals leave nothing from which to estimate the noise: standard errors are not "
-            "known; give the noise, or more data"
+            f"{found.projection.shape[0]} residuals are too few to estimate the noise, and standard errors are unknown: give the "
+            "noise, or more data"
         )
-    for name in known.poor:
+    for name in found.poor:
         k = list(values.names).index(name)
-        error, unit = known.standard_errors[k], f" {values.units[k]}".rstrip()
+        error, unit = found.standard_errors[k], f" {values.units[k]}".rstrip()
         percent = f" ({100 * error / abs(values.x[k]):.0f} %)" if values.x[k] else ""
-        yield f"{name} is poorly known: {values.x[k]:.4g}{unit} with a standard error of {error:.2g}{unit}{percent}"
-    for one, other, rho in known.correlated:
-        yield f"{one} and {other} are hardly known apart: their errors have the correlation {rho:.4f}"
-    if not known.noise.size and known.degrees_of_freedom > 0:
-        yield from _noise_sentence(known.chi2, known.degrees_of_freedom)
+        yield f"{name} is poorly determined: {values.x[k]:.4g}{unit} with a standard error of {error:.2g}{unit}{percent}"
+    for one, other, rho in found.correlated:
+        yield f"{one} and {other} are hard to distinguish: the correlation of their errors is {rho:.4f}"
+    if not found.noise.size and found.degrees_of_freedom > 0:
+        yield from _noise_sentence(found.chi2, found.degrees_of_freedom)
 
 
 def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
-    """Say so where residuals are not as large as the noise that was given."""
+    """Iterate over a sentence if the residuals are larger or smaller than the given noise."""
     ratio = np.sqrt(chi2 / freedom)
     numbers = f"chi^2 = {chi2:.4g} with {freedom} degrees of freedom"
     if chdtrc(freedom, chi2) < SIGNIFICANCE:
-        size, why = f"{ratio:.3g}", "the model leaves something out, or the noise is larger"
+        size, why = f"{ratio:.3g}", "the model omits something, or the noise is larger"
     elif chdtr(freedom, chi2) < SIGNIFICANCE:
         size, why = f"only {ratio:.3g}", "the noise is smaller, or its samples are not independent"
     else:
         return
-    end = "standard errors are those of the noise given"
-    yield f"residuals are {size} times as large as the noise given ({numbers}): {why}; {end}"
+    end = "standard errors are those of the given noise"
+    yield f"residuals are {size} times as large as the given noise ({numbers}): {why}; {end}"
 
 
 def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
-    """Word a direction of z: as a common factor where it is one, else with one percent of the unknown that changes most."""
+    """Describe a direction of z: as a common factor if it is one, else by changes per one percent of the largest change."""
     nonzero = np.flatnonzero(coefficients).tolist()
     x, change = (np.asarray(a, float)[nonzero] for a in (values.x, values.dx_dz))
     change = change * coefficients[nonzero]

@@ -1,8 +1,8 @@
 """The unknowns of a fit: parameters and initial states, as dimensionless numbers z that are zero at the first guess.
 
-A parameter x with the first guess x0 is x0 exp(z) if it is positive; low + (high - low) / (1 + (1 / u0 - 1) exp(-z)) between
-bounds, with u0 the place of x0 between them; and any other one x0 + scale z. An initial state is closed beside the guess that
-coordinates and rates of some bodies are added to, as many as the mechanism has degrees of freedom.
+A parameter x with first guess x0 is x0 exp(z) if it is positive; low + (high - low) / (1 + (1 / u0 - 1) exp(-z)) if it is
+bounded, with u0 = (x0 - low) / (high - low); and x0 + scale z otherwise. An initial state is closed from a guess plus changes of
+some coordinates and rates, one of each per degree of freedom.
 """
 
 from collections.abc import Hashable, Sequence
@@ -26,17 +26,17 @@ from udkjax.scene.quantities import Setter, parameter_value
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
 
 Transform = Literal["positive", "bounded", "free"]
-BOUND_DISTANCE = 1e-3  # of the distance between the bounds: a value as near to one of them is said to be at it
-FARTHEST_UNKNOWN = 20.0  # of an unknown: a positive parameter a hundred million times too large is not looked at
-# Distance of other guesses from the first: positive parameters by a factor, others by a part of their scale.
+BOUND_DISTANCE = 1e-3  # relative to the distance between the bounds: a closer value is at a bound
+FARTHEST_UNKNOWN = 20.0  # largest |z|: a positive parameter a hundred million times too large
+# Distance of other guesses from the first: a factor for positive parameters, relative to the scale for others.
 GUESS_FACTOR, GUESS_RADIUS = 2.5, 0.5
-BOUND_MARGIN = 0.02  # of the distance between the bounds: no guess is nearer, since bounds themselves are infinitely far
-SMALLEST_READABLE_PART = 1e-3  # of the largest: the least that coordinates taken as unknowns of a free motion must show of it
-STATE_RADIUS = 0.05  # of the scene's length, time and one radian: how far guesses of initial states are from the first
+BOUND_MARGIN = 0.02  # relative to the distance between the bounds: least distance of a guess, as z is infinite at a bound
+SMALLEST_READABLE_PART = 1e-3  # relative to the largest: least pivot of coordinates chosen as unknowns of the free motions
+STATE_RADIUS = 0.05  # relative to the scene's length and time, and rad: distance of guesses of initial states from the first
 
 
 class Target(NamedTuple):
-    """The numbers that a value is assigned to: hashable, so that what is compiled for it serves all values."""
+    """The numbers of a scene that a value is assigned to: hashable, so that compiled programs serve all values."""
 
     names: tuple[str, ...] = ()
     scaled: bool = False
@@ -44,18 +44,18 @@ class Target(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """One parameter: what it is called, what its value is assigned to, its transform, first guess, bounds, and prior."""
+    """One parameter: its name, target, transform, first guess, bounds, and prior."""
 
     name: str
     units: str
     target: Target
     kind: Transform
-    at_scene_value: bool  # whether the first guess is the scene's own
+    at_scene_value: bool  # True if the first guess is the scene's value
     guess: float
-    low: float  # nan: no bounds
+    low: float  # NaN: no bounds
     high: float
     scale: float
-    mean: float  # nan: no prior
+    mean: float  # NaN: no prior
     sigma: float
 
 
@@ -67,7 +67,7 @@ class Unknowns:
     units: tuple[str, ...]
     targets: tuple[Target, ...]
     kinds: tuple[Transform, ...]
-    at_scene_values: bool  # whether all first guesses are
+    at_scene_values: bool  # True if all first guesses are the scene's values
     guess: Float[np.ndarray, "P"]
     low: Float[np.ndarray, "P"]
     high: Float[np.ndarray, "P"]
@@ -77,7 +77,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, each: Sequence[Unknown]) -> "Unknowns":
-        """Return some parameters as one."""
+        """Combine parameters."""
         names, units, targets, kinds, at_scene_value, *numbers = zip(*each, strict=True)
         return cls(names, units, targets, kinds, all(at_scene_value), *np.array(numbers, float))
 
@@ -98,7 +98,7 @@ class Unknowns:
 
     @np.errstate(divide="ignore", invalid="ignore")
     def z_of(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return z(x); not finite where a value is not between its bounds, or not positive."""
+        """Return z(x); not finite for a value outside its bounds, or not positive."""
         width = self.high - self.low
         bounded = logit((x - self.low) / width) - logit((self.guess - self.low) / width)
         return self._by_kind(np.log(x / self.guess), bounded, (x - self.guess) / self.scale)
@@ -108,13 +108,13 @@ class Unknowns:
         return np.select([kinds == "positive", kinds == "bounded"], [positive, bounded], free)
 
     def at_bounds(self, x: Float[np.ndarray, "P"]) -> tuple[str, ...]:
-        """Return the names of those that are at one of their bounds."""
+        """Return the names of the parameters that are at one of their bounds."""
         near = np.minimum(x - self.low, self.high - x) <= BOUND_DISTANCE * (self.high - self.low)
         return tuple(name for name, at, kind in zip(self.names, near, self.kinds, strict=True) if at and kind == "bounded")
 
 
 def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array, "P"] | np.ndarray) -> Mechanism:
-    """Return the mechanism with the values x (P,) assigned, in the order of the parameters. Pure; x may be traced."""
+    """Return the mechanism with values x (P,), which may be traced, assigned in the order of the parameters; pure."""
     base, values = mechanism, {}
     for k, target in enumerate(targets):
         if target.function is not None:
@@ -126,13 +126,13 @@ def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array
 
 
 def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample guesses beside a first one: within a factor or a half of the scale, every second anywhere between bounds.
+    """Sample guesses around a first one: within a factor, or half of the scale; every second one anywhere between bounds.
 
-    Unknowns of initial states, which come after the parameters, are moved by a little.
+    Unknowns of initial states, which follow the parameters, are changed only slightly.
     """
     P = len(u.names)
     unit = _latin_hypercube(count, len(z), seed)
-    low, high = np.full(P, -np.log(GUESS_FACTOR)), np.full(P, np.log(GUESS_FACTOR))  # of z, from that of the first on
+    low, high = np.full(P, -np.log(GUESS_FACTOR)), np.full(P, np.log(GUESS_FACTOR))  # changes of z from the first guess
     free, bounded = (np.array([kind == which for kind in u.kinds], bool) for which in ("free", "bounded"))
     low[free], high[free] = -GUESS_RADIUS, GUESS_RADIUS
     guesses = z[:P] + low + (high - low) * unit[:, :P]
@@ -143,7 +143,7 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
 
 
 def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample points of the unit cube, one in each of `count` parts of every coordinate. SciPy's takes a second to import."""
+    """Sample points of the unit cube, one in each of `count` parts of every coordinate; SciPy's takes a second to import."""
     random = np.random.default_rng(seed)
     parts = random.permuted(np.tile(np.arange(count), (dimensions, 1)), axis=1).T
     return (parts + random.random((count, dimensions))) / count
@@ -153,9 +153,10 @@ def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray
 
 
 class InitialStateUnknowns(NamedTuple):
-    """The S unknowns of one initial state, which tied records share. They are dimensionless, over the scales of the scene.
+    """The S dimensionless unknowns of one initial state, which tied records share.
 
-    `sizes` (S,) are changes of the named coordinates and rates by one of each, in `units`; `basis` those of all q and v (n,).
+    `sizes` (S,) are the changes of the named coordinates and rates per unit of each unknown, in `units`; `basis` those of all q
+    and v (n,).
     """
 
     names: tuple[str, ...]
@@ -167,8 +168,8 @@ class InitialStateUnknowns(NamedTuple):
 def initial_state_unknowns(
     mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
 ) -> tuple[tuple[InitialStateUnknowns, ...], Int[np.ndarray, "records S"], Float[np.ndarray, "records 2 n S"]]:
-    """Return the unknowns of all initial states; where in z those of each record are (-1: none), and what they change."""
-    found: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # by the name of a start; if it has none, by the record
+    """Return the unknowns of all initial states, their indices in z for each record (-1: unused), and the changes of q and v."""
+    found: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # by the name of a start, or the number of its record
     at, problems = len(unknowns.names), []
     for k, record in enumerate(records):
         start, key = record.start, record.start.name or k
@@ -177,7 +178,7 @@ def initial_state_unknowns(
         if key in found:
             if not _same(found[key][0], start):
                 problems.append(
-                    f"{record.place}start {quote(start.name)} is another one in an earlier record: give one Start to both"
+                    f"{record.place}start {quote(start.name)} differs from that of an earlier record: give the same Start to both"
                 )
         else:
             label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
@@ -207,12 +208,12 @@ def _same(one: Start, two: Start) -> bool:
 
 
 def with_conditions(mechanism: Mechanism, record: Record) -> Mechanism:
-    """Return the mechanism as it was in a record."""
+    """Return the mechanism with the conditions of a record."""
     return mechanism.with_parameters(record.conditions) if record.conditions else mechanism
 
 
 def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Estimated, label: str) -> InitialStateUnknowns:
-    """Choose coordinates that parametrize the closed states beside a guess (None: the scene's own): angles where they do.
+    """Choose coordinates that parametrize the closed states near a guess (None: the scene's own): angles only, if possible.
 
     The names of the unknowns begin with `label`.
     """
@@ -220,18 +221,18 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
     free = np.eye(len(q))
     if rows.count:
         position = rows.close(t0, q)
-        assert position is not None, "what has been assembled is closed"
+        assert position is not None, "an assembled state is closed"
         free = rows.metric[:, None] * position.vt[position.rank :].T
     chosen, scales = _independent_rows(free), concrete_scales(mech)
-    size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles are in rad
-    rate = float(scales.rate) or 1.0  # of what rests without any load, in 1/s
+    size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles in rad
+    rate = float(scales.rate) or 1.0  # 1/s for a scene without motion and loads
     basis = free @ np.linalg.inv(free[chosen]) * size
     names: list[str] = []
     units: list[str] = []
     sizes, parts, nothing = [], [], np.zeros_like(basis)
     kinds = ("position", COORDINATES, 1.0, (basis, nothing)), ("velocity", RATES, rate, (nothing, rate * basis))
-    for what, fields, factor, part in kinds:
-        if estimate in (what, "both"):
+    for kind, fields, factor, part in kinds:
+        if estimate in (kind, "both"):
             sizes.append(factor * size)
             names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
             units += [UNITS[fields[k % 3]] for k in chosen]
@@ -240,7 +241,7 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
 
 
 def _independent_rows(free: np.ndarray) -> list[int]:
-    """Choose as many rows as there are columns, far from dependent on each other: of angles alone if possible."""
+    """Choose as many well-conditioned rows as there are columns: rows of angles only, if possible."""
     count, every = free.shape[1], np.arange(len(free))
     chosen = every[:0]
     for rows in (every[2::3], every):
@@ -252,11 +253,11 @@ def _independent_rows(free: np.ndarray) -> list[int]:
     return sorted(chosen.tolist())
 
 
-# --- what else differs between records
+# --- other differences between records
 
 
 def guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """Return q and v (records, bodies, 3) from which initial states are closed; None where all are the scene's own."""
+    """Return guesses q and v (records, bodies, 3) of initial states; None if all are the scene's own."""
     states = [record.start.state for record in records]
     if all(state is None for state in states):
         return None, None
@@ -266,15 +267,15 @@ def guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.
 
 
 def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:
-    """Return values of all records for every parameter that differs between them."""
-    known, problems = parameters_of(mechanism), []
+    """Return the values in all records of every parameter that differs between them."""
+    numbers, problems = parameters_of(mechanism), []
     found: dict[str, np.ndarray] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
-        owner, index = split_index(name, known)
-        if owner not in known or known[owner].value is None:
+        owner, index = split_index(name, numbers)
+        if owner not in numbers or numbers[owner].value is None:
             problems.append(f"conditions: no parameter {quote(name)}")
             continue
-        usual = np.asarray(known[owner].value)[index]
+        usual = np.asarray(numbers[owner].value)[index]
         try:
             found[name] = np.stack(
                 [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]

@@ -1,12 +1,12 @@
 """Sweeps: many runs that differ in parameters, settings and methods, as one dataset.
 
-axes, dimensions, grid      what varies: as users write it, as dimensions, as a TOML file
-measures                    what is stored of each member
-plan, groups                members and their groups; what is computed of those of a group
-chunks, executors           members that take a few seconds together, computed on devices or on a cluster
-store, fingerprint          finished chunks on disk; what decides the results
+axes, dimensions, grid      the varied quantities: as given by users, as dimensions, as a TOML file
+measures                    the variables stored for each member
+plan, groups                members (the single runs) and groups of members with a common compiled program
+chunks, executors           chunks of members of a few seconds, computed on devices or on a cluster
+store, fingerprint          finished chunks on disk; all inputs that determine the results
 dataset                     all results, labelled
-sweep                       what users call, and how far it is
+sweep                       the public function and its progress
 """
 
 from udkjax.study.sweep.axes import Axis as Axis

@@ -1,9 +1,9 @@
-"""Axes: what a sweep varies, each under a name; and designs, which spread members over their ranges.
+"""Axes: the quantities that a sweep varies, by name; and designs, which sample members from their ranges.
 
 An axis of numbers (parameters, tolerances, gains) is batched in one compiled program. An axis of choices (methods, solvers,
-mechanisms, initial states) divides the members into groups by the structure of what they chose, one program each: no member
-executes a branch that it did not choose, and choices that differ by numbers alone share a program. So do dense pseudoinverses, of
-which machine code takes one of several by its number.
+mechanisms, initial states) divides the members into groups by the structure of their choices, with one program each, so that no
+member executes a branch that it did not choose. Choices that differ only in numbers share a program, and so do dense
+pseudoinverses, of which machine code selects one by its number.
 """
 
 import abc
@@ -26,7 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.quantities import Setter
 from udkjax.study.choices import Choice
 
-# The settings of a run that are choices; what each is where none is given, or given as None.
+# The settings of a run that are choices, each with the label of None.
 CHOICES = {
     "mechanism": "",
     "state": "assembled",
@@ -45,23 +45,21 @@ class Distribution(Protocol):
 
 
 AxisChoice: TypeAlias = "Mechanism | State | int | Choice"
-# Numbers (n, ...) or choices; for a design a range or a distribution.
+# Numbers (n, ...) or choices; with a design, a range or a distribution.
 Values: TypeAlias = "Distribution | State | Numbers | Sequence[AxisChoice]"
 
 
 class Axis:
-    """The values of one quantity, and what it is the quantity of.
+    """The values of one axis, and the quantity that they set.
 
-    `values` are numbers (n, ...), one entry a value, or instances such as `[SVD(), Varga()]`; with a design a range (low, high)
-    or a frozen distribution of scipy.stats. `of` is the name of a parameter or of a setting, several names that all take the
-    value (tied), or a pure function (mechanism, value) -> mechanism; by default the axis's own name. Functions and parameters
-    are applied in the order of the axes. `units` are those of the value, where its name does not tell.
+    Functions and parameters are applied in the order of the axes.
 
     Args:
-        values: numbers, one entry a value; instances; with a design a range (low, high) or a distribution of scipy.stats.
-        of: the name of a parameter or a setting, several that take the same value, or (mechanism, value) -> mechanism; by default
-            the axis's own name.
-        units: of the values, where the name does not tell.
+        values: numbers (n, ...), one entry per value, or instances such as `[SVD(), Varga()]`; with a design, a range (low, high)
+            or a frozen distribution of scipy.stats.
+        of: the name of a parameter or a setting, several tied names that take the same value, or a pure function (mechanism,
+            value) -> mechanism; by default the axis's own name.
+        units: units of the values, if `of` does not determine them.
     """
 
     def __init__(self, values: Values, of: str | Sequence[str] | Setter | None = None, units: str | None = None):
@@ -73,7 +71,7 @@ class Axis:
 
 
 class Zipped(NamedTuple):
-    """Axes of equal length that advance together, along one dimension.
+    """Axes of equal length that vary together, along one dimension.
 
     Args:
         axes: an `Axis`, or its values, by name.
@@ -87,7 +85,7 @@ AxisValues: TypeAlias = "Axis | Zipped | Values"
 
 @dataclass(frozen=True, eq=False)
 class AxisColumn:
-    """An axis with its values laid out along a dimension."""
+    """An axis with its values along a dimension."""
 
     name: str
     values: np.ndarray | tuple[AxisChoice, ...]  # numbers (n, ...), or choices
@@ -114,18 +112,18 @@ class AxisColumn:
 
     @cached_property
     def computed(self) -> tuple[AxisChoice, ...]:
-        """The choices as programs take them: dense methods that machine code has as one of several, by its number."""
+        """The choices as inputs of programs: dense methods are replaced by a `OneOf`, selected by its number."""
         return one_of_several(self.choices) if self.setting == "method" else self.choices
 
     @property
     def setting(self) -> str:
-        """The setting that its choices are of."""
+        """The setting that the choices set."""
         assert self.is_choice and not callable(self.of)
         return self.of[0]
 
     @property
     def coordinate(self) -> np.ndarray:
-        """The values as a dataset shows them: numbers, or labels."""
+        """The values as written in a dataset: numbers, or labels."""
         if not self.is_choice:
             return self.numbers
         if self.of == ("max_steps",):
@@ -135,7 +133,7 @@ class AxisColumn:
 
 @dataclass(frozen=True, eq=False)
 class Dimension:
-    """A dimension of the sweep, and the axes that advance along it."""
+    """A dimension of the sweep, and the axes that vary along it."""
 
     name: str
     size: int
@@ -143,7 +141,7 @@ class Dimension:
 
 
 def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
-    """Return readable, unique names of choices: their types; where these are the same, with their numbers."""
+    """Return readable, unique names of choices: their types, with their numbers if the types are equal."""
     plain = [_plain(setting, choice) for choice in choices]
     names = [name if plain.count(name) == 1 else _full(name, choice) for name, choice in zip(plain, choices, strict=True)]
     return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
@@ -156,20 +154,20 @@ def _plain(setting: str, choice: AxisChoice) -> str:
 
 
 def _full(name: str, choice: AxisChoice) -> str:
-    """Return the type of a choice with its numbers."""
+    """Return the name of a choice with its scalar fields."""
     numbers = {key: value for key, value in getattr(choice, "__dict__", {}).items() if eqx.is_array(value) and value.ndim == 0}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
 
 
 def structure_of(choice: PyTree) -> Hashable:
-    """Return everything of a choice but the values of its numbers: choices of one structure share a program."""
+    """Return the structure of a choice, without the values of its numbers: choices of the same structure share a program."""
     arrays, rest = eqx.partition(choice, eqx.is_array)
     leaves, tree = jax.tree.flatten(rest)
     return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), tree, tuple(leaves)
 
 
 def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:
-    """Return methods with dense ones of machine code replaced by a `OneOf` of all their kinds, so that they share a structure."""
+    """Return methods with the compilable dense ones replaced by a `OneOf` of all their kinds, so that they share a structure."""
     dense: dict[int, Dense] = {}
     for k, method in enumerate(methods):
         if isinstance(method, Dense) and not isinstance(method, Auto | Elimination | OneOf) and not reason_for_plain(method):
@@ -185,16 +183,16 @@ def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:
     return tuple(found)
 
 
-# --- designs: members spread over ranges, instead of all combinations of values
+# --- designs: members sampled from ranges, instead of all combinations of values
 
 
 @dataclass(frozen=True)
 class SweepDesign(abc.ABC):
-    """`n` members in the ranges of the axes; the same `seed` gives the same members.
+    """A sample of `n` members from the ranges of the axes; the same `seed` gives the same members.
 
     Args:
         n: number of members.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
     """
 
     n: int
@@ -206,11 +204,11 @@ class SweepDesign(abc.ABC):
 
     @abc.abstractmethod
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
-        """Points of the unit cube."""
+        """Return points of the unit cube."""
 
 
 class Sobol(SweepDesign):
-    """A scrambled Sobol sequence: it fills the ranges most evenly where `n` is a power of two."""
+    """A scrambled Sobol sequence, which fills the ranges most evenly if `n` is a power of two."""
 
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
         from scipy.stats import qmc
@@ -221,7 +219,7 @@ class Sobol(SweepDesign):
 
 
 class LatinHypercube(SweepDesign):
-    """Each axis is cut into `n` parts of equal probability, with one member in each."""
+    """A Latin hypercube: each axis is divided into `n` parts of equal probability, with one member in each."""
 
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
         from scipy.stats import qmc
@@ -237,7 +235,7 @@ class Random(SweepDesign):
 
 
 def scale_to_range(values: Values, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
-    """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None: it is neither."""
+    """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None if it is neither."""
     if hasattr(values, "ppf"):
         return np.asarray(cast(Distribution, values).ppf(unit), float)
     ends = np.asarray(cast(Numbers, values), float)

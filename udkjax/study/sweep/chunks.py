@@ -1,7 +1,6 @@
-"""Chunks of a sweep: members of one group that take a few seconds together, by what a first chunk of the group took.
+"""Chunks of a sweep: members of one group that take a few seconds together, as estimated from a first chunk of the group.
 
-Members come in the order of the steps that they are expected to take, the longest first: the end, where devices wait for the
-last chunk, is short.
+Members are sorted by their expected number of steps, the longest first, so that devices wait only briefly for the last chunk.
 """
 
 import sys
@@ -18,13 +17,13 @@ from udkjax.study.sweep.executors import Done, Executor, run
 from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 
-MEMORY = 2**30  # bytes that members in computation take at most, by default
-CHUNK_COPIES = 4  # of what is stored of a chunk, in memory while it is computed: parts on the device, joined, of other chunks
-CHUNK_SECONDS = 2.0  # of work in a chunk, roughly: bounds the loss by an interruption, and the time between two signs of progress
-CHUNKS_FOR_EACH = 4  # chunks for each that computes at a time, so that all have something to do to the end
-SHORTEST_CHUNK = 0.05  # s of work in a chunk for that: to call a program and to store what it gave takes a few hundredths of it
-MOST_TRIED_GROUPS = 3  # groups timed to estimate a cost; others are taken to be as fast, on average
-# Steps that a run takes grow by this power of the reciprocal of its tolerances, about: by methods of 8th order, rtol and atol.
+MEMORY = 2**30  # default limit of the memory of members in computation (bytes)
+CHUNK_COPIES = 4  # copies of a chunk's stored variables in memory while it is computed: on the device, joined, of other chunks
+CHUNK_SECONDS = 2.0  # approximate work in a chunk (s): bounds the loss by an interruption, and the time between progress reports
+CHUNKS_FOR_EACH = 4  # chunks per device or core, so that all are busy to the end
+SHORTEST_CHUNK = 0.05  # s of work in a chunk: calling a program and storing its results takes a few hundredths of it
+MOST_TRIED_GROUPS = 3  # groups timed to estimate a cost; the others are assumed to be as fast on average
+# The number of steps grows approximately as this power of the reciprocal of rtol, and of atol, for methods of 8th order.
 TOLERANCE_POWER = 1 / 16
 
 
@@ -35,9 +34,9 @@ def compute_members(
     memory: int = MEMORY,
     expect: Callable[[Sequence[Chunk]], None] = lambda chunks: None,
 ) -> Iterator[Done]:
-    """Compute the members that are not done: a piece or a few of each group, then chunks as long as these suggest.
+    """Compute the members that are not done: a few pieces of each group, then chunks sized by the time that these took.
 
-    `expect` is called with the chunks that are left after the first ones, whose `work` is in seconds.
+    `expect` is called with the chunks after the first ones, with their `work` in seconds.
     """
     orders = members_to_compute(plan, done)
     measured = []
@@ -52,7 +51,7 @@ def compute_members(
 
 
 def members_to_compute(plan: SweepPlan, done: Int[np.ndarray, "n"] | Sequence[int] = ()) -> dict[int, np.ndarray]:
-    """Return the members of each group that are not done, the longest first; no group that has none."""
+    """Return the members of each group that are not done, the longest runs first; finished groups are omitted."""
     found = {}
     for group in plan.groups:
         members = group.members[~np.isin(group.members, done)]
@@ -62,7 +61,7 @@ def members_to_compute(plan: SweepPlan, done: Int[np.ndarray, "n"] | Sequence[in
 
 
 def first_chunks(plan: SweepPlan, orders: Mapping[int, np.ndarray]) -> list[Chunk]:
-    """Return chunks of one piece that tell how long the members of each group take: as many as are computed at a time."""
+    """Return chunks of one piece to measure the speed of each group, as many as are computed concurrently."""
     found: list[Chunk] = []
     for index, members in orders.items():
         piece = group_run(plan, index).program.size
@@ -75,9 +74,9 @@ def first_chunks(plan: SweepPlan, orders: Mapping[int, np.ndarray]) -> list[Chun
 def cut_chunks(
     plan: SweepPlan, orders: Mapping[int, np.ndarray], measured: Sequence[tuple[Chunk, float]], memory: int = MEMORY
 ) -> list[Chunk]:
-    """Cut members of each group, in their order, into chunks of a few seconds of work and of at most `memory` bytes.
+    """Cut the members of each group, in order, into chunks of a few seconds of work and at most `memory` bytes.
 
-    `measured` are chunks of which it is known how long they took (s); groups without one are taken to be as fast as the others.
+    `measured` are finished chunks with the time they took (s); groups without one are assumed to be as fast as the others.
     """
     most = max(1, memory // (CHUNK_COPIES * max(1, bytes_per_member(plan))))
     pace = {index: [seconds / chunk.work for chunk, seconds in measured if chunk.group == index] for index in orders}
@@ -94,7 +93,7 @@ def cut_chunks(
 
 
 def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = CHUNK_SECONDS) -> list[slice]:
-    """Cut members into consecutive parts of whole pieces, each of at most `limit` seconds and of at most so many members."""
+    """Cut members into consecutive parts of whole pieces, each of at most `limit` seconds and `most` members."""
     most = max(piece, most // piece * piece)
     parts, start = [], 0
     total = np.concatenate([[0.0], np.cumsum(seconds)])
@@ -112,7 +111,7 @@ def _chunk(plan: SweepPlan, index: int, group: int, members: np.ndarray) -> Chun
 
 
 def expected_steps(plan: SweepPlan, members: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Estimate the steps of members, up to a common factor: by the length of their runs, and a little by their tolerances."""
+    """Estimate the number of steps of members, up to a common factor, from the duration of their runs and their tolerances."""
     places, steps = plan.places(members), np.ones(len(members))
     for column in plan.columns:
         if not column.is_choice and not callable(column.of):
@@ -133,16 +132,16 @@ class SweepCost:
 
     members: int
     groups: int  # programs, each compiled once
-    tried: int  # of these, of which a first chunk was run
+    tried: int  # groups of which a first chunk was run
     chunks: int
-    stored: int  # bytes of the dataset, and roughly of the files
-    memory: int  # bytes of this process, at most
-    compiling: float  # s; less where programs are in the cache
+    stored: int  # bytes of the dataset, and approximately of the files
+    memory: int  # peak memory of this process (bytes)
+    compiling: float  # s; less if programs are in the cache
     computing: float  # s
 
 
 def estimate_cost(plan: SweepPlan, memory: int = MEMORY) -> SweepCost:
-    """Compile and run a piece of some groups of a plan, and say what all of it will take."""
+    """Estimate the cost of a plan by compiling and running a piece of some of its groups."""
     orders, compiling, measured = members_to_compute(plan), [], []
     count = len(plan.groups)
     for k in np.unique(np.linspace(0, count - 1, min(count, MOST_TRIED_GROUPS)).astype(int)).tolist():
@@ -160,7 +159,7 @@ def estimate_cost(plan: SweepPlan, memory: int = MEMORY) -> SweepCost:
 
 
 def _resident() -> int:
-    """Return the most memory that this process has used so far, in bytes; 0 where it cannot be known."""
+    """Return the peak memory of this process so far (bytes); 0 if it is unknown."""
     try:
         import resource
     except ImportError:  # Windows

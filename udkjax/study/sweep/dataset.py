@@ -20,21 +20,21 @@ from udkjax.study.sweep.plan import Group, StoredVariable, SweepPlan
 if TYPE_CHECKING:
     import xarray
 
-# Values, or dimensions with the values along them, and attributes: as xarray takes them.
+# Values, or dimensions, values and attributes, as accepted by xarray.
 Labelled: TypeAlias = "np.ndarray | list[str] | tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]"
 FORMAT = "udkjax sweep 1"
 LABELS = {
-    RESULT: Label((), "1", "how the run ended"),
-    END: Label((), "s", "time that was reached"),
-    STEPS: Label((), "1", "steps tried"),
+    RESULT: Label((), "1", "result of the run"),
+    END: Label((), "s", "time reached by the run"),
+    STEPS: Label((), "1", "attempted steps"),
 }
-NOT_COMPUTED = -1  # the result of a member that is not among what is finished
+NOT_COMPUTED = -1  # the result of an unfinished member
 
 
 def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
-    """Return the variables that are stored of each member of a group."""
+    """Return the variables that are stored for each member of a group."""
     bodies, found = len(plan.mechanism_of(group).body_names), {}
-    known = {name: label for measure in plan.measures for name, label in measure.labels.items()} | LABELS
+    labels = {name: label for measure in plan.measures for name, label in measure.labels.items()} | LABELS
     outputs = group_run(plan, group.index).outputs
     slopes = {f"d_{of}_d_{by}": (of, by) for of in outputs for by in plan.derivatives}
     for name, info in outputs.items():
@@ -42,13 +42,13 @@ def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
             of, by = slopes[name]
             label = Label(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
         else:
-            label = known.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
+            label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
         found[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
     return found
 
 
 def _per(units: str, by: str, plan: SweepPlan) -> str:
-    """Return the unit of a derivative; an empty text where it has none."""
+    """Return the unit of a derivative; empty if it is unknown."""
     below = next((column.units for column in plan.columns if column.name == by), None)
     below = units_of(plan.mechanism, by) if below is None else below
     return "" if not units or not below or "," in units else f"{units}/({below})"
@@ -56,9 +56,9 @@ def _per(units: str, by: str, plan: SweepPlan) -> str:
 
 @lru_cache(maxsize=8)
 def variables_of(plan: SweepPlan) -> Mapping[str, StoredVariable]:
-    """Return the variables that are stored of each member. `result`, `end_time` and `steps` are always among them.
+    """Return the variables that are stored for each member, always including `result`, `end_time` and `steps`.
 
-    Where mechanisms have other bodies, the dimension "body" has all of them, and any other is as long as the longest.
+    If mechanisms have different bodies, the dimension "body" has all of them, and any other dimension has the largest size.
     """
     found: dict[str, StoredVariable] = {}
     for group in plan.groups:
@@ -78,9 +78,9 @@ def bytes_per_member(plan: SweepPlan) -> int:
 
 
 def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
-    """Return the xarray Dataset of a plan, from (members, what was stored of them) in any order.
+    """Return the xarray Dataset of a plan from (members, their stored variables) in any order.
 
-    Other members are not a number, and have the result -1.
+    Unfinished members are NaN, with result -1.
     """
     import xarray
 
@@ -115,7 +115,7 @@ def _fill_value(name: str, variable: StoredVariable) -> float | int | bool:
 def _put(
     into: np.ndarray, variable: StoredVariable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None
 ) -> None:
-    """Write the values of members; those of bodies in their places among all bodies."""
+    """Write the values of members; values of bodies go to their places among all bodies."""
     if "body" in variable.dims and places is not None:
         axis = variable.dims.index("body")
         for k, place in enumerate(places):
@@ -125,14 +125,14 @@ def _put(
 
 
 def _places(plan: SweepPlan) -> dict[int, list[int]]:
-    """Return for each group the places of its bodies among all bodies, where it has not all of them."""
+    """Return the places of a group's bodies among all bodies, for groups that do not have all of them."""
     everyone = list(plan.bodies)
     own = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in own.items() if names != everyone}
 
 
 def _coordinates(plan: SweepPlan) -> dict[str, Labelled]:
-    """Return the values of axes along their dimensions; times, bodies and coordinates where a variable lies along them."""
+    """Return the values of axes along their dimensions; and times, bodies and coordinates if a variable has that dimension."""
     found: dict[str, Labelled] = {}
     for dimension in plan.dimensions:
         for column in dimension.columns:
@@ -141,7 +141,7 @@ def _coordinates(plan: SweepPlan) -> dict[str, Labelled]:
     if "time" in along:
         scaled = any(not callable(column.of) and "t1" in column.of for column in plan.columns)
         fractions = (plan.ts - plan.ts[0]) / (plan.ts[-1] - plan.ts[0])
-        part = "time", fractions, {"units": "1", "long_name": "part of the span from the start to t1"}
+        part = "time", fractions, {"units": "1", "long_name": "fraction of the span from the start to t1"}
         found["time"] = part if scaled else ("time", plan.ts, {"units": "s"})
     if "body" in along:
         found["body"] = list(plan.bodies)

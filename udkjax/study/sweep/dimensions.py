@@ -1,4 +1,4 @@
-"""From axes as a user writes them to the dimensions of a sweep; every mistake is named, all at once."""
+"""From axes as given by users to the dimensions of a sweep; all mistakes are reported together."""
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
@@ -31,14 +31,14 @@ from udkjax.study.sweep.axes import (
     scale_to_range,
 )
 
-Settings: TypeAlias = Mapping[str, Any]  # arguments of `simulate`, of as many types as it has
+Settings: TypeAlias = Mapping[str, Any]  # arguments of `simulate`
 MEMBER = "member"  # the dimension of a design
-# Names of the dimensions of what is stored, which a dimension of the sweep cannot have.
+# Dimensions and variables of the dataset, whose names a dimension of the sweep cannot have.
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 
 
 class SweepError(Mistakes):
-    """A sweep cannot be what it says. `problems` lists every mistake.
+    """The arguments of a sweep are invalid. `problems` lists every mistake.
 
     Attributes:
         problems: every mistake, each with its place.
@@ -49,7 +49,11 @@ class SweepError(Mistakes):
 
 
 def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepDesign | None = None) -> tuple[Dimension, ...]:
-    """Return the dimensions of a sweep over `axes`. Raises `SweepError`."""
+    """Return the dimensions of a sweep over `axes`.
+
+    Raises:
+        SweepError: lists every mistake.
+    """
     problems: list[str] = []
     ranges = [name for name, given in axes.items() if design is not None and not isinstance(given, Zipped) and _is_range(given)]
     unit = dict(zip(ranges, design.unit(len(ranges)).T, strict=True)) if design is not None and ranges else {}
@@ -67,7 +71,7 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepD
         columns = tuple(column for column in columns if column is not None)
         sizes = {column.name: len(column.values) for column in columns}
         if len(set(sizes.values())) > 1:
-            problems.append(f"{name}: axes that advance together have as many values each, but these have {sizes}")
+            problems.append(f"{name}: zipped axes must have equally many values, but have {sizes}")
         if name in TAKEN or (name == MEMBER and unit):
             problems.append(
                 f"axis {quote(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
@@ -83,7 +87,7 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepD
 
 
 def _is_range(given: "Axis | Values") -> bool:
-    """Return whether a design fills this axis: all but choices."""
+    """Return True if a design samples this axis, that is, unless it is one of choices."""
     values = given.values if isinstance(given, Axis) else given
     return hasattr(values, "ppf") or _numbers(values) is not None
 
@@ -91,8 +95,8 @@ def _is_range(given: "Axis | Values") -> bool:
 def _column(
     mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]
 ) -> AxisColumn | None:
-    """Lay out one axis; None: its mistake is among the problems."""
-    assert not isinstance(given, Zipped), "its axes come one by one"
+    """Return the values of one axis; None if they are invalid, with the mistake added to `problems`."""
+    assert not isinstance(given, Zipped), "zipped axes are passed one by one"
     axis = given if isinstance(given, Axis) else Axis(given)
     of = (name,) if axis.of is None else axis.of
     before = len(problems)
@@ -100,7 +104,7 @@ def _column(
         problems += _unknown_targets(mechanism, name, of)
     values = axis.values if unit is None else scale_to_range(axis.values, unit)
     if values is None:
-        problems.append(f"axis {quote(name)}: with a design its values are a range (low, high), or a frozen distribution")
+        problems.append(f"axis {quote(name)}: with a design, values must be a range (low, high) or a frozen distribution")
     elif hasattr(values, "ppf"):
         problems.append(f"axis {quote(name)}: a distribution needs a design to draw from it, such as design=Sobol(1024)")
     elif not isinstance(values, Sized) or len(values) == 0:
@@ -111,7 +115,7 @@ def _column(
         return _choices(name, of, values, problems)
     numbers = _numbers(values)
     if numbers is None or not np.all(np.isfinite(numbers)):
-        problems.append(f"axis {quote(name)}: must be finite numbers, one entry a value, is {abbreviate(values)}")
+        problems.append(f"axis {quote(name)}: must be finite numbers, one entry per value, is {abbreviate(values)}")
         return None
     if not callable(of):
         problems += _misfits(mechanism, name, of, numbers)
@@ -121,7 +125,7 @@ def _column(
 
 def _choices(name: str, of: tuple[str, ...], values: Values, problems: list[str]) -> AxisColumn | None:
     if len(of) != 1:
-        problems.append(f"axis {quote(name)}: choices cannot be tied, but it is of {', '.join(map(quote, of))}; zip them instead")
+        problems.append(f"axis {quote(name)}: choices cannot be tied, but it sets {', '.join(map(quote, of))}; zip them instead")
         return None
     if of == ("state",) and isinstance(values, State):
         choices: tuple[AxisChoice, ...] = _states(values)
@@ -147,22 +151,22 @@ def _numbers(values: Values) -> np.ndarray | None:
 
 
 def _unknown_targets(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str]:
-    known = parameters_of(mechanism)
+    parameters = parameters_of(mechanism)
     for target in of:
-        if target not in NUMBERS and target not in CHOICES and split_index(target, known)[0] not in known:
-            near = suggestion(target, (*known, *NUMBERS, *CHOICES)) or _suggest_ending(target, known)
-            yield f"axis {quote(name)}: {quote(target)} is no parameter of the mechanism, nor a setting{near}"
+        if target not in NUMBERS and target not in CHOICES and split_index(target, parameters)[0] not in parameters:
+            near = suggestion(target, (*parameters, *NUMBERS, *CHOICES)) or _suggest_ending(target, parameters)
+            yield f"axis {quote(name)}: {quote(target)} is neither a parameter of the mechanism nor a setting{near}"
 
 
-def _suggest_ending(target: str, known: Iterable[str]) -> str:
-    """Suggest a parameter that ends as the name does: `mass` may stand for many."""
-    last = {full.rpartition(".")[2]: full for full in known}
+def _suggest_ending(target: str, parameters: Iterable[str]) -> str:
+    """Suggest a parameter whose last part is similar: `body.a.mass` for `mass`."""
+    last = {full.rpartition(".")[2]: full for full in parameters}
     close = difflib.get_close_matches(target, last, n=1)
     return f"; did you mean {quote(last[close[0]])}?" if close else ""
 
 
 def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
-    """Iterate over values that the mechanism refuses, for their shape or a requirement."""
+    """Iterate over mistakes of values that violate the shape or a requirement of a parameter or setting."""
     parameters = [target for target in of if target not in NUMBERS]
     if parameters:
         for value in (numbers.min(axis=0), numbers.max(axis=0)):
@@ -184,7 +188,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
     for dimension in dimensions:
         for column in dimension.columns:
             if column.name in names or (column.name != dimension.name and column.name in {d.name for d in dimensions}):
-                yield f"axis {quote(column.name)} is there twice"
+                yield f"axis {quote(column.name)} is given twice"
             names[column.name] = None
             for target in () if callable(column.of) else column.of:
                 if target in owner:
@@ -193,7 +197,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
 
 
 def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
-    """Return the mistakes of axes of settings: values of no use, settings given twice, gains that no choice has."""
+    """Return the mistakes of axes of settings: invalid values, settings given twice, gains that the choices do not have."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
@@ -206,7 +210,7 @@ def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settin
     def all_are(setting: str, kind: type | UnionType, wanted: str, cure: str) -> Iterator[str]:
         choices = targets[setting].values if setting in targets else (settings.get(setting),)
         if wanted in targets and not all(isinstance(choice, kind) for choice in choices):
-            yield f"axis {quote(targets[wanted].name)}: {wanted} is a number of {cure}, which not all members have"
+            yield f"axis {quote(targets[wanted].name)}: {wanted} belongs to {cure}, which not all members have"
 
     for gain in ("alpha", "beta"):
         problems += all_are("stabilization", Baumgarte, gain, "stabilization=Baumgarte()")
@@ -217,16 +221,16 @@ def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settin
 def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
     """Return the mistakes in the names of derivatives."""
     columns = {column.name: column for dimension in dimensions for column in dimension.columns}
-    known, problems = parameters_of(mechanism), []
+    parameters, problems = parameters_of(mechanism), []
     for name in names:
         if name in columns:
             if columns[name].is_choice or columns[name].numbers.ndim > 1:
-                problems.append(f"derivatives: axis {quote(name)} is not one of plain numbers")
+                problems.append(f"derivatives: the values of axis {quote(name)} are not single numbers")
             continue
-        owner, index = split_index(name, known)
-        if owner not in known:
-            near = suggestion(name, (*known, *columns))
-            problems.append(f"derivatives: {quote(name)} is no parameter of the mechanism, nor an axis{near}")
-        elif known[owner].value is None or np.ndim(jax.eval_shape(lambda v, i=index: v[i], known[owner].value)):
-            problems.append(f"derivatives: {quote(name)} is not one number; name an entry, such as {quote(name + '[0]')}")
+        owner, index = split_index(name, parameters)
+        if owner not in parameters:
+            near = suggestion(name, (*parameters, *columns))
+            problems.append(f"derivatives: {quote(name)} is neither a parameter of the mechanism nor an axis{near}")
+        elif parameters[owner].value is None or np.ndim(jax.eval_shape(lambda v, i=index: v[i], parameters[owner].value)):
+            problems.append(f"derivatives: {quote(name)} is not a single number; name an entry, such as {quote(name + '[0]')}")
     return problems

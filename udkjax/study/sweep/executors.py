@@ -1,4 +1,4 @@
-"""Compute the chunks of a sweep: on this machine's devices or cores, or by the workers of dask.distributed."""
+"""Computation of the chunks of a sweep: on this machine's devices or cores, or by the workers of dask.distributed."""
 
 import time
 from collections import deque
@@ -20,18 +20,18 @@ from udkjax.study.sweep.plan import Chunk, SweepPlan
 if TYPE_CHECKING:
     import distributed
 
-Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, what it gave, and how long that took (s)
-Executor: TypeAlias = Callable[[SweepPlan, Sequence[Chunk]], Generator[Done, None, None]]  # hands over chunks as they are done
+Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, its stored variables, and the time it took (s)
+Executor: TypeAlias = Callable[[SweepPlan, Sequence[Chunk]], Generator[Done, None, None]]  # yields chunks as they finish
 
-CHUNK_RETRIES = 2  # of a chunk that raised: on another worker there may be memory, or room on the disk
-TASKS_AHEAD = 2  # tasks for each thread of the cluster, so that none waits for the next; more would only fill the workers' memory
-LEAST_TASKS = 16  # tasks, so that a cluster that grows by what is asked of it sees that something is
+CHUNK_RETRIES = 2  # retries of a chunk that raised: another worker may have enough memory, or space on the disk
+TASKS_AHEAD = 2  # tasks per thread of the cluster, so that every thread is busy; more would only fill the workers' memory
+LEAST_TASKS = 16  # tasks, so that an adaptive cluster sees demand
 
 
 def run(plan: SweepPlan, chunk: Chunk) -> Done:
-    """Compute the members of a chunk: each stored variable (members, ...), with "result". A failing member has a code, and NaN.
+    """Compute the stored variables (members, ...) of a chunk. A failed member has its code in "result", and NaN elsewhere.
 
-    Where a member's numbers made rows independent that the mechanism leaves out as redundant, it is run again without them.
+    A member whose numbers make other rows redundant than those of the group's mechanism is run again with its own.
     """
     group = group_run(plan, chunk.group)
     group.compile()  # compiling is not counted
@@ -45,7 +45,7 @@ def run(plan: SweepPlan, chunk: Chunk) -> Done:
 
 
 def _other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Find members that drifted, although they were projected, as other rows of theirs are redundant: by these rows."""
+    """Return members that drifted despite projection because other rows are redundant in them, by these rows."""
     found: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
         own = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
@@ -59,7 +59,7 @@ def _other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarr
 
 
 def compute_on_devices(plan: SweepPlan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
-    """Compute chunks, and hand each over when it is done."""
+    """Compute chunks, and yield each when it is finished."""
     waiting, width = deque(chunks), concurrent_chunks()
     with ThreadPoolExecutor(width, thread_name_prefix="sweep") as pool:
         running = set()
@@ -76,15 +76,18 @@ def compute_on_devices(plan: SweepPlan, chunks: Sequence[Chunk]) -> Generator[Do
 
 
 class ClusterError(RuntimeError):
-    """A cluster cannot do a sweep."""
+    """A cluster cannot compute a sweep."""
 
 
 def dask_engine(client: "distributed.Client | None" = None) -> Executor:
-    """Return the engine on the workers of a `distributed.Client`; without one, the client that was made last.
+    """Return the engine on the workers of a `distributed.Client`, by default the one created last.
 
-    Workers may come and go: another one computes what a lost one had not delivered. Each result is handed over when it
-    arrives, and stored nowhere else. Raises `ClusterError` where there is no client, where a worker has
-    other versions of the packages that decide the results, and where workers die time and again over one chunk.
+    Workers may come and go: unfinished chunks of a lost worker are computed by another. Each result is yielded when it arrives,
+    and is not kept on the cluster.
+
+    Raises:
+        ClusterError: there is no client, a worker has other versions of the packages that determine the results, or a chunk
+            killed several workers.
     """
     with OptionalImport():
         import distributed
@@ -93,13 +96,13 @@ def dask_engine(client: "distributed.Client | None" = None) -> Executor:
             client = distributed.default_client()
         except ValueError:
             raise ClusterError(
-                "the engine 'dask' needs a client: client=distributed.Client(address), or a Client() made before, whose worker "
-                'processes are on this machine (in a script: below `if __name__ == "__main__":`)'
+                "the engine 'dask' needs a client: client=distributed.Client(address), or create a Client() first for workers on "
+                'this machine (in a script: below `if __name__ == "__main__":`)'
             ) from None
 
     def engine(plan: SweepPlan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
         wanted = _deciding_versions()
-        # Not scattered: data that was scattered is gone with the worker that held it, what a task returned is made again.
+        # A task, not scattered data: scattered data is lost with its worker, while the result of a task is computed again.
         shared = client.submit(_same, plan, pure=False)
         waiting, running, results = deque(chunks), {}, distributed.as_completed()
 
@@ -119,8 +122,8 @@ def dask_engine(client: "distributed.Client | None" = None) -> Executor:
                     done = future.result()
                 except distributed.KilledWorker as error:
                     raise ClusterError(
-                        f"chunk {chunk.index} ({len(chunk.members)} members) was being computed by several workers that died; "
-                        f"they may be short of memory: give them more, or a smaller `memory` to the sweep ({error})"
+                        f"several workers died while computing chunk {chunk.index} ({len(chunk.members)} members), perhaps for "
+                        f"lack of memory: give them more, or give the sweep a smaller `memory` ({error})"
                     ) from error
                 del running[future.key]
                 future.release()
@@ -134,7 +137,7 @@ def dask_engine(client: "distributed.Client | None" = None) -> Executor:
 
 @contextmanager
 def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]:
-    """Start a client of the scheduler at this address; without one, of a process for each core, which end with the client."""
+    """Start a client of the scheduler at an address, or of one worker process per core, which end with the client."""
     with OptionalImport():
         import distributed
     cluster = {"n_workers": cores(), "threads_per_worker": 1, "dashboard_address": ":0"}
@@ -142,7 +145,7 @@ def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]
         try:
             client = distributed.Client(where)
         except (OSError, ValueError) as error:
-            raise ClusterError(f"no scheduler of dask answers at {scheduler}: {error}") from error
+            raise ClusterError(f"no dask scheduler answers at {scheduler}: {error}") from error
         with client:
             yield client
 
@@ -152,10 +155,9 @@ def _same(plan: SweepPlan) -> SweepPlan:
 
 
 def _run(plan: SweepPlan, chunk: Chunk, wanted: dict[str, str]) -> Done:
-    """Compute a chunk on a worker."""
     if (found := _deciding_versions()) != wanted:
         differing = ", ".join(f"{name} {found[name]} instead of {wanted[name]}" for name in wanted if found[name] != wanted[name])
-        raise ClusterError(f"a worker has other versions of what decides the results: {differing}")
+        raise ClusterError(f"a worker has other versions of packages that determine the results: {differing}")
     return run(plan, chunk)
 
 

@@ -1,4 +1,4 @@
-"""The fingerprint of a sweep: all that decides its results, as JSON; and the differences of two of them, in words."""
+"""The fingerprint of a sweep: all inputs that determine its results, as JSON; and the differences of two, in words."""
 
 import difflib
 import hashlib
@@ -20,13 +20,13 @@ from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import SweepPlan
 
 JsonValue: TypeAlias = "str | int | float | bool | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
-MOST_LINES = 24  # on differences; more are counted
-MOST_NUMBERS = 64  # numbers that are spelled out; of more, how many, the first, the last, and a digest
+MOST_LINES = 24  # lines on differences; further ones are counted
+MOST_NUMBERS = 64  # largest array written in full; larger ones by their shape, first and last number, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
 
 def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
-    """Return everything that two plans of the same results have in common."""
+    """Return all inputs that determine the results: plans with equal ones have the same results."""
     return {
         **_mechanism(plan.mechanism),
         "axes": {dimension.name: {c.name: _axis(plan, c) for c in dimension.columns} for dimension in plan.dimensions},
@@ -58,7 +58,7 @@ def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
 
 
 def _solution(plan: SweepPlan) -> Solution:
-    """Return a solution of the right shapes."""
+    """Return a solution with the right shapes, for tracing."""
     number, states = np.zeros(()), np.zeros((len(plan.ts), len(plan.mechanism.body_names), 3))
     count = np.zeros((), int)
     stats = dict.fromkeys(STATS, count)
@@ -66,7 +66,7 @@ def _solution(plan: SweepPlan) -> Solution:
 
 
 def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
-    """Describe a function by what it computes: its name, and digests of its operations and of the numbers in them."""
+    """Describe a function by its name, and digests of its traced operations and constants."""
     program = eqx.filter_make_jaxpr(function)(*arguments)[0]
     text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
     constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
@@ -114,27 +114,29 @@ def digest(content: bytes) -> str:
 
 
 def differences(before: JsonValue, now: JsonValue) -> list[str]:
-    """Return lines on what differs between two JSON values: the path, what was there, what is there now.
+    """Return a line for each difference between two JSON values: the path, the old value, and the new one.
 
-    Of texts of several lines, such as scenes, the lines that differ are shown.
+    Texts of several lines, such as scenes, are compared line by line.
     """
     old, new, found = dict(_leaves(before)), dict(_leaves(now)), []
     for path in {**old, **new}:
         a, b = old.get(path), new.get(path)
         if path not in new:
-            found.append(f"{path}: was {abbreviate(a)}, is no longer there")
+            found.append(f"{path}: was {abbreviate(a)}, is now missing")
         elif path not in old:
-            found.append(f"{path}: was not there, is {abbreviate(b)}")
+            found.append(f"{path}: was missing, is now {abbreviate(b)}")
         elif isinstance(a, str) and isinstance(b, str) and "\n" in a + b:
-            compared = list(difflib.unified_diff(a.splitlines(), b.splitlines(), lineterm="", n=0))[2:]  # the first name files
+            compared = list(difflib.unified_diff(a.splitlines(), b.splitlines(), lineterm="", n=0))[
+                2:
+            ]  # without the two lines of file names
             found += [f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}" for line in compared if line[0] != "@"]
-        elif json.dumps(a) != json.dumps(b):  # nan is equal to nan, and true is not 1
+        elif json.dumps(a) != json.dumps(b):  # as text, nan equals nan, and true differs from 1
             found.append(f"{path}: was {abbreviate(a)}, is {abbreviate(b)}")
     return found if len(found) <= MOST_LINES else [*found[:MOST_LINES], f"and {len(found) - MOST_LINES} more"]
 
 
 def _leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Iterate over the paths and values of what is neither a list nor a mapping in a JSON value, nor an empty one."""
+    """Iterate over the paths and values of a JSON value's scalars, and of its empty lists and mappings."""
     if isinstance(value, dict) and value:
         for key, part in value.items():
             yield from _leaves(part, f"{path}.{key}" if path else key)

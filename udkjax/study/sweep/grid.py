@@ -1,4 +1,4 @@
-"""Sweeps as TOML files: which values every axis takes, and what is stored. Read into the arguments of `udkjax.sweep`."""
+"""Sweeps as TOML files (grids): axes, settings and measures, read into the arguments of `udkjax.sweep`."""
 
 import math
 import os
@@ -25,13 +25,18 @@ SCALES = {"linear": np.linspace, "log": np.geomspace}
 
 
 class GridError(Mistakes):
-    """A file cannot be the grid of a sweep. `problems` lists every mistake, each with the path of the offending entry."""
+    """A grid file is invalid. `problems` lists every mistake, each with the path of the offending entry."""
 
     subject = "grid"
 
 
 def load_grid(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the arguments of `udkjax.sweep`, but for the mechanism, from a TOML file. Raises `GridError` or `OSError`."""
+    """Read the arguments of `udkjax.sweep`, except the mechanism, from a TOML file.
+
+    Raises:
+        GridError: the file is not a valid grid.
+        OSError: the file cannot be read.
+    """
     try:
         return loads_grid(Path(path).read_text(encoding="utf-8"), os.fspath(path))
     except UnicodeDecodeError as error:
@@ -39,7 +44,7 @@ def load_grid(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def loads_grid(text: str, source: str = "") -> dict[str, Any]:
-    """Read the arguments of `udkjax.sweep` from the text of a TOML file, as `load_grid` does."""
+    """Read the arguments of `udkjax.sweep` from the text of a TOML file: see `load_grid`."""
     given = parse_toml(text, source, GridError)
     reader = _GridReader("design" in given, Path(source).parent)
     arguments = reader.sweep(given)
@@ -49,10 +54,10 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
 
 
 class _GridReader:
-    """Reads the file of a sweep. A mistake becomes one of `problems`, and its value None or something empty.
+    """Reads a grid file. Mistakes are collected in `problems`; invalid values become None or empty.
 
-    `drawn`: members are drawn by a design, from ranges and distributions, instead of from lists of values. Other files are looked
-    for beside it, in `folder`.
+    If `drawn`, members are drawn by a design from ranges and distributions, not from lists of values. Paths of other files are
+    relative to `folder`.
     """
 
     def __init__(self, drawn: bool, folder: Path):
@@ -80,11 +85,11 @@ class _GridReader:
         return arguments
 
     def reference(self, given: Toml) -> np.ndarray | None:
-        """Read coordinates (T, bodies, 3) from the file of a simulation, such as `udkjax simulate` writes."""
+        """Read coordinates (T, bodies, 3) from a file written by `udkjax simulate`."""
         with OptionalImport():
             import xarray
         if not isinstance(given, str):
-            return self.wrong("reference", f"must be the name of a file that udkjax simulate wrote, is {abbreviate(given)}")
+            return self.wrong("reference", f"must be the name of a file written by udkjax simulate, is {abbreviate(given)}")
         try:
             with xarray.open_dataset(self.folder / given, engine="h5netcdf") as data:
                 return data["q"].transpose("time", "body", "coordinate").values
@@ -92,14 +97,14 @@ class _GridReader:
             return self.wrong("reference", f"{self.folder / given} has no coordinates q of a simulation ({error})")
 
     def times(self, given: TomlTable) -> np.ndarray | None:
-        """Read output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or the start and the end alone."""
+        """Read output times: `ts`, or from `t0` (0) to `t1` in steps of `dt`, or only the start and the end."""
         if "ts" in given:
             for key in ("t0", "t1", "dt"):
                 if key in given:
-                    self.wrong(key, "ts is given: leave one of them out")
+                    self.wrong(key, "ts is also given: leave one of them out")
             ts = self.numbers("ts", given["ts"])
             if ts is not None and (ts.ndim != 1 or len(ts) < 2 or not np.all(np.diff(ts) > 0)):
-                self.wrong("ts", f"must be at least two times (s), each later than the one before, is {abbreviate(given['ts'])}")
+                self.wrong("ts", f"must be at least two increasing times (s), is {abbreviate(given['ts'])}")
             return ts
         if "t1" not in given:
             return self.wrong("t1", "missing; write t1 = 10.0 (s), or ts = [...]")
@@ -115,10 +120,10 @@ class _GridReader:
             return None
         if not 0 < dt <= t1 - t0:
             return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, is {dt:g}")
-        return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # t1 itself too, where it is a multiple of dt up to rounding
+        return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # including t1 if it is a multiple of dt up to rounding
 
     def axis(self, place: str, name: str, given: Toml) -> Axis | Zipped:
-        """Read one axis: a list of values, or a table that says more."""
+        """Read one axis: a list of values, or a table."""
         if not isinstance(given, dict):
             return Axis(self.values(place, name, given))
         if "zipped" in given:
@@ -138,7 +143,7 @@ class _GridReader:
 
     def values(self, place: str, name: str, given: Toml) -> np.ndarray | list[Choice]:
         if not isinstance(given, list) or not given:
-            self.wrong(place, f"must be a list of values, or a table of from, to and num, is {abbreviate(given)}")
+            self.wrong(place, f"must be a list of values, or a table with from, to and num, is {abbreviate(given)}")
             return []
         if name not in CHOICES:
             numbers = self.numbers(place, given)
@@ -146,7 +151,7 @@ class _GridReader:
         return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
 
     def range(self, place: str, given: TomlTable) -> Values:
-        """Read a range: for a design its two ends, else the `num` numbers between them."""
+        """Read a range: its two ends for a design, otherwise `num` numbers between them."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
         self.check_keys(place, given, (*needed, "scale"))
         for key in needed:
@@ -158,7 +163,7 @@ class _GridReader:
         if scale not in SCALES:
             self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
         elif scale == "log" and low is not None and high is not None and min(low, high) <= 0:
-            self.wrong(place, "from and to must be positive where scale is log")
+            self.wrong(place, 'from and to must be positive if scale is "log"')
         elif low is not None and high is not None and num is not None:
             if not self.drawn:
                 return SCALES[scale](low, high, num)
@@ -166,13 +171,13 @@ class _GridReader:
         return ()
 
     def distribution(self, place: str, given: TomlTable) -> Values:
-        """Read a distribution of scipy.stats by its name and its numbers."""
+        """Read a distribution of scipy.stats by its name and arguments."""
         name, numbers = given["distribution"], {key: value for key, value in given.items() if key != "distribution"}
-        known = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
+        names = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
         if not self.drawn:
             self.wrong(f"{place}.distribution", "needs a [design] that draws from it")
-        elif not isinstance(name, str) or name not in known:
-            self.wrong(f"{place}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, known)}")
+        elif not isinstance(name, str) or name not in names:
+            self.wrong(f"{place}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, names)}")
         else:
             try:
                 return getattr(stats, name)(**numbers)
@@ -181,7 +186,7 @@ class _GridReader:
         return ()
 
     def of(self, place: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
-        """Read the targets of an axis: names, the length or the initial angle of bodies, or names with factors."""
+        """Read the target of an axis: names, the length or initial angle of bodies, or names with factors."""
         if given is None or isinstance(given, str):
             return given
         if isinstance(given, list):
@@ -221,18 +226,18 @@ class _GridReader:
     # --- single values
 
     def wrong(self, place: str, problem: str) -> None:
-        """Note a mistake."""
+        """Report a mistake."""
         self.problems.append(f"{place}: {problem}")
 
     def check_keys(self, place: str, given: TomlTable, expected: Iterable[str]) -> None:
-        """Note the keys of a table that are not expected."""
+        """Report unexpected keys of a table."""
         expected = tuple(expected)
         for key in given:
             if key not in expected:
                 self.wrong(f"{place}.{key_of(key)}" if place else key_of(key), unknown_key(key, expected))
 
     def choice(self, place: str, setting: str, given: Toml) -> Choice:
-        """Read one of the choices of a run."""
+        """Read a method, solver, stabilization or formulation."""
         try:
             return choice(setting, cast(str, given))
         except (TypeError, ValueError) as error:
@@ -265,11 +270,11 @@ class _GridReader:
         """Read a whole number."""
         if isinstance(given, int) and not isinstance(given, bool) and given >= least:
             return given
-        self.wrong(place, "missing" if given is None else f"must be a whole number from {least} on, is {abbreviate(given)}")
+        self.wrong(place, "missing" if given is None else f"must be a whole number, at least {least}, is {abbreviate(given)}")
         return None
 
     def numbers(self, place: str, given: Toml) -> np.ndarray | None:
-        """Read a list of finite numbers, or of such lists."""
+        """Read a list of finite numbers, which may be nested."""
         try:
             values = np.array(given)
         except ValueError:
@@ -281,5 +286,5 @@ class _GridReader:
 
 
 def key_of(name: str) -> str:
-    """Return a key as a TOML file shows it."""
+    """Return a key as written in a TOML file."""
     return name if name.replace("_", "").replace("-", "").isalnum() else quote(name)

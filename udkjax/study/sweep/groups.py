@@ -1,6 +1,6 @@
-"""The computation of the members of a group: from their places in the sweep to what is stored of them.
+"""The computation of the members of a group: from their indices in the sweep to their stored variables.
 
-Members of a group differ by numbers alone. These are arguments of its program: those that all members share, and those of each.
+Members of a group differ only in numbers, which are arguments of its program: those shared by all members, and those of each.
 """
 
 import dataclasses
@@ -27,23 +27,23 @@ from udkjax.scene.units import NUMBERS
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
 from udkjax.study.sweep.plan import SweepPlan, stack_choices
 
-RESULT, END, STEPS = "result", "end_time", "steps"  # stored of every member
-LANE_WIDTH = 8  # members: a piece has a multiple, of what the widest vector units hold
-DEVICE_PIECE = 4096  # members of a piece where a device takes them all at once
-LARGEST_PIECE = 8  # times `PIECE_MEMBERS` in a piece, at most: to call a program takes what ten of its members take
-LEAST_PIECES = 16  # pieces that a group has at least, before they get larger: so that all devices have something to do
-STRAIGHT_METHODS = (type(None), Auto, Elimination)  # methods that suit vector instructions also without machine code
+RESULT, END, STEPS = "result", "end_time", "steps"  # variables stored for every member
+LANE_WIDTH = 8  # members in the widest vector unit; the size of a piece is a multiple
+DEVICE_PIECE = 4096  # members of a piece on devices that compute a batch whole
+LARGEST_PIECE = 8  # times `PIECE_MEMBERS`: larger pieces save little, since calling a program takes as long as ten members
+LEAST_PIECES = 16  # pieces of a group before they become larger, so that all devices are busy
+STRAIGHT_METHODS = (type(None), Auto, Elimination)  # methods without branches, which suit vector lanes also without machine code
 
 
 class Shared(NamedTuple):
-    """The numbers that all members of a group share: those of settings, and the closed initial state, where that is one."""
+    """The numbers that all members of a group share: those of settings, and the closed initial state, if it is the same."""
 
     settings: Mapping[str, PyTree]
     closure: Closure | None
 
 
 class Own(NamedTuple):
-    """The numbers that members have of their own: of their choices by setting, of axes by name, and who they are."""
+    """The numbers of single members: of their choices by setting, of axes by name, and their indices."""
 
     choices: Mapping[str, PyTree]
     axes: Mapping[str, np.ndarray | Array]
@@ -51,7 +51,7 @@ class Own(NamedTuple):
 
 
 class GroupChoices(NamedTuple):
-    """The choices of an axis that occur in a group: their numbers, one behind the other, what they share, and their places."""
+    """The choices of an axis that occur in a group: their stacked numbers, their common static part, and their indices."""
 
     axis: str
     numbers: PyTree
@@ -60,7 +60,7 @@ class GroupChoices(NamedTuple):
 
 
 class GroupRun:
-    """The members of a group, and how they are computed; `redundant`: rows of Psi to leave out, where not the mechanism's."""
+    """The members of a group and their program; `redundant` are rows of Psi to leave out, by default the mechanism's."""
 
     def __init__(self, plan: SweepPlan, index: int, redundant: tuple[int, ...] | None = None):
         group = plan.groups[index]
@@ -80,7 +80,7 @@ class GroupRun:
         analysis = analyse(fixed["mechanism"])
         self.redundant = analysis.redundant_rows if redundant is None else redundant
         fixed["analysis"] = dataclasses.replace(analysis, redundant_rows=self.redundant)
-        if "mechanism" in self._own:  # each has scales of its own
+        if "mechanism" in self._own:  # each has its own scales
             own = self._own["mechanism"]
             column = next(column for column in plan.columns if column.name == own.axis)
             analyses = [analyse(cast(Mechanism, column.choices[k])) for k in own.places]
@@ -111,7 +111,7 @@ class GroupRun:
         )
 
     def own(self, members: Int[np.ndarray, "n"]) -> Own:
-        """Return the numbers of members, (n, ...) each."""
+        """Return the numbers of members, each (n, ...)."""
         places = self.plan.places(members)
         choices = {}
         for setting, given in self._own.items():
@@ -120,7 +120,7 @@ class GroupRun:
         return Own(choices, {column.name: column.numbers[places[column.name]] for column in self.numbers}, members)
 
     def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> Mechanism:
-        """Return the mechanism of one member. `shift` is added to what derivatives are taken by."""
+        """Return the mechanism of one member, with `shift` added to the numbers to differentiate by."""
         mechanism = self._setting("mechanism", shared, own)
         values: dict[str, np.ndarray | Array] = {}
         for column in self.numbers:
@@ -138,7 +138,7 @@ class GroupRun:
         return mechanism.with_parameters(parameters) if parameters else mechanism
 
     def settings(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> dict[str, PyTree]:
-        """Return the settings of one member, output times among them."""
+        """Return the settings of one member, including output times."""
         names = {*self._static, *self._own} - {"mechanism"}
         found = {name: self._setting(name, shared, own) for name in names}
         numbers = {
@@ -160,7 +160,7 @@ class GroupRun:
         return found | numbers | {"ts": ts}
 
     def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
-        """Return the stored variables of one member, with `shifts` (names,) added to the numbers that derivatives are by."""
+        """Return the stored variables of one member, with `shifts` (names,) added to the numbers to differentiate by."""
         shift = dict(zip(self.names, shifts, strict=True))
         mechanism = self.mechanism(shared, own, shift)
         closure, settings = self._closure(shared, own, mechanism), self.settings(shared, own, shift)
@@ -173,24 +173,24 @@ class GroupRun:
         return stored
 
     def compile(self) -> None:
-        """Compile the program, and put what members share on the devices, if that is not done yet."""
+        """Compile the program, and put the shared numbers on the devices, once."""
         if self._placed is None:
             self._placed = self.program.place(self.shared, self.own(self.members[:1]))
 
     def compute(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Compute members, in this order: what is stored of them, (n, ...) each."""
+        """Compute the stored variables of members, each (n, ...)."""
         self.compile()
         stored, slopes = self.program(self._placed, self.own(members))
         return stored | {name: slopes[of][..., k] for name, (of, k) in self._names_of_slopes(slopes).items()}
 
     @property
     def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """The shapes and types of what is stored of one member."""
+        """Shapes and types of the stored variables of one member."""
         stored, slopes = self.program.shapes(self.shared, self.own(self.members[:1]))
         return stored | {name: stored[of] for name, (of, _) in self._names_of_slopes(slopes).items()}
 
     def _names_of_slopes(self, slopes: Mapping[str, object]) -> dict[str, tuple[str, int]]:
-        """Return the names of derivatives: of which variable, by which of the names."""
+        """Return the variable and the index of the differentiation name of each derivative."""
         return {f"d_{of}_d_{by}": (of, k) for of in slopes if of != END for k, by in enumerate(self.names)}
 
     def _closure(self, shared: Shared, own: Own, mechanism: Mechanism) -> Closure | None:
@@ -209,7 +209,7 @@ def _with(choice: PyTree, name: str, value: np.ndarray | Array) -> PyTree:
 
 
 def _piece(members: int, in_lanes: bool, platform: str) -> int:
-    """Return the number of members that are computed at once on each device: in vector lanes, or one by one."""
+    """Return the number of members in a piece on each device: several in vector lanes, or one."""
     full = -(-members // LANE_WIDTH) * LANE_WIDTH
     if platform not in CHUNKED_PLATFORMS:
         return min(DEVICE_PIECE, full)
@@ -217,10 +217,10 @@ def _piece(members: int, in_lanes: bool, platform: str) -> int:
 
 
 def group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
-    """Return the program of the members of a group, compiled once for each process."""
+    """Return the program of the members of a group, compiled once per process."""
     return _group_run(plan, group, redundant)
 
 
 @lru_cache(maxsize=MOST_PROGRAMS)
 def _group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None) -> GroupRun:
-    return GroupRun(plan, group, redundant)  # the same one, in whatever way it is asked for
+    return GroupRun(plan, group, redundant)  # positional arguments, so that equal calls share one entry of the cache

@@ -1,4 +1,4 @@
-"""Measures: what is stored of each member, and nothing else is computed."""
+"""Measures: the variables stored for each member. Nothing else is computed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,14 +25,14 @@ from udkjax.study.sweep.dimensions import SweepError
 UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, NumberLike]])
 OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)
 MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure] | Mapping[str, OneMeasure])
-# Coordinates (T, bodies, 3) that runs are compared with, or a function (mechanism, ts) of them.
+# Coordinates (T, bodies, 3) to compare runs with, or a function of (mechanism, ts) that returns them.
 Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Mechanism, Array], Numbers] | None)
 
-RANK_NOT_REACHED = -1  # the rank at output times that a run has not reached
+RANK_NOT_REACHED = -1  # the rank at output times that a run did not reach
 
 
 class MeasuredRun(NamedTuple):
-    """A member that has been run, as a measure sees it."""
+    """The input of a measure: a completed run and its method."""
 
     mechanism: Mechanism
     solution: Solution
@@ -53,36 +53,36 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True)
 class Measure:
-    """The part of a run to be stored: `compute(run)` gives arrays, which are stored by the names of `labels`, in their order.
+    """The part of a run to be stored: `compute(run)` returns arrays, stored under the names of `labels`, in this order.
 
-    Without labels it is a user's `function`, whose arrays have names of their own.
+    Without labels it is a user-defined `function`, which names its arrays itself.
     """
 
     name: str
     compute: Callable[[MeasuredRun], Mapping[str, Array]]
     labels: Mapping[str, Label] = field(default_factory=dict)
-    along: bool = True  # whether it needs all output times, not only the end
+    along: bool = True  # True if all output times are needed, not only the last
     reference: Reference = None
     function: UserMeasure | None = None
 
     def of(self, mechanism: Mechanism, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
-        """Return the arrays that are stored, under their names in the dataset."""
+        """Return the stored arrays by their names in the dataset."""
         found = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
         return {name: jnp.asarray(x) for name, x in zip(self.labels or found, found.values(), strict=True)}
 
     def renamed(self, key: str) -> "Measure":
-        """Return the same one, stored under a key: its only variable, or in front of the names of several."""
+        """Return the measure with its single variable renamed to `key`, or with `key` as a prefix of several names."""
         if key in ("", self.name):
             return self
         alone = len(self.labels) == 1
         return replace(self, labels={key if alone else f"{key}_{name}": label for name, label in self.labels.items()})
 
 
-NAMELESS = "lambda"  # the name of a function that has none
+NAMELESS = "lambda"  # name of an anonymous function
 
 
 def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Label:
-    """Label the result of a user's function by its shape."""
+    """Label the result of a user-defined function by its shape."""
     dims = [f"{name}_{k}" for k in range(len(shape))]
     if shape[-2:] == (bodies, 3):
         dims[-2:] = "body", "coordinate"
@@ -92,9 +92,12 @@ def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) ->
 
 
 def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> tuple[Measure, ...]:
-    """Read `measure`: a name, a function of (mechanism, solution), a sequence of such, or a dict of them. Raises ValueError.
+    """Read `measure`: a name, a function of (mechanism, solution), or a sequence or dict of these.
 
     Names are those of `MEASURES`, or of channels of the mechanism, such as `pin.C.x` and `driver.motor.load`.
+
+    Raises:
+        ValueError: a measure or the reference is invalid.
     """
     if isinstance(given, Mapping):
         items = [(str(key), value) for key, value in given.items()]
@@ -104,7 +107,7 @@ def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mech
     found = tuple(_measure(key, value, mechanism).renamed(key) for key, value in items)
     if not any(measure.name == "error" for measure in found):
         if reference is not None:
-            raise ValueError('reference: only the measure "error" looks at it, which is not among the measures')
+            raise ValueError('reference: is used by the measure "error" only, which is not among the measures')
         return found
     reference = _reference(reference, ts)
     return tuple(replace(measure, reference=reference) if measure.name == "error" else measure for measure in found)
@@ -115,8 +118,8 @@ def _measure(key: str, given: OneMeasure, mechanism: Mechanism) -> Measure:
         if given in MEASURES:
             return MEASURES[given]
         if "." not in given:
-            near = suggestion(given, MEASURES) or f"; known are {', '.join(MEASURES)}, and channels such as pin.A.x"
-            raise ValueError(f"measure {quote(given)}: there is none of this name{near}")
+            near = suggestion(given, MEASURES) or f"; use {', '.join(MEASURES)}, or a channel such as pin.A.x"
+            raise ValueError(f"measure {quote(given)} does not exist{near}")
         try:
             channel = channel_of(mechanism, given)
         except ValueError as problem:
@@ -134,11 +137,11 @@ def _evaluate_channel(channel: Channel, run: MeasuredRun) -> dict[str, Array]:
 
 
 def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array]:
-    """Call a user's function, whose single array has the measure's name, and several that name before theirs, if it has one."""
+    """Call a user-defined function: a single array gets the measure's name, several get it as a prefix, if there is a name."""
     try:
         found = function(run.mechanism, run.solution)
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
-        cure = "write it in jax.numpy, without numpy, float() and `if` of what is computed: members are computed side by side"
+        cure = "write it in jax.numpy, without numpy, float() or `if` on computed values: members are computed in a batch"
         raise SweepError([f"measure {quote(name)}: {cure}"]) from None
     if isinstance(found, Mapping):
         front = "" if name == NAMELESS else f"{name}_"
@@ -160,7 +163,7 @@ def _reference(given: Reference, ts: np.ndarray) -> Reference:
 
 
 def _largest(x: Array) -> Array:
-    """Return the largest absolute value; nan, at output times after the end of a run, does not count."""
+    """Return the largest absolute value, ignoring the NaN after the end of a run."""
     return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), initial=0.0)
 
 
@@ -171,7 +174,7 @@ _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 
 
 def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute], Compute]:
-    """Decorator of a function that computes a measure: its name, whether it needs all output times, and its variables."""
+    """Decorate a function that computes a measure with its name, the need for all output times, and its variables."""
 
     def add(compute: Compute) -> Compute:
         MEASURES[name] = Measure(name, compute, labels, along)
@@ -204,7 +207,9 @@ def _violation(run: MeasuredRun) -> dict[str, Array]:
     return {"violation": _largest(violation(run.mechanism, run.solution))}
 
 
-@_named("energy_drift", energy_drift=Label((), "J", "largest change of the total energy, by whatever does work, too"))
+@_named(
+    "energy_drift", energy_drift=Label((), "J", "largest change of the total energy, including the work of loads and drivers")
+)
 def _energy_drift(run: MeasuredRun) -> dict[str, Array]:
     total = energy(run.mechanism, run.solution).total
     return {"energy_drift": _largest(total - total[0])}
@@ -224,10 +229,10 @@ def _error(run: MeasuredRun) -> dict[str, Array]:
 @_named(
     "counts",
     along=False,
-    accepted=Label((), "1", "steps accepted"),
-    rejected=Label((), "1", "steps rejected"),
-    right_hand_sides=Label((), "1", "evaluations of the accelerations; -1: not known"),
-    projections=Label((), "1", "returns to the constraint manifold"),
+    accepted=Label((), "1", "accepted steps"),
+    rejected=Label((), "1", "rejected steps"),
+    right_hand_sides=Label((), "1", "evaluations of the accelerations; -1: unknown"),
+    projections=Label((), "1", "projections on the constraint manifold"),
 )
 def _counts(run: MeasuredRun) -> dict[str, Array]:
     return {name: run.solution.stats[name] for name in MEASURES["counts"].labels}
@@ -235,7 +240,7 @@ def _counts(run: MeasuredRun) -> dict[str, Array]:
 
 @_named("rank", rank=Label(("time",), "1", "rank of D by the method's own rule; -1: not reached"))
 def _rank(run: MeasuredRun) -> dict[str, Array]:
-    """Compute ranks by the method's own rule; that of `Auto` is the rule of the singular values that it falls back to."""
+    """Compute ranks by the method's own rule; `Auto` has that of its rank-revealing fallback."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))

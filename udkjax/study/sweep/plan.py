@@ -1,4 +1,4 @@
-"""A plan: what a sweep is, before anything is computed. Its members, their groups and the chunks in which they are computed."""
+"""The plan of a sweep, made before anything is computed: members, their groups, and chunks."""
 
 import uuid
 from collections.abc import Mapping, Sequence
@@ -22,14 +22,14 @@ from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimensio
 from udkjax.study.sweep.dimensions import Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
-OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep decides about
+OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep sets itself
 
 
 @dataclass(frozen=True, eq=False)
 class StoredVariable:
-    """A variable that is stored of each member."""
+    """A variable that is stored for each member."""
 
-    dims: tuple[str, ...]  # besides those of the sweep
+    dims: tuple[str, ...]  # in addition to those of the sweep
     shape: tuple[int, ...]
     dtype: np.dtype
     units: str
@@ -38,36 +38,36 @@ class StoredVariable:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Members whose choices have one structure: one compiled program, which groups of other methods may share, serves them."""
+    """Members whose choices have the same structure, and one compiled program, which groups of other methods may share."""
 
     index: int
-    choices: Mapping[str, tuple[int, ...]]  # for each axis of choices, the places of those that occur
+    choices: Mapping[str, tuple[int, ...]]  # for each axis of choices, the indices of those that occur
     labels: Mapping[str, str]  # the same, readable
-    members: Int[np.ndarray, "n"]  # places in the flattened grid, row-major over the dimensions in their order
+    members: Int[np.ndarray, "n"]  # indices in the flattened grid, row-major over the dimensions
 
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
     """Members of one group that are computed together: the unit of progress, of storage and of a task."""
 
-    index: int  # its place among all chunks
+    index: int  # its number among all chunks
     group: int  # `Group.index`
-    members: Int[np.ndarray, "n"]  # places in the flattened grid, in the order in which they are computed
+    members: Int[np.ndarray, "n"]  # indices in the flattened grid, in the order of computation
     work: float  # expected work, relative to other chunks of its group
 
 
 @dataclass(frozen=True, eq=False)
 class SweepPlan:
-    """The plan of a sweep. Immutable; it pickles, so that other processes can compute parts of it. Made by `make_plan`."""
+    """The plan of a sweep, made by `make_plan`. Immutable and picklable, so that other processes can compute parts of it."""
 
     mechanism: Mechanism
     dimensions: tuple[Dimension, ...]
     ts: np.ndarray  # (T,) s
-    settings: Settings  # of simulate, those that are no axes
+    settings: Settings  # arguments of simulate that are not axes
     measures: tuple[Measure, ...]
     derivatives: tuple[str, ...] = ()
     design: SweepDesign | None = None
-    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy: code compiled for one serves all
+    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy, so that copies share compiled code
 
     def __hash__(self) -> int:
         return hash(self.token)
@@ -77,12 +77,12 @@ class SweepPlan:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The number of values along each dimension."""
+        """Number of values along each dimension."""
         return tuple(dimension.size for dimension in self.dimensions)
 
     @property
     def size(self) -> int:
-        """The number of members."""
+        """Number of members."""
         return int(np.prod(self.shape))
 
     @property
@@ -91,13 +91,13 @@ class SweepPlan:
         return tuple(column for dimension in self.dimensions for column in dimension.columns)
 
     def places(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Return for each axis which of its values each member has."""
+        """Return the index of each member's value on each axis."""
         along = np.unravel_index(members, self.shape)
         return {column.name: k for d, k in zip(self.dimensions, along, strict=True) for column in d.columns}
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """One for each combination of structures that occurs among the choices."""
+        """One group for each combination of structures that occurs among the choices."""
         chosen = [column for column in self.columns if column.is_choice]
         places = self.places(np.arange(self.size))
         kinds = np.stack(
@@ -114,7 +114,7 @@ class SweepPlan:
 
     @cached_property
     def first_alike(self) -> tuple[int, ...]:
-        """For each group the first that the same compiled program serves: their methods are one of several by a number."""
+        """For each group, the first with the same compiled program: their methods differ only in the number of a `OneOf`."""
         numbers = {column.name: _number_structures(column.computed) for column in self.columns if column.is_choice}
 
         def key(group: Group) -> tuple:
@@ -135,21 +135,21 @@ class SweepPlan:
         return int(self._numbers[member])
 
     def choice(self, group: Group, setting: str) -> AxisChoice:
-        """Return a group's value of a setting: the first of its choices, where these differ by numbers."""
+        """Return a group's value of a setting: the first of its choices, if they differ in numbers."""
         for column in self.columns:
             if column.of == (setting,) and column.is_choice:
                 return column.choices[group.choices[column.name][0]]
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
 
     def mechanism_of(self, group: Group) -> Mechanism:
-        """Return the mechanism of a group: the first, where these differ by numbers."""
+        """Return the mechanism of a group: the first, if they differ in numbers."""
         found = self.choice(group, "mechanism")
         assert isinstance(found, Mechanism)
         return found
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
-        """The bodies of all mechanisms, in their order."""
+        """The bodies of all mechanisms, in order of appearance."""
         return tuple(dict.fromkeys(name for group in self.groups for name in self.mechanism_of(group).body_names))
 
 
@@ -164,7 +164,11 @@ def make_plan(
     derivatives: Sequence[str] = (),
     **settings: Any,
 ) -> SweepPlan:
-    """Make the plan of a sweep; arguments as those of `udkjax.sweep`. Raises `SweepError`, which lists every mistake."""
+    """Make the plan of a sweep; arguments as for `udkjax.sweep`.
+
+    Raises:
+        SweepError: lists every mistake.
+    """
     problems = [f"{name}: a sweep has no such setting" for name in settings if name in OUTSIDE]
     wrong = argument_problems(make_plan, {"mechanism": mechanism})
     if wrong:
@@ -183,7 +187,7 @@ def make_plan(
         problems += error.problems
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
-        settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs some
+        settings.setdefault("stabilization", Baumgarte())  # needed by an axis of gains
     problems += check_settings(mechanism, dimensions, settings)
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()
@@ -198,7 +202,7 @@ def make_plan(
 
 
 def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:
-    """Return for each of the choices of an axis the number of its structure."""
+    """Return the number of the structure of each choice of an axis."""
     structures = [
         (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in values
     ]
@@ -206,6 +210,6 @@ def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:
 
 
 def stack_choices(choices: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
-    """Return the numbers of choices of one structure, stacked, and everything else of them."""
+    """Return the stacked numbers of choices with the same structure, and their common static part."""
     parts = [eqx.partition(choice, eqx.is_array) for choice in choices]
     return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(arrays for arrays, _ in parts)), parts[0][1]

@@ -25,7 +25,7 @@ from udkjax.study.sweep.measures import MeasureChoice, Reference
 from udkjax.study.sweep.plan import Chunk, make_plan
 from udkjax.study.sweep.store import open_store, read_variable
 
-if TYPE_CHECKING:  # neither is needed before a sweep has results, or a cluster
+if TYPE_CHECKING:  # imported only for results and clusters
     import distributed
     import xarray
 
@@ -51,42 +51,42 @@ def sweep(
 ) -> "xarray.Dataset":
     """Simulate a mechanism for all combinations of the values of some axes.
 
-    Members are computed side by side, in chunks of a few seconds, on all devices or cores of the machine.
+    Members (the single runs) are computed concurrently, in chunks of a few seconds, on all devices or cores of the machine.
 
     Args:
         mechanism: the scene.
         axes: values by name. A name is that of a parameter (`body.link1.mass`), of a setting of `simulate` (`rtol`, `atol`,
             `drift_tol`, `dt0`, `method`, `solver`, `stabilization`, `formulation`, `max_steps`, `state`), of one of its parts
             (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to which the
-            output times are stretched, or `mechanism`, for mechanisms beside each other. `Axis(values, of=...)` gives an axis a
-            name of its own and may tie several quantities; `Zipped({...})` lets axes advance together.
+            output times are stretched, or `mechanism`, to compare mechanisms. `Axis(values, of=...)` gives an axis a name of
+            its own and may tie several quantities; `Zipped({...})` varies axes together.
         ts: output times (T,), s.
-        measure: measures to store of each member; nothing else is stored. By name: "final" (q and v at the end), "states" (at
-            all `ts`), "violation" (the largest, m and rad), "energy_drift" (J), "error" (the largest of a coordinate and of an
+        measure: measures to store for each member; nothing else is stored. By name: "final" (q and v at the end), "states" (at
+            all `ts`), "violation" (the largest, m or rad), "energy_drift" (J), "error" (the largest error of a position and of an
             angle, against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x" (at all `ts`). Or a
-            function of (mechanism, solution), by jax.numpy, which returns an array or a dict of arrays; or several, in a list or
-            in a dict of names.
-        design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are ranges (low, high), or frozen distributions
-            of scipy.stats, and all of them lie along the dimension "member".
-        reference: of the measure "error": a Solution, coordinates (T, bodies, 3), or a function (mechanism, ts) of them.
-        derivatives: names of parameters and axes: the derivative of everything that is stored by each of them is in the dataset
-            too, as `d_<variable>_d_<name>`, by forward mode.
-        engine: "dask": on the workers of a `client`; "devices": in this process; "auto": on a client where one is given.
-        client: of dask.distributed; by default the one that was made last.
-        out: a folder in which finished chunks are stored: the same sweep again goes on from there.
-        memory: memory of the members in computation, at most (bytes).
-        progress: None shows a line where it takes longer than two seconds, True at once, False never; a function gets a
-            `SweepProgress` after each chunk.
-        settings: any other that `simulate` has, of all members.
+            function of (mechanism, solution), in jax.numpy, that returns an array or a dict of arrays; or several measures, in a
+            list, or a dict by name.
+        design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are then ranges (low, high) or frozen
+            distributions of scipy.stats, and all of them lie along the dimension "member".
+        reference: for the measure "error": a Solution, coordinates (T, bodies, 3), or a function of (mechanism, ts).
+        derivatives: names of parameters and axes: the dataset also has the derivatives of all stored variables by each of them,
+            as `d_<variable>_d_<name>`, in forward mode.
+        engine: "dask": on the workers of a `client`; "devices": in this process; "auto": on a client if one is given.
+        client: a client of dask.distributed; by default the one created last.
+        out: a folder for finished chunks: the same sweep, run again, continues from them.
+        memory: limit of the memory of members in computation (bytes).
+        progress: None shows a line after two seconds, True at once, False never; a function gets a `SweepProgress` after each
+            chunk.
+        settings: further arguments of `simulate`, for all members.
 
     Returns:
-        A dataset along the axes. Each member's `result` says how it ended, as a number whose meanings are in its attributes;
-        a failed member is not a number, and nothing is raised for it.
+        A dataset along the axes. `result` is the result of each member, a number whose meanings are in its attributes. The
+        variables of failed members are NaN; no exception is raised for them.
 
     Raises:
-        SweepError: with every mistake in the arguments.
-        StoreError: `out` cannot be written to, or holds another sweep.
-        ClusterError: there is no client, or its workers cannot do it.
+        SweepError: lists every mistake in the arguments.
+        StoreError: `out` cannot be written to, or contains another sweep.
+        ClusterError: there is no client, or its workers cannot compute the sweep.
     """
     require("xarray")
     plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
@@ -102,7 +102,7 @@ def sweep(
 
 
 def _engine(engine: str, client: "distributed.Client | None") -> Executor:
-    """Return the engine that computes chunks: a client that is given is there to be used."""
+    """Return the engine that computes chunks; "auto" uses a client if one is given."""
     return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices
 
 
@@ -112,14 +112,14 @@ STEPS = "steps"  # the variable by which members are compared
 
 @dataclass(frozen=True)
 class SweepProgress(Progress):
-    """The progress of a sweep: `done` of `total` members, those of an earlier run that it goes on with among them.
+    """The progress of a sweep: `done` of `total` members, including those of an earlier run that it continues.
 
     Attributes:
-        rate: members a second, in this run; None until something is done.
-        remaining: time that the rest takes (s), by the work that is left; None until it can be said.
-        failures: number of members that ended with each `Result`, successes left out.
-        slowest: the member that took most steps, and how many; None where steps are not stored.
-        slowest_chunk: the chunk that took longest, and how long (s).
+        rate: members per second, in this run; None until something is done.
+        remaining: estimated remaining time (s); None until it can be estimated.
+        failures: number of members for each `Result` other than success.
+        slowest: the member with the most steps, and their number; None if steps are not stored.
+        slowest_chunk: the chunk that took longest, and its time (s).
     """
 
     rate: float | None = None
@@ -135,12 +135,12 @@ class SweepProgress(Progress):
     def __str__(self) -> str:
         part = 100 * self.done / self.total if self.total else 100.0
         time_left = duration(self.seconds) if self.left is None or self.done == self.total else f"{duration(self.left)} left"
-        rate = [] if self.rate is None else [f"{self.rate:.3g} a second"]
+        rate = [] if self.rate is None else [f"{self.rate:.3g} per second"]
         return "; ".join([f"{self.done:g} of {self.total:g} members ({part:.0f} %)", *rate, time_left, self.message])
 
 
 class Watch:
-    """Follow a sweep of so many members, of which an earlier run has `done` some, that ended with `codes`.
+    """The progress of a sweep of `members`, of which an earlier run has `done` some, with the results `codes`.
 
     `show` is called with the `SweepProgress` at the start and after each chunk.
     """
@@ -148,17 +148,17 @@ class Watch:
     def __init__(self, members: int, done: int, show: Callable[[SweepProgress], object], codes: ArrayLike = ()):
         self.show, self.new = show, 0
         self.begun = time.monotonic()
-        self.since, self.work, self.work_done = self.begun, 0.0, 0.0  # of chunks whose work is known
+        self.since, self.work, self.work_done = self.begun, 0.0, 0.0  # of chunks with a known amount of work
         failures = _count_failures({}, codes)
         self.state = SweepProgress("sweep", done, members, 0.0, _message(failures), failures=failures)
         self.show(self.state)
 
     def expect(self, chunks: Sequence[Chunk]) -> None:
-        """Take the work that is left from these chunks, which are all that are to come."""
+        """Set the remaining work to that of `chunks`, which are all remaining ones."""
         self.since, self.work = time.monotonic(), sum(chunk.work for chunk in chunks)
 
     def __call__(self, chunk: Chunk, data: Mapping[str, np.ndarray], seconds: float | None = None) -> None:
-        """Note that a chunk is done, what it gave, and how long it took (s) where that is known."""
+        """Update the progress with a finished chunk, its stored variables, and the time it took (s), if known."""
         before, now = self.state, time.monotonic()
         self.new += len(chunk.members)
         self.work_done += chunk.work if self.work else 0.0
@@ -190,7 +190,7 @@ def _message(
 
 
 def _count_failures(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
-    """Add to the numbers of members that ended with each `Result`; successes are left out."""
+    """Add members to the counts of each `Result` other than success."""
     found = Counter(before)
     for code, count in zip(*np.unique(np.asarray(codes, int), return_counts=True), strict=True):
         if code != Result.successful:
@@ -198,17 +198,17 @@ def _count_failures(before: Mapping[str, int], codes: ArrayLike) -> dict[str, in
     return dict(found)
 
 
-def _find_slowest(before: tuple[int, T] | None, who: ArrayLike, values: ArrayLike | None) -> tuple[int, T] | None:
-    """Return the largest of the values and whose it is, unless one before was as large."""
+def _find_slowest(before: tuple[int, T] | None, indices: ArrayLike, values: ArrayLike | None) -> tuple[int, T] | None:
+    """Return the index and value of the largest of the values, unless the one before was as large."""
     if values is None:
         return before
     values = np.atleast_1d(values)
     most = int(np.argmax(values))
-    return before if before is not None and before[1] >= values[most] else (int(np.asarray(who)[most]), values[most].item())
+    return before if before is not None and before[1] >= values[most] else (int(np.asarray(indices)[most]), values[most].item())
 
 
 def duration(seconds: float) -> str:
-    """Return a time (s) as text."""
+    """Format a duration (s)."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
