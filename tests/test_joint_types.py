@@ -21,8 +21,8 @@ from tests.elements import BODIES, JOINTS, P
 from udkjax.integrate.causes.reach import Reach, dead_point
 from udkjax.integrate.events.conditions import joint_coordinate
 from udkjax.scene.wording import row_label
-from udkjax.show.player.followers import followers
 from udkjax.show.player.marks import marks
+from udkjax.show.player.symbol_updates import symbol_updates
 from udkjax.show.player.symbols import symbols_of
 from udkjax.statics.reaction_peaks import cam_forces
 from udkjax.studio.drawn_scenes import drawing_text_of
@@ -130,7 +130,7 @@ def follows_radius(joint: udk.Joint) -> bool:
     mechanism = udk.Mechanism(BODIES, {"J": joint})
     symbols = symbols_of(marks(mechanism, mechanism.q0[None]), 0.1)
     record = {"marks": [], "traces": [], "reactions": None}
-    return bool(followers(mechanism, record, symbols, 0)["sizes"])
+    return bool(symbol_updates(mechanism, record, symbols, 0)["sizes"])
 
 
 def axles(joint: udk.Joint) -> dict[str, udk.Joint]:
