@@ -26,7 +26,7 @@ NAMES = (
 
 
 def main(words: list[str] | None = None) -> None:
-    """Run the benchmarks, then hold what is promised against all figures, those of earlier runs in the folder among them."""
+    """Run the benchmarks, then compare all figures, including earlier ones in the folder, with the promised targets."""
     parser = argparse.ArgumentParser("python -m benchmarks", description="Measure udkjax against what would be used without it.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; without one: all")
     parser.add_argument("--smoke", action="store_true", help="run everything once, tiny, to see that it runs; measures nothing")
@@ -62,5 +62,5 @@ def main(words: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    os.environ["UDKJAX_CACHE"] = "0"  # otherwise programs compiled before would be found; `startup` measures that by itself
+    os.environ["UDKJAX_CACHE"] = "0"  # otherwise programs compiled earlier would be found; `startup` measures that separately
     main()

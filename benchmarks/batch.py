@@ -18,37 +18,37 @@ from benchmarks.peers.peer import STARTS, coordinates
 from benchmarks.scripts import solve
 from udkjax.study.accuracy import pendulum
 
-TARGETS = (1e-6, 1e-8)  # m and rad: the largest error of any coordinate of any member
+TARGETS = (1e-6, 1e-8)  # m and rad: the largest error over coordinates and members
 TOLERANCES = tuple(float(tol) for tol in 10 ** -np.arange(4.0, 10.01, 1.0))
-END, SPREAD = 10.0, 10.0  # s; degrees, all of it
-MEMBERS, FEW = 1024, 256  # of ours and C++; of the script, which takes a second for them
-MANY = 16384  # members on two cores: the scheduler may start both threads on one core, and parts them only some ms later
+END, SPREAD = 10.0, 10.0  # s; degrees to both sides together
+MEMBERS, FEW = 1024, 256  # members for ours and C++; for the script, which takes a second for these
+MANY = 16384  # members on two cores: the scheduler may start both threads on one core, and separates them only some ms later
 OUTPUTS = {"end only": 2, "201 outputs": 201}
 OURS, LANES, SCALAR, SCRIPT = "udkjax", "C++, 8 lanes", "C++, one by one", "script"
 ROUNDS = 3
-REGULARIZATION = 1e-10  # of the script: more reaches no such errors
+REGULARIZATION = 1e-10  # of the script: a larger regularization does not reach such errors
 OMEGA = np.sqrt(3.5 * 9.81 / 3.05)  # 1/s: 3.05 theta'' = -3.5 g cos(theta)
 
 
 def angles(start: float, members: int) -> np.ndarray:
-    """Where the members are released (rad), around `start` (degrees)."""
+    """Return the angles (rad) from which members are released, around `start` (degrees)."""
     return np.deg2rad(start + SPREAD * np.linspace(-0.5, 0.5, members))
 
 
 def exact(releases: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """The exact coordinates (members, T, 12)."""
+    """Return the exact coordinates (members, T, 12)."""
     links = np.stack([angle + pendulum(ts, angle + np.pi / 2, 0.0, OMEGA) for angle in releases])
     return np.stack([coordinates(np.repeat(theta[:, None], 3, axis=1), 0 * theta) for theta in links])
 
 
 def states(releases: np.ndarray) -> jax.Array:
-    """(members, 24) at rest."""
+    """Return states (members, 24) at rest."""
     q = coordinates(np.repeat(releases[:, None], 3, axis=1), 0 * releases)
     return jnp.asarray(np.concatenate([q, 0 * q], axis=1))
 
 
 def ours(mechanism: Any, ts: np.ndarray) -> Callable:
-    """From states (members, 24) and a tolerance to coordinates (members, T, 12)."""
+    """Return a function from states (members, 24) and a tolerance to coordinates (members, T, 12)."""
 
     def one(y0, tol):
         state = udk.State(y0[:12].reshape(4, 3), y0[12:].reshape(4, 3))
@@ -87,7 +87,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
 
 
 def _measure(start: float, ts: np.ndarray, members: int, few: int, tolerances: Any, rounds: int) -> tuple[float, dict]:
-    """How long ours compiles; for each candidate and tolerance the largest error and, by rounds, a trajectory's CPU time."""
+    """Return our time to compile; by candidate and tolerance the largest error and, by rounds, the CPU time of a trajectory."""
     releases, spare = angles(start, members), angles(start, few)
     truth = {len(each): exact(each, ts) for each in (releases, spare)}
     errors, timers, compiled_in = {}, {}, 0.0
@@ -117,7 +117,7 @@ def _measure(start: float, ts: np.ndarray, members: int, few: int, tolerances: A
 
 
 def _cores(smoke: bool) -> list[dict[str, Any]]:
-    """How many times as many trajectories two cores compute as one: per second of wall time, at tolerance 1e-7."""
+    """Return the speed-up of two cores over one: trajectories per second of wall time, at tolerance 1e-7."""
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if len(available) < 2:
         print("two cores: there is one, or this system does not say")

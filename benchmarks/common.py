@@ -1,4 +1,4 @@
-"""How everything here is measured: compiled once, warmed up, blocked, the candidates in turn, medians; at equal error."""
+"""Rules of all measurements: compiled once, warmed up, blocked, candidates in turn, medians; at equal error."""
 
 import json
 import os
@@ -50,9 +50,9 @@ class Compiled:
 
 
 def cpu_seconds(call: Callable[[], Any], at_least: float = 0.02) -> float:
-    """CPU time (s) of a call, of all threads: the median of as many as take `at_least` seconds, as the C++ program takes it.
+    """Return the CPU time (s) of a call, over all threads: the median of repetitions that take `at_least` seconds together.
 
-    What else runs on the machine matters less, and so do the first calls, in caches that another candidate has left behind.
+    The median reduces the effect of other programs, and of first calls with caches filled by another candidate.
     """
     times: list[float] = []
     while not times or sum(times) < at_least:
@@ -63,14 +63,14 @@ def cpu_seconds(call: Callable[[], Any], at_least: float = 0.02) -> float:
 
 
 def alternate(candidates: dict[str, Compiled], arguments: tuple, rounds: int) -> dict[str, list[float]]:
-    """Time each candidate once a round: what slows the machine down for a while slows all of them."""
+    """Time each candidate once a round: a temporary slowdown of the machine then affects all of them."""
     for candidate in candidates.values():
         candidate(*arguments)
     return in_turn({name: lambda c=candidate: c.seconds(*arguments) for name, candidate in candidates.items()}, rounds)
 
 
 def in_turn(timers: dict[Any, Callable[[], float]], rounds: int) -> dict[Any, list[float]]:
-    """The same of anything that returns how long it took."""
+    """Do the same with functions that return their own time."""
     times: dict[Any, list[float]] = {name: [] for name in timers}
     for _ in range(rounds):
         for name, timer in timers.items():
@@ -79,25 +79,25 @@ def in_turn(timers: dict[Any, Callable[[], float]], rounds: int) -> dict[Any, li
 
 
 def ratio(slow: list[float], fast: list[float]) -> float:
-    """The median of the ratios within a round."""
+    """Return the median of the ratios within a round."""
     return statistics.median(s / f for s, f in zip(slow, fast, strict=True))
 
 
 class Work:
-    """What it costs to reach an error: a polygon through (error, cost), straight in logarithms."""
+    """Cost of reaching an error: piecewise linear through (error, cost) in logarithms."""
 
     def __init__(self, points: Iterable[tuple[float, float]]):
         self.error, self.cost = np.log(np.array(sorted(points))).reshape(-1, 2).T
 
     def at(self, error: float) -> float:
-        """The cost at this error, between two that were measured; nan outside."""
+        """Return the cost at this error, interpolated between measured points; nan outside."""
         if not len(self.error):
             return float("nan")
         return float(np.exp(np.interp(np.log(error), self.error, self.cost, left=np.nan, right=np.nan)))
 
 
 def frontier(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those (error, cost) than which no other is both more accurate and cheaper, by error."""
+    """Return the points (error, cost) that no other beats in both accuracy and cost, sorted by error."""
     left: list[tuple[float, float]] = []
     for error, cost in sorted(p for p in points if np.isfinite(p).all() and p[0] > 0):
         if not left or cost < left[-1][1]:
@@ -106,7 +106,7 @@ def frontier(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]
 
 
 def at_equal_error(times: dict[Any, list[float]], errors: dict[Any, float], target: float) -> dict[str, list[float]]:
-    """What each candidate costs at the error `target`, in each round; nan where none of its settings reaches it.
+    """Return the cost of each candidate at the error `target`, in each round; nan if none of its settings reaches it.
 
     Keys of `times` and `errors` are pairs (candidate, setting).
     """
@@ -120,7 +120,7 @@ def at_equal_error(times: dict[Any, list[float]], errors: dict[Any, float], targ
 
 
 def machine() -> dict[str, Any]:
-    """Describe the machine that the figures belong to."""
+    """Describe the machine of the figures."""
     load = os.getloadavg() if hasattr(os, "getloadavg") else None
     packages = {name: version(name) for name in ("jax", "jaxlib", "equinox", "diffrax", "numpy")}
     return {
@@ -135,13 +135,13 @@ def machine() -> dict[str, Any]:
 
 
 def write(about: dict[str, Any], figures: Any, file: Path) -> None:
-    """Write figures and what they belong to."""
+    """Write figures with the machine and versions."""
     file.write_text(json.dumps(_finite({"machine": about, "figures": figures}), indent=1, allow_nan=False) + "\n")
     print(f"written to {file}")
 
 
 def _finite(tree: Any) -> Any:
-    """JSON knows no nan: null."""
+    """Replace nan, which JSON does not have, by null."""
     if isinstance(tree, dict):
         return {key: _finite(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):

@@ -1,8 +1,8 @@
 """All four-bars through nine places and five poses: `python -m benchmarks.complete_design [SETS]`.
 
-The published problem is solved in a process of its own, with no stored machine code and on one core: its times are those of
-everything, importing and compiling included. Then known four-bars are asked for by nine places of their own, at random crank
-angles, and by five poses; and counts are printed of the real solutions of random places.
+The published problem is solved in its own process, without stored machine code and on one core: its times include importing and
+compiling. Then known four-bars are searched by nine of their own places, at random crank angles, and by five poses. Finally the
+numbers of real solutions of random places are printed.
 """
 
 import json
@@ -16,7 +16,7 @@ import numpy as np
 
 CASES = Path(__file__).parents[1] / "tests" / "data" / "path_synthesis.json"
 SETS = 10
-FOUND_TOL = 1e-6  # of the frame: how near a four-bar that was found is to the known one
+FOUND_TOL = 1e-6  # fraction of the frame: largest distance between the pins of a found four-bar and of the known one
 ALONE = """
 import time; begin = time.perf_counter()
 from benchmarks.complete_design import drawing, published
@@ -32,14 +32,14 @@ def published() -> dict:
 
 
 def drawing():
-    """Return a four-bar; where its pins are says nothing."""
+    """Return a four-bar; the positions of its pins do not matter."""
     from benchmarks.design import LINKAGE
 
     return LINKAGE
 
 
 def known_four_bar(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joints O, C, A, B (4,) and poses (J, 3) of a random four-bar whose positions are all there, along its crank."""
+    """Return the joints O, C, A, B (4,) of a random four-bar that can take all J poses (J, 3) of its crank."""
     while True:
         frame, crank, coupler, rocker = rng.uniform(0.5, 3.0, 4)
         angles = np.sort(rng.uniform(0, 2 * np.pi, count))

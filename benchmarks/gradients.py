@@ -1,4 +1,4 @@
-"""What gradients of the final angle cost, in times a run without them: udkjax, dual numbers in C++, a script."""
+"""Cost of gradients of the final angle, relative to the run alone: udkjax, dual numbers in C++, a script."""
 
 import statistics
 from collections.abc import Callable
@@ -16,18 +16,18 @@ from benchmarks.common import Compiled, in_turn, ratio
 from benchmarks.scripts import MASS, WEIGHT, solve
 
 START, END, TOLERANCE = -45.0, 10.0, 1e-8  # degrees, s
-COUNTS = (1, 2, 4, 8)  # of parameters, the first of those
+COUNTS = (1, 2, 4, 8)  # numbers of parameters
 PARAMETERS = {**{f"body.link{i}.mass": 1.0 for i in (1, 2, 3)}, "body.coupler.mass": 2.0} | {
     **{f"body.link{i}.inertia": 0.1 for i in (1, 2, 3)},
     "gravity": 9.81,
 }
 AGREE = 1e-4  # relative
-REGULARIZATION = 1e-10  # of the script: the gradients of more are not those of the linkage
+REGULARIZATION = 1e-10  # regularization of the script: with a larger one the gradients are not those of the linkage
 ROUNDS = 7
 
 
 def ours(adjoint: Any = None) -> Callable:
-    """The final angle from values of the first parameters."""
+    """Return the final angle for values of the first parameters."""
     mechanism = udk.library.parallelogram(np.deg2rad(START))
     ts, start = np.array([0.0, END]), udk.State(mechanism.q0, mechanism.v0)
 
@@ -41,7 +41,7 @@ def ours(adjoint: Any = None) -> Callable:
 
 
 def script(adjoint: Any = None) -> Callable:
-    """The same by a user's script."""
+    """Do the same by a user's script."""
     placed = udk.library.parallelogram(np.deg2rad(START))
     y0 = jnp.concatenate([placed.q0.ravel(), jnp.zeros(12)])
     run = solve(jnp.array([0.0, END]), REGULARIZATION, adjoint)
@@ -59,7 +59,7 @@ def script(adjoint: Any = None) -> Callable:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print for each count of parameters the cost of a gradient, in times the run alone, and check the gradients against C++."""
+    """Print the cost of a gradient relative to the run alone, by number of parameters, and check the gradients against C++."""
     counts, rounds, at_least = ((1,), 1, 0.0) if smoke else (COUNTS, ROUNDS, 0.02)
     figures, gradients = [], {}
     makers = {"udkjax": ours} if smoke else {"udkjax": ours, "script": script}

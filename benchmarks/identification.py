@@ -1,4 +1,4 @@
-"""What `udk.identify` finds, how surely and how fast: numbers of known mechanisms, from wrong ones, with and without noise."""
+"""Reliability and speed of `udk.identify`: numbers of known mechanisms from wrong guesses, with and without noise."""
 
 import json
 import os
@@ -25,21 +25,21 @@ CASES: dict[str, Callable[..., Measurement]] = {
 LONG = 20.0  # s
 SIZES = (3, 5, 10, 20)
 REACHED = 1e-8  # relative error of the worst parameter
-WIDE, NEAR = 0.5, 0.1  # of true values: how far off first guesses are; near ones are for what is asked of one minimum
-NOISE = 0.01  # of what a channel shows, root mean square about its mean
+WIDE, NEAR = 0.5, 0.1  # relative errors of first guesses; the smaller ones are for comparisons within one minimum
+NOISE = 0.01  # relative to the root mean square of a channel about its mean
 SIGMAS = 2.0
 FAILURES = (udk.IdentificationError, udk.AssemblyError, udk.SimulationError)
 
 
 class Count(NamedTuple):
-    """How many fits of each kind."""
+    """Numbers of fits of each kind."""
 
     starts: int
     long: int
     noisy: int
     timed: int
     sizes: tuple[int, ...]
-    end: float | None = None  # s, instead of what each case has
+    end: float | None = None  # s, instead of the duration of each case
     cases: int | None = None
 
 
@@ -47,7 +47,7 @@ FULL, SMOKE = Count(64, 16, 200, 5, SIZES), Count(1, 0, 2, 1, (3,), 1.0, 1)
 
 
 class Fit(NamedTuple):
-    """One fit: values and standard errors (P,), what is wrong with the values, relative, and what it took."""
+    """One fit: values and standard errors (P,), relative errors of the values, and its cost."""
 
     values: np.ndarray
     errors: np.ndarray
@@ -55,18 +55,18 @@ class Fit(NamedTuple):
     seconds: float
     cpu: float
     evaluations: int = 0
-    said: str = ""  # why there is none, or what is wrong with it
+    said: str = ""  # the reason if it failed, or its defect
 
 
 def exact(m: Measurement) -> np.ndarray:
-    """What is measured, to the last digits (T, C)."""
+    """Return the exact measurements (T, C)."""
     values, code = m.predictor()(m.unknowns.guess, EXACT)
     assert int(code) == 0, "the true mechanism does not move to the end"
     return np.asarray(values)
 
 
 def record(m: Measurement, values: np.ndarray) -> udk.Record:
-    """A record as it would be read from a file."""
+    """Return a record as read from a file."""
     return udk.Record(m.ts, dict(zip(m.channels, values.T, strict=True)))
 
 
@@ -87,7 +87,7 @@ def identified(m: Measurement, data: udk.Record, x0: np.ndarray) -> Fit:
 
 
 def by_differences(m: Measurement, predicted: Callable, data: np.ndarray, x0: np.ndarray, tol: float, tight: bool) -> Fit:
-    """The same by `scipy.optimize.least_squares` over the jitted run, in logarithms; `tight`: to the last digit."""
+    """Fit by `scipy.optimize.least_squares` over the jitted run, in logarithms; `tight`: to the last digit."""
     from scipy.optimize import least_squares
 
     spread, truth = data.std(0), m.unknowns.guess
@@ -106,7 +106,7 @@ def by_differences(m: Measurement, predicted: Callable, data: np.ndarray, x0: np
 
 
 def summary(case: str, protocol: str, m: Measurement, fits: list[Fit], **more: Any) -> dict[str, Any]:
-    """One row of the table, with the errors of every parameter."""
+    """Return one row of the table, with the errors of every parameter."""
     wrong = np.array([fit.wrong for fit in fits])
     worst = wrong.max(1)
     row = {
@@ -136,19 +136,19 @@ def summary(case: str, protocol: str, m: Measurement, fits: list[Fit], **more: A
 
 
 def recovery(case: str, m: Measurement, count: int, protocol: str = "without noise") -> dict[str, Any]:
-    """From wrong first guesses, all within a half of the true values."""
+    """Fit from wrong first guesses, all within 50 % of the true values."""
     data = record(m, exact(m))
     return summary(case, protocol, m, [identified(m, data, x0) for x0 in m.starts(count, WIDE)])
 
 
 def coverage(case: str, m: Measurement, count: int) -> dict[str, Any]:
-    """With noise whose size the fit is not told: how often true values are within two standard errors. Right is 0.95."""
+    """Fit with noise of unknown size: the share of true values within two standard errors. Correct is 0.95."""
     random, values = np.random.default_rng(0), exact(m)
     noise = NOISE * values.std(0)
     measured = [record(m, values + noise * random.standard_normal(values.shape)) for _ in range(count)]
     fits = [identified(m, data, x0) for data, x0 in zip(measured, m.starts(count, NEAR), strict=True)]
     off = np.array([(fit.values - m.unknowns.guess) / np.where(np.isfinite(fit.errors), fit.errors, np.nan) for fit in fits])
-    within = np.abs(off) <= SIGMAS  # not where there is no standard error
+    within = np.abs(off) <= SIGMAS  # except where there is no standard error
     each = {
         name: {"covered": float(one.mean()), "bias": float(np.nanmean(z)), "spread": float(np.nanstd(z))}
         for name, one, z in zip(m.unknowns.names, within.T, off.T, strict=True)
@@ -160,7 +160,7 @@ WAYS = {"udkjax": {}, "least_squares": {"tol": 1e-8, "tight": False}, "least_squ
 
 
 def timing(case: str, words: dict[str, Any], ways: Iterable[str], spread: float, count: int) -> list[dict[str, Any]]:
-    """A fit that compiles and then warm ones, each way in a process of its own without a cache of compiled programs."""
+    """Time a fit that compiles and then warm ones, by each method, in separate processes without a cache of compiled programs."""
     found: list[dict[str, Any]] = []
     m = made(case, words)
     for way in ways:
@@ -178,7 +178,7 @@ def timing(case: str, words: dict[str, Any], ways: Iterable[str], spread: float,
 
 
 def _timed(case: str, words: dict[str, Any], way: str, starts: Any, values: Any) -> list[Fit]:
-    """In a process of its own: the first guess is used twice, the second time warm."""
+    """Time both fits in this process: the first guess is used twice, the second time warm."""
     m, values, starts = made(case, words), np.array(values), np.array(starts)
     starts = starts[[0, *range(len(starts))]]
     if way == "udkjax":
@@ -188,12 +188,12 @@ def _timed(case: str, words: dict[str, Any], way: str, starts: Any, values: Any)
 
 
 def made(case: str, words: dict[str, Any]) -> Measurement:
-    """The measurement of a name."""
+    """Return the measurement of a name."""
     return sprung_chain(**words) if case == "sprung chain" else CASES[case](**words)
 
 
 def rows(count: Count) -> Iterable[dict[str, Any]]:
-    """Everything, protocol by protocol."""
+    """Run every protocol."""
     shorter = {} if count.end is None else {"end": count.end}
     cases = list(CASES)[: count.cases]
     for case in cases:
@@ -208,7 +208,7 @@ def rows(count: Count) -> Iterable[dict[str, Any]]:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print one table: of each case and protocol how many fits reach the true values, their errors and times."""
+    """Print a table: by case and protocol the number of fits that reach the true values, their errors and times."""
     print(
         f"{'case':24} {'protocol':22} {'P':>3} {'s':>5} {'fits':>5} {'<= 1e-8':>8} {'median':>9} {'worst':>9} {'within 2':>8} "
         f"{'seconds':>9} {'cpu':>9} {'runs':>8}"

@@ -1,4 +1,4 @@
-"""Work and precision: calls of the right-hand side and errors of the integrators, beside SciPy's, on six problems."""
+"""Work and precision: calls of the right-hand side and errors of our integrators and SciPy's, on six problems."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,8 +16,8 @@ from benchmarks.common import Compiled, Work
 from benchmarks.problems import PROBLEMS, STIFF, Problem
 from udkjax.integrate.solvers.counting import count_evaluations, evaluations
 
-Run = Callable[[float], tuple[float, ...]]  # from a tolerance to an error and counts
-FIRST = 1e-6  # step that is tried
+Run = Callable[[float], tuple[float, ...]]  # from a tolerance to an error and numbers of calls
+FIRST = 1e-6  # first step
 FINER = 10 ** -np.arange(3.0, 12.01, 0.5)  # tolerances of the yardstick: its calls at any error lie between two of them
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 FOR_NOT_STIFF = {
@@ -31,7 +31,7 @@ FOR_STIFF = {"BDF": udk.BDF()}
 
 
 def ours(problem: Problem, solver: diffrax.AbstractSolver) -> Compiled:
-    """From a tolerance to the state at the end, the calls of the right-hand side, Jacobians and accepted steps."""
+    """Return a function from a tolerance to the end state, the calls of the right-hand side, Jacobians and accepted steps."""
 
     def run(tol):
         control: Any = diffrax.PIDController(rtol=tol, atol=tol * jnp.array(problem.scale), norm=optx.rms_norm)
@@ -56,20 +56,20 @@ def ours(problem: Problem, solver: diffrax.AbstractSolver) -> Compiled:
 
 
 def measured(problem: Problem, run: Compiled, tol: float) -> tuple[float, int, int, int]:
-    """The error, calls of the right-hand side, Jacobians and accepted steps."""
+    """Return the error, calls of the right-hand side, Jacobians and accepted steps."""
     y, calls, jacobians, steps = jax.device_get(run(jnp.asarray(tol)))
     return problem.error(y), int(calls), int(jacobians), int(steps)
 
 
 def vode(problem: Problem, tol: float) -> tuple[float, int]:
-    """The error, and the calls of the right-hand side, by VODE's Adams methods (Brown, Byrne, Hindmarsh 1989)."""
+    """Return the error, and the calls of the right-hand side, by VODE's Adams methods (Brown, Byrne, Hindmarsh 1989)."""
     f, calls = _counted(problem)
     solver = ode(f).set_integrator("vode", method="adams", rtol=tol, atol=_atol(problem, tol), nsteps=10**6)
     return problem.error(solver.set_initial_value(np.array(problem.y0)).integrate(problem.end)), len(calls)
 
 
 def scipy(problem: Problem, method: Any, tol: float) -> tuple[float, int]:
-    """The same by a method of `solve_ivp`; calls for Jacobians by differences count."""
+    """Do the same by a method of `solve_ivp`; calls for Jacobians by differences count."""
     f, calls = _counted(problem)
     options: Any = {"rtol": tol, "atol": _atol(problem, tol), "first_step": FIRST}
     found = solve_ivp(f, (0.0, problem.end), problem.y0, method=method, **options)
@@ -93,7 +93,7 @@ def _counted(problem: Problem) -> Any:
 def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print the errors and the calls of the right-hand side, and their ratio to those of a known code at equal error.
 
-    This is VODE's Adams methods, or where the problem is stiff the backward differentiation formulas of LSODA (those of VODE, as
+    The known code is VODE's Adams methods or, for stiff problems, LSODA's backward differentiation formulas (those of VODE, as
     SciPy translated it for its version 1.17, take up to a hundred times the steps that the Fortran code took).
     """
     figures = []

@@ -1,8 +1,8 @@
-"""Live pages: the size of the engine of each scene of the library, how long it takes to make, how fast a page solves and draws.
+"""Live pages: size of the engine of each scene of the library, time to make it, speed of solving and drawing.
 
-A run of 401 states in headless Chromium beside the same run by the engine on this processor, in the same minute; and the time
-from a slider that moves to the picture, of 120 moves, one for each frame of the screen, with the CPU time of the page's thread
-and the frames a second that are held.
+A run of 401 states in headless Chromium is compared with the same run by the engine on this processor, in the same minute. For
+120 moves of a slider, one per frame of the screen, the time from the move to the picture, the CPU time of the page's thread and
+the frame rate are measured.
 """
 
 import json
@@ -19,7 +19,7 @@ import udkjax as udk
 from udkjax.integrate import native_engine
 
 CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
-SPANS = {"andrews_squeezer": 0.03}  # s; of all others
+SPANS = {"andrews_squeezer": 0.03}  # s; all other scenes
 SPAN = 20.0
 RUNS, WARM, MOVES = 30, 20, 120
 PLAYER = "document.getElementById('player').player"
@@ -34,7 +34,7 @@ RUN_IN_PAGE = """async runs => {
   }
   return times.sort((a, b) => a - b)[times.length >> 1];
 }""".replace("PLAYER", PLAYER)
-# The page's code is compiled while it runs for the first time: that is not what a hand at a slider feels.
+# The page's code is compiled during its first run, before anyone moves a slider.
 MOVE_IN_PAGE = """async ([warm, moves]) => {
   const {live} = PLAYER, delays = [], median = x => [...x].sort((a, b) => a - b)[x.length >> 1];
   const {range, slider: {value, low, high}} = live.panel.rows[0], frame = () => new Promise(done => requestAnimationFrame(done));
@@ -53,7 +53,7 @@ MOVE_IN_PAGE = """async ([warm, moves]) => {
 
 
 def busy_seconds(client: Any) -> float:
-    """Return the CPU time (s) that the main thread of a page has taken, whatever else runs on the machine."""
+    """Return the CPU time (s) of the main thread of a page."""
     metrics = client.send("Performance.getMetrics")["metrics"]
     return next(metric["value"] for metric in metrics if metric["name"] == "TaskDuration")
 
@@ -111,7 +111,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
                 for row, file, run in pages:
                     page = browser.new_page(viewport={"width": 1280, "height": 800})
                     page.goto(file.as_uri())
-                    page.wait_for_timeout(500)  # until its engine is loaded
+                    page.wait_for_timeout(500)  # wait for its engine
                     client = page.context.new_cdp_session(page)
                     client.send("Performance.enable", {"timeDomain": "threadTicks"})
                     runs, warm, moves = (3, 1, 5) if smoke else (RUNS, WARM, MOVES)

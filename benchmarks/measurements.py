@@ -1,8 +1,8 @@
-"""Mechanisms whose numbers are known, what is measured of their motion, and which of these numbers that tells.
+"""Mechanisms with known numbers, the measurements of their motion, and the numbers that these determine.
 
-Which can be told was worked out by the singular values of the derivatives of the channels by the logarithms of the parameters,
-each channel in units of what it shows: root mean square of all samples, the smallest is at least 2e-3 in every set here. Motion
-alone never tells the scale of all masses, stiffnesses and dampings together: something whose size is known has to be left out.
+The sets were chosen by the singular values of the derivatives of the channels with respect to the logarithms of the parameters,
+each channel in units of its own size, as the root mean square over all samples: the smallest is at least 2e-3 in every set.
+Motion alone never determines the common scale of all masses, stiffnesses and dampings: one of them has to be known.
 """
 
 from collections.abc import Callable
@@ -21,11 +21,11 @@ from udkjax.study.identify.unknowns import Unknowns, apply_values
 LINKS = ("link1", "link2", "link3")
 CYLINDERS = ("boom cylinder", "stick cylinder", "bucket cylinder")
 PINS = ("joint.foot.angle", "joint.tip.angle", "joint.bucket pin.angle")
-EXACT = 1e-12  # tolerance of what is measured
+EXACT = 1e-12  # tolerance of the measured run
 
 
 class Measurement(NamedTuple):
-    """What is measured of a mechanism for `end` seconds at a `rate` (Hz), and the parameters to be found from it."""
+    """Measurements of a mechanism for `end` seconds at a `rate` (Hz), and the parameters to find from them."""
 
     mechanism: udk.Mechanism
     parameters: tuple[Any, ...]
@@ -35,20 +35,20 @@ class Measurement(NamedTuple):
 
     @property
     def ts(self) -> np.ndarray:
-        """The times of the samples."""
+        """Return the times of the samples."""
         return np.linspace(0.0, self.end, round(self.end * self.rate) + 1)
 
     @property
     def unknowns(self) -> Unknowns:
-        """The parameters: `names`, and their true values, `start`."""
+        """Return the parameters: `names`, and their true values, `start`."""
         return unknowns_of(self.mechanism, self.parameters)
 
     def with_values(self, x: np.ndarray) -> udk.Mechanism:
-        """The mechanism with other values of the parameters."""
+        """Return the mechanism with other values of the parameters."""
         return apply_values(self.mechanism, self.unknowns.targets, jnp.asarray(x))
 
     def predictor(self) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """(values, tolerance) -> channels (T, C) and how the run ended; compiled, a single run without derivatives."""
+        """Return the compiled function (values, tolerance) -> channels (T, C) and result, a single run without derivatives."""
         targets, ts = self.unknowns.targets, self.ts
         channels = tuple(channel_of(self.mechanism, text) for text in self.channels)
 
@@ -61,16 +61,16 @@ class Measurement(NamedTuple):
         return predicted
 
     def starts(self, count: int, spread: float, seed: int = 0) -> np.ndarray:
-        """First guesses (count, P): each parameter anywhere within `spread` of its true value."""
+        """Return first guesses (count, P): each parameter uniformly within `spread` of its true value."""
         truth = self.unknowns.guess
         return truth * np.random.default_rng(seed).uniform(1 - spread, 1 + spread, (count, len(truth)))
 
 
 def linkage(degrees: float = -45.0, damping: float = 0.4, end: float = 10.0) -> Measurement:
-    """The paper's linkage with some damping in its first bearing; what its coupler weighs is known.
+    """Return the paper's linkage with some damping in its first bearing; the mass of its coupler is known.
 
-    Its angle alone tells one number, by which gravity accelerates it, beside the damping; the height of its coupler the length.
-    Released above the ground it crosses the singular configurations, in line, again and again.
+    Its angle determines, in addition to the damping, only one number, the acceleration by gravity; the height of its coupler
+    determines the length. Released above the ground, it crosses the singular configurations again and again.
     """
     placed = udk.library.parallelogram(np.deg2rad(degrees))
     bearing = udk.TorsionSpring((udk.GROUND, LINKS[0]), 0.0, damping)
@@ -81,10 +81,10 @@ def linkage(degrees: float = -45.0, damping: float = 0.4, end: float = 10.0) -> 
 
 
 def four_bar(end: float = 5.0) -> Measurement:
-    """A four-bar on two encoders, with a crank that is known.
+    """Return a four-bar with two encoders and a known crank.
 
-    Of masses and inertias of three links the motion tells five numbers, up to a common factor: a coupler of length b and mass m
-    is felt as m / 2 at either end, and by its inertia less m b^2 / 4.
+    The motion determines five numbers of the masses and inertias of three links, up to a common factor: a coupler of length b
+    and mass m acts as m / 2 at either end, and by its inertia less m b^2 / 4.
     """
     parameters = (
         *(f"body.{body}.{what}" for body in ("coupler", "rocker") for what in ("mass", "inertia")),
@@ -94,7 +94,7 @@ def four_bar(end: float = 5.0) -> Measurement:
 
 
 def slider_crank(end: float = 5.0) -> Measurement:
-    """A slider-crank whose slider is on a spring with a damper; crank and rod are of known mass, which their weight compares."""
+    """Return a slider-crank whose slider is on a spring with a damper; crank and rod have known masses."""
     mechanism = udk.library.slider_crank(0.7, 4.0, driven=False, spring=(60.0, 1.6, 4.0))
     spring = (f"force.spring.{what}" for what in ("stiffness", "length", "damping"))
     parameters = (*spring, "body.slider.mass", udk.length("rod"))
@@ -102,15 +102,15 @@ def slider_crank(end: float = 5.0) -> Measurement:
 
 
 def excavator(end: float = 4.0) -> Measurement:
-    """An excavator's arm that swings on the oil in its cylinders, on encoders at three pins; what its boom weighs is known."""
+    """Return an excavator's arm on the oil in its cylinders, with encoders at three pins; the mass of its boom is known."""
     cylinders = (f"force.{name}.{what}" for what in ("stiffness", "damping") for name in CYLINDERS)
     return Measurement(udk.library.excavator(), (*cylinders, "body.bucket.mass", "body.stick.mass"), PINS, end, 50.0)
 
 
 def driven_excavator(end: float = 10.0) -> Measurement:
-    """An excavator's arm moved by its cylinders, whose forces are measured beside the angles: these tell masses, and geometry.
+    """Return an excavator's arm moved by its cylinders; their forces and the angles determine masses and geometry.
 
-    The bucket's cylinder only gets longer, so that the four-bar closes with a link half as long, or half as long again.
+    The bucket's cylinder only extends, so that the four-bar closes with a link from half to one and a half times as long.
     """
     mechanism = udk.library.excavator(driven=True, strokes=(0.3, -0.4, 0.2), frequencies=(1.6, 2.2, 2.8))
     masses = (*(f"body.{body}.mass" for body in ("boom", "stick", "bucket")), "body.stick.inertia", "body.bucket.inertia")
@@ -119,10 +119,10 @@ def driven_excavator(end: float = 10.0) -> Measurement:
 
 
 def sprung_chain(count: int = 20, end: float = 3.0) -> Measurement:
-    """Five links hung on each other, with torsion springs and dampers at the pins, pulled at the end by a known force.
+    """Return a chain of five links with torsion springs and dampers at the pins, pulled at the end by a known force.
 
-    The first `count` of 5 stiffnesses, 5 dampings, 5 masses, 4 inertias and the length of the last link. The inertia of the first
-    link is left out: beside its mass and the first spring, it hardly changes anything.
+    Parameters are the first `count` of 5 stiffnesses, 5 dampings, 5 masses, 4 inertias and the length of the last link. The
+    inertia of the first link is left out, since its effect is negligible compared with its mass and the first spring.
     """
     placed = udk.library.chain(5, angle=0.3, length=2.0, mass=5.0)
     pairs = zip((udk.GROUND, *placed.body_names), placed.body_names, strict=False)

@@ -1,4 +1,4 @@
-"""What an engineer asks of a mechanism: positions over a turn, torques, rest; beside scripts by SciPy, and pylinkage."""
+"""An engineer's tasks: positions over a turn, torques, equilibrium; compared with scripts by SciPy, and pylinkage."""
 
 import json
 import math
@@ -22,25 +22,25 @@ from udkjax.positions.march import march
 CRANK, COUPLER, ROCKER, GROUND = 0.5, 1.2, 0.8, 1.0
 START, TURN = math.pi / 3, 2 * math.pi
 INPUT, JOINT = "body.crank.angle", "joint.D.points[0][0]"
-POINTS = [f"joint.{name}.points" for name in "ABCD"]  # sixteen numbers: where each pin is on both of its links
+POINTS = [f"joint.{name}.points" for name in "ABCD"]  # sixteen numbers: the points of each pin on both of its links
 MEMBERS, VALUES, ROUNDS = 2000, 360, 5
-TOLERANCE = 1e-12  # m and rad: what all candidates must agree to
+TOLERANCE = 1e-12  # m and rad: tolerance within which all candidates must agree
 
 
 def linkage() -> udk.Mechanism:
-    """The crank-rocker that all candidates solve."""
+    """Return the crank-rocker that all candidates solve."""
     return udk.library.four_bar(START, lengths=(CRANK, COUPLER, ROCKER), ground=GROUND)
 
 
 def rocker(angle: np.ndarray, ground: Any = GROUND) -> np.ndarray:
-    """The angle of the rocker in closed form."""
+    """Return the angle of the rocker in closed form."""
     x, y = ground - CRANK * np.cos(angle), -CRANK * np.sin(angle)
     square = x**2 + y**2
     return np.arctan2(-y, -x) - np.arccos((square + ROCKER**2 - COUPLER**2) / (2 * np.sqrt(square) * ROCKER))
 
 
 def by_fsolve(values: np.ndarray) -> np.ndarray:
-    """A script: the loop of two angles, solved by SciPy from value to value."""
+    """Solve the loop of two angles by SciPy from value to value."""
 
     def loop(x: np.ndarray, s: float) -> list[float]:
         return [
@@ -57,9 +57,9 @@ def by_fsolve(values: np.ndarray) -> np.ndarray:
 
 
 def by_pylinkage(values: np.ndarray) -> float | None:
-    """CPU time (s) of a closed position of the same linkage by pylinkage's compiled solver; None where it is not installed.
+    """Return the CPU time (s) of a closed position of the same linkage by pylinkage's compiled solver; None if not installed.
 
-    In a process of its own, by the Python that `PYLINKAGE` names, by default this one.
+    It runs in a process of its own, by the Python that `PYLINKAGE` names, by default this one.
     """
     numbers = (CRANK, COUPLER, ROCKER, GROUND, values[0], len(values))
     command = [os.environ.get("PYLINKAGE", sys.executable), str(Path(__file__).with_name("pylinkage_positions.py"))]
@@ -81,7 +81,7 @@ def timed(run: Callable[[], Any], least: float = 0.05) -> Callable[[], float]:
 
 
 def positions(smoke: bool) -> list[dict[str, Any]]:
-    """Closed positions a second and core: of a batch of four-bars with other grounds, and of one."""
+    """Measure closed positions a second and core: of a batch of four-bars with other grounds, and of one."""
     members, rounds = (16, 1) if smoke else (MEMBERS, ROUNDS)
     mech, values = linkage(), START + np.linspace(0.0, TURN, VALUES)
     grounds = jnp.linspace(0.95, 1.05, members)
@@ -106,7 +106,7 @@ def positions(smoke: bool) -> list[dict[str, Any]]:
     np.asarray(moved(grounds)[1])
     lone, along = (udk.PositionBatch(mech, INPUT, names, derivatives=d) for names, d in (([JOINT], False), (POINTS, True)))
     given = {JOINT: np.asarray(grounds)}
-    few = min(members, 50)  # 26 MB of derivatives: to get fresh memory from the system takes longer than to fill it
+    few = min(members, 50)  # 26 MB of derivatives: allocating fresh memory takes longer than filling it
     pins = {name: np.repeat(np.asarray(mech.parameters()[name])[None], few, 0) for name in POINTS}
     assert np.max(np.abs(np.sin((lone(given, values).q[:, :, 2, 2] - exact) / 2))) < TOLERANCE
     candidates = {
@@ -130,7 +130,7 @@ def positions(smoke: bool) -> list[dict[str, Any]]:
 
 
 def rest(smoke: bool) -> list[dict[str, Any]]:
-    """The equilibrium of the four-bar under gravity, and its frequency: warm, beside a minimization of one coordinate."""
+    """Measure the equilibrium of the four-bar under gravity, and its frequency: warm, and a minimization over one coordinate."""
     mech = linkage()
 
     def height(s: float) -> float:
@@ -162,7 +162,7 @@ def rest(smoke: bool) -> list[dict[str, Any]]:
 
 
 def torque(smoke: bool) -> list[dict[str, Any]]:
-    """The torque of a slider-crank at 1,000 instants, warm, beside Lagrange's equation of one coordinate by differences."""
+    """Measure the torque of a slider-crank at 1,000 instants, warm, and Lagrange's equation of one coordinate by differences."""
     count = 20 if smoke else 1000
     mech, ts = udk.library.slider_crank(0.3, 4.0), np.linspace(0.0, 1.5, count)
 
@@ -193,5 +193,5 @@ def torque(smoke: bool) -> list[dict[str, Any]]:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print how fast positions, torques and rest are found; all candidates must agree."""
+    """Print the times of positions, torques and equilibrium; all candidates must agree."""
     return [*positions(smoke), *torque(smoke), *rest(smoke)]

@@ -1,7 +1,7 @@
 """Runs by each pseudoinverse and formulation, and of traced mechanisms: the paper's linkage, 5 s, 101 outputs, at 1e-8.
 
 Each method takes one run and 64 of them under `vmap`, by machine code and in plain JAX; Adams and BDF of diffrax take the same
-equations. A jitted function of a mechanism, a function of the library and stacked mechanisms stand beside a known mechanism.
+equations. A jitted function of a mechanism, a library function and stacked mechanisms are compared with a concrete one.
 """
 
 import statistics
@@ -19,7 +19,7 @@ MEMBERS, ROUNDS = 64, 9
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print CPU times in ms, in times the run by `Auto`, and the time to compile."""
+    """Print CPU times in ms and relative to the run by `Auto`, and the time to compile."""
     ts, members, rounds = (np.linspace(0.0, 0.1, 3), 2, 1) if smoke else (np.linspace(0.0, 5.0, 101), MEMBERS, ROUNDS)
     linkage, masses, angles = udk.library.parallelogram(), np.linspace(1.0, 1.2, members), np.linspace(-0.9, -0.5, members)
 

@@ -1,4 +1,4 @@
-"""The page: what was measured, in pictures and one table, self-contained."""
+"""The page of results: figures and one table, self-contained."""
 
 import re
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ STYLES = {"udkjax": {"color": "black", "lw": 2.2}, "C++": {"color": "#c03030", "
 
 
 def write(figures: Figures, judged: Rows, about: dict[str, Any], missing: Iterable[str], target: Path) -> None:
-    """Write the page of what the benchmarks returned, by name."""
+    """Write the page from the results of the benchmarks, by name."""
     style = re.search(r"<style>.*?</style>", Path(page.__file__).with_name("page.html").read_text(encoding="utf-8"), re.DOTALL)
     missing = list(missing)
     parts = [
@@ -82,7 +82,7 @@ def _pictures(figures: Figures) -> Iterable[str]:
 
 
 def _panels(rows: Rows, height: float) -> tuple[Figure, Any, list[str]]:
-    """A figure with one panel a motion, and what is to be drawn in each, in the order of the rows."""
+    """Return a figure with one panel for each motion, and the data of each, in the order of the rows."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots(1, len(MOTIONS), sharex=True, sharey=True), list(dict.fromkeys(row["name"] for row in rows))
 

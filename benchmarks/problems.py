@@ -1,4 +1,4 @@
-"""Initial value problems that the integrators are measured on: three that are not stiff, and three that are.
+"""Initial value problems for the integrators: three non-stiff and three stiff ones.
 
 Each right-hand side computes in NumPy (`xp=numpy`) as well as in JAX.
 """
@@ -17,10 +17,10 @@ class Problem(NamedTuple):
     y0: tuple[float, ...]
     end: float
     reached: tuple[float, ...]
-    scale: tuple[float, ...] = (1.0,)  # of each component: where it is smaller, its error is not relative to it
+    scale: tuple[float, ...] = (1.0,)  # of each component: if it is smaller, its error is relative to this
 
     def error(self, y: Any) -> float:
-        """The largest error of any component of a state at the end."""
+        """Return the largest error of any component of the end state."""
         return float(np.max(np.abs(np.asarray(y) - self.reached) / (np.array(self.scale) + np.abs(self.reached))))
 
 

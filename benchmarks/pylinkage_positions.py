@@ -1,8 +1,8 @@
-"""The four-bar of `mechanisms` in pylinkage's compiled solver, a program of its own: prints what it took and where the pin is.
+"""The four-bar of `mechanisms` in pylinkage's compiled solver, a separate program: prints its time and the position of the pin.
 
     python benchmarks/pylinkage_positions.py CRANK COUPLER ROCKER GROUND START STEPS
 
-By itself, since pylinkage's compiler (numba) asks for another version of llvmlite than udkjax may have. The linkage turns once.
+It is separate because pylinkage's compiler (numba) may need another version of llvmlite than udkjax. The linkage turns once.
 """
 
 import json
@@ -32,7 +32,7 @@ arguments = (
 
 
 def turn() -> np.ndarray:
-    """The pin (steps, 2), after each step."""
+    """Return the position of the pin (steps, 2) after each step."""
     return simulate(positions.copy(), *arguments, count, 1.0)[:, 3]
 
 

@@ -1,4 +1,4 @@
-"""One right-hand side of the paper's linkage: a user's dense script against udkjax by each of its methods."""
+"""One right-hand side of the paper's linkage: a user's dense script compared with each method of udkjax."""
 
 import statistics
 from typing import Any
@@ -16,7 +16,7 @@ EVALUATIONS, ROUNDS = 1000, 31
 
 
 def candidates(mechanism) -> dict:
-    """Right-hand sides y -> y' in JAX, by name."""
+    """Return right-hand sides y -> y' in JAX, by name."""
 
     def ours(equations):
         return lambda y: jnp.concatenate([y[12:], equations.accelerations(0.0, y[:12], y[12:])])
@@ -30,7 +30,7 @@ def candidates(mechanism) -> dict:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print time per evaluation and how many times faster than the script with pinv it is."""
+    """Print the time of an evaluation, and the speed-up over the script with pinv."""
     evaluations, rounds = (3, 2) if smoke else (EVALUATIONS, ROUNDS)
     mechanism = udk.library.parallelogram()
     y0 = jnp.concatenate([mechanism.q0.ravel(), mechanism.v0.ravel()])
@@ -39,7 +39,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
     for name, f in functions.items():
         np.testing.assert_allclose(f(y0), reference, rtol=0, atol=1e-2 if "Cholesky" in name else 1e-10, err_msg=name)
 
-    def loop(f):  # each evaluation needs the one before, so that none can be left out
+    def loop(f):  # each evaluation needs the one before, so that XLA cannot omit any
         return lambda y: jax.lax.fori_loop(0, evaluations, lambda _, y: y + 1e-12 * f(y), y)
 
     compiled = {name: Compiled(loop(f), y0) for name, f in functions.items()}

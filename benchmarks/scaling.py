@@ -1,6 +1,6 @@
-"""How one right-hand side grows with the scene, and what it takes until the first run is there.
+"""Growth of one right-hand side with the scene, and the time until the first run.
 
-Measured in whole runs by machine code, projected, with what a step takes besides: time over the right-hand sides counted.
+Measured in whole projected runs by machine code, as the time of a run divided by its number of right-hand sides.
 """
 
 import statistics
@@ -13,23 +13,23 @@ import udkjax as udk
 from benchmarks.common import cpu_seconds, in_turn
 
 SIZES = {"N-four-bar": (1, 2, 5, 10, 20, 40, 100, 200, 1000), "chain": (1, 10, 100, 1000)}
-FROM, UP_TO = 10, 1000  # the exponent is that of N-four-bars of so many: of fewer, what a call takes counts as well
+FROM, UP_TO = 10, 1000  # the exponent is fitted from this number of four-bars on: below, the overhead of a call matters
 ROUNDS, AT_LEAST = 9, 0.05  # s
 TS = np.array([0.0, 0.2])  # s
 
 
 def n_four_bar(n: int) -> udk.Mechanism:
-    """A row of n four-bars, in no singular configuration."""
+    """Return a row of n four-bars, away from singular configurations."""
     return udk.library.n_four_bar(n, 1.0)
 
 
 def chain(n: int) -> udk.Mechanism:
-    """A chain of n links."""
+    """Return a chain of n links."""
     return udk.library.chain(n, 0.4)
 
 
 def measured(name: str, make: Any, n: int) -> tuple[dict[str, Any], Any]:
-    """Build a scene, analyse and run it for the first time; and what times further runs."""
+    """Build a scene, analyse and run it for the first time; return the function that times further runs."""
     seconds = {}
 
     def timed(part: str, function: Any) -> Any:
@@ -48,14 +48,14 @@ def measured(name: str, make: Any, n: int) -> tuple[dict[str, Any], Any]:
 
 
 def exponent(rows: list[dict[str, Any]]) -> float:
-    """The slope of a straight line through the logarithms."""
+    """Return the slope of a straight line through the logarithms."""
     chosen = [(row["n"], row["us"]) for row in rows if row["name"] == "N-four-bar" and FROM <= row["n"] <= UP_TO]
     n, cost = np.log(np.array(chosen, float).reshape(-1, 2)).T
     return float(np.polyfit(n, cost, 1)[0]) if len(chosen) > 1 else float("nan")
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print figures for every size, and with what power of N they grow."""
+    """Print figures for every size, and the power of N with which they grow."""
     sizes = {"N-four-bar": (1, 2), "chain": (2,)} if smoke else SIZES
     cases = [(name, make, n) for name, make in (("N-four-bar", n_four_bar), ("chain", chain)) for n in sizes[name]]
     figures, timers = [], {}

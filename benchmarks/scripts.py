@@ -1,4 +1,4 @@
-"""What a user would write without udkjax for the paper's linkage: dense matrices, derivatives by JAX, diffrax."""
+"""A user's script without udkjax for the paper's linkage: dense matrices, derivatives by JAX, diffrax."""
 
 import diffrax
 import jax
@@ -11,7 +11,7 @@ MAX_STEPS = 100_000
 
 
 def psi(q):
-    """12 rows: each link's foot on the ground, its tip on the coupler."""
+    """Return 12 rows: each link's foot on the ground, its tip on the coupler."""
     link, coupler = q[:9].reshape(3, 3), q[9:]
     half = 0.5 * jnp.stack([jnp.cos(link[:, 2]), jnp.sin(link[:, 2])], axis=1)
     feet = link[:, :2] - half - jnp.stack([PIVOTS, 0.0 * PIVOTS], axis=1)
@@ -21,12 +21,12 @@ def psi(q):
 
 
 def gamma(q, v):
-    """-(Psi_q v)_q v."""
+    """Return -(Psi_q v)_q v."""
     return -jax.jvp(lambda q: jax.jvp(psi, (q,), (v,))[1], (q,), (v,))[1]
 
 
 def by_pinv(y):
-    """The Udwadia-Kalaba equation with a dense pseudoinverse, as the paper writes it."""
+    """Solve the Udwadia-Kalaba equation with a dense pseudoinverse, as the paper writes it."""
     q, v = y[:12], y[12:]
     root = MASS**-0.5
     psi_q = jax.jacfwd(psi)(q)
@@ -35,7 +35,7 @@ def by_pinv(y):
 
 
 def by_cholesky(y, baumgarte=10.0, tikhonov=1e-4, mass=MASS, weight=WEIGHT):
-    """The same with Cholesky factors of D D^T, regularized, and stabilized."""
+    """Solve it with Cholesky factors of D D^T, regularized, and stabilized."""
     q, v = y[:12], y[12:]
     root = mass**-0.5
     psi_q = jax.jacfwd(psi)(q)
@@ -46,7 +46,7 @@ def by_cholesky(y, baumgarte=10.0, tikhonov=1e-4, mass=MASS, weight=WEIGHT):
 
 
 def solve(ts, tikhonov=1e-4, adjoint=None):
-    """From a state (24,) and a tolerance to the coordinates (T, 12) at the times `ts`; masses and weight may be others."""
+    """Return a function from a state (24,) and a tolerance to the coordinates (T, 12) at `ts`; masses and weight may differ."""
 
     def run(y0, tol, mass=MASS, weight=WEIGHT):
         solution = diffrax.diffeqsolve(

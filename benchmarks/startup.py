@@ -1,6 +1,6 @@
-"""How long one waits for the first result: import, --help, the first trajectory, and what JAX's transformations of one take.
+"""Time to the first result: import, --help, the first trajectory, and JAX's transformations of one.
 
-Processes from start to end, with what they compile: nothing is cached, but where a name says so.
+Times of whole processes, compiling included: nothing is cached unless the name says so.
 """
 
 import os
@@ -50,7 +50,7 @@ PROGRAMS = {
     "python": "pass",
     "import jax": "import jax",
     "import udkjax": "import udkjax",
-    "import udkjax and simulate": "from udkjax import simulate",  # the package imports what is used
+    "import udkjax and simulate": "from udkjax import simulate",  # the package imports modules when they are used
     "udkjax --help": "import sys; sys.argv = ['udkjax', '--help']; from udkjax.cli import main; main()",
     "first trajectory, no cache": FIRST,
     "first trajectory, cached": FIRST,
@@ -58,7 +58,7 @@ PROGRAMS = {
 
 
 def waited(code: str, cache: Path, bytecode: Path) -> dict[str, float]:
-    """Wall and CPU time (s) of a Python process that keeps compiled programs in `cache` and modules' bytecode in `bytecode`.
+    """Return wall and CPU time (s) of a Python process with compiled programs in `cache` and bytecode in `bytecode`.
 
     Without bytecode Python would compile the sources of all packages each time, which triples the time of `import jax`. pip
     writes it when it installs; other installers, and settings such as PYTHONDONTWRITEBYTECODE, do not.
@@ -74,7 +74,7 @@ def waited(code: str, cache: Path, bytecode: Path) -> dict[str, float]:
 
 
 def transformed(bytecode: Path) -> list[dict[str, Any]]:
-    """Print how long each scene waits for each transformation, the least of two."""
+    """Print the time of each transformation for each scene, the lesser of two."""
     print(f"\n{'s, nothing cached':28} {' '.join(f'{name:>13}' for name in RUNS)}")
     figures = []
     for scene, end in SCENES.items():
@@ -90,7 +90,7 @@ def transformed(bytecode: Path) -> list[dict[str, Any]]:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print the time from the start of Python to its end, medians."""
+    """Print the times from the start of Python to its end, as medians."""
     figures = []
     programs = {name: code for name, code in PROGRAMS.items() if not smoke or code != FIRST}
     print(f"{'start of a process':28} {'s':>7} {'CPU s':>7}")

@@ -1,4 +1,4 @@
-"""A sweep of 100,000 ten-second runs of the paper's linkage: throughput, memory, and what a kill in the middle of it costs."""
+"""A sweep of 100,000 ten-second runs of the paper's linkage: throughput, memory, and the cost of a kill in the middle."""
 
 import json
 import signal
@@ -20,12 +20,12 @@ from udkjax.study.members import cores
 
 LINKS = ("link1", "link2", "link3")
 END = 10.0  # s
-MEMORY = 40  # bytes for each member of the sweep: so little that there are many chunks, one of which is hit by a kill
-KILLED = 0.5  # of the members
+MEMORY = 40  # bytes for each member of the sweep: small, to get many chunks, one of which is hit by the kill
+KILLED = 0.5  # fraction of the members
 
 
 class Size(NamedTuple):
-    """How many values each axis has."""
+    """Number of values on each axis."""
 
     masses: int
     lengths: int
@@ -37,7 +37,7 @@ FULL, SMOKE = Size(20, 10, 25, 20), Size(2, 2, 2, 16)
 
 
 def arguments(size: Size, end: float) -> dict[str, Any]:
-    """What the sweep is: mass and length of the links, tied; the angle from which they are released, hanging; and tolerance."""
+    """Return the axes: mass and length of the links, tied; their angle of release, hanging; and tolerance."""
     return {
         "axes": {
             "mass": udk.Axis(np.geomspace(0.5, 2.0, size.masses), of=[f"body.{link}.mass" for link in LINKS], units="kg"),
@@ -51,7 +51,7 @@ def arguments(size: Size, end: float) -> dict[str, Any]:
 
 
 def tolerances(size: Size) -> np.ndarray:
-    """The tolerances of the members."""
+    """Return the tolerances of the members."""
     return np.geomspace(1e-10, 1e-4, size.tolerances)
 
 
@@ -64,7 +64,7 @@ def _angle(mechanism: Any, angle: Any) -> Any:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Sweep once, once more with a kill in the middle, and print what it took beside the same work by `jax.vmap` alone."""
+    """Sweep once, and once more with a kill in the middle; print the cost of both and of the same work by `jax.vmap` alone."""
     size, end = (SMOKE, 0.2) if smoke else (FULL, END)
     count = int(np.prod(size))
     before = single_program(size, end, smoke)
@@ -103,7 +103,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
 
 
 def single_program(size: Size, end: float, smoke: bool) -> dict[str, float]:
-    """Runs and steps per second of CPU time by `jax.vmap` alone, as in the benchmark `batch`, at the sweep's tolerances."""
+    """Return runs and steps per second of CPU time by `jax.vmap` alone, as in `batch`, at the sweep's tolerances."""
     mechanism, ts, members = udk.library.parallelogram(), np.array([0.0, end]), 16 if smoke else MEMBERS
     y0 = states(angles(-45.0, members))
 
@@ -120,7 +120,7 @@ def single_program(size: Size, end: float, smoke: bool) -> dict[str, float]:
 
 
 def _process(size: Size, end: float, folder: str, killed: bool = False) -> dict[str, float]:
-    """Run the sweep in a process of its own; return what it took, or nothing where it was to be killed and was."""
+    """Run the sweep in a process of its own; return its cost, or None if it was killed as intended."""
     words = [sys.executable, "-m", "benchmarks.sweep", json.dumps({"size": size, "end": end, "folder": folder, "killed": killed})]
     ran = subprocess.run(words, capture_output=True, text=True, check=False)
     if killed and ran.returncode == -signal.SIGKILL:
@@ -131,7 +131,7 @@ def _process(size: Size, end: float, folder: str, killed: bool = False) -> dict[
 
 
 def _sweep(size: Size, end: float, folder: str, killed: bool) -> dict[str, float]:
-    """In a process of its own: what the sweep takes once its program is compiled and its members are in order."""
+    """Measure, in this process, the sweep after its program is compiled and its members are sorted."""
     import hashlib
     import os
     import resource

@@ -1,4 +1,4 @@
-"""What is promised, as data: each claim with its target, and where in the figures it is read."""
+"""The promises as data: each claim with its target, and its place in the figures."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ Figures = dict[str, Rows]  # by benchmark
 
 
 class Claim(NamedTuple):
-    """A figure that is to be at most `target`, or at least."""
+    """A figure that must be at most, or at least, `target`."""
 
     name: str
     benchmark: str
@@ -19,7 +19,7 @@ class Claim(NamedTuple):
     at_least: bool = False
 
     def judged(self, figures: Figures) -> dict[str, Any]:
-        """Return the claim with what was measured: `holds` is None where it was not."""
+        """Return the claim with the measured figure: `holds` is None without one."""
         figure = self.read(figures[self.benchmark]) if self.benchmark in figures else None
         if figure is not None and figure != figure:
             figure = None
@@ -29,7 +29,7 @@ class Claim(NamedTuple):
 
 
 def pick(rows: Rows, key: str, **wanted: Any) -> list[Any]:
-    """The values of `key` in the rows that have the values `wanted`."""
+    """Return the values of `key` in the rows that have the values `wanted`."""
     chosen = (row for row in rows if all(row.get(name) == value for name, value in wanted.items()))
     return [row[key] for row in chosen if row.get(key) is not None]
 
@@ -48,7 +48,7 @@ def _reciprocal(read: Callable[[Rows], float | None]) -> Callable[[Rows], float 
 
 
 def _least(key: str, names: tuple[str, ...], **wanted: Any) -> Callable[[Rows], float | None]:
-    """Read the least of several; infinite where they were measured, and none reached the error in question."""
+    """Read the least of several; infinite if they were measured but none reached the required error."""
 
     def found(rows: Rows) -> float | None:
         chosen = [row for name in names for row in rows if all(row.get(k) == v for k, v in ({"name": name} | wanted).items())]
@@ -150,7 +150,7 @@ CLAIMS = tuple(_claims())
 
 
 def judge(figures: Figures) -> Rows:
-    """Hold every claim against the figures."""
+    """Compare every claim with the figures."""
     return [claim.judged(figures) for claim in CLAIMS]
 
 

@@ -1,7 +1,7 @@
 """Work and precision: 20 s of the paper's linkage, 401 outputs: udkjax, the equivalent C++ program, a user's script.
 
-How exact a run is that crosses singular configurations is partly chance: where its steps end beside them. So each is one of five
-runs from starts beside each other, whose errors are averaged in logarithms.
+The accuracy of a run that crosses singular configurations is partly chance, depending on where steps end near them. So errors are
+averaged, in logarithms, over five runs from neighbouring starts.
 """
 
 import statistics
@@ -19,17 +19,17 @@ from benchmarks.scripts import solve
 
 TARGETS = (1e-6, 1e-8, 1e-10)  # m and rad
 TOLERANCES = tuple(float(tol) for tol in 10 ** -np.arange(4.0, 12.01, 0.5))
-REGULARIZATIONS = (1e-4, 1e-10)  # of the script: what one would take first, and what is the most accurate
+REGULARIZATIONS = (1e-4, 1e-10)  # regularizations of the script: the obvious one, and the most accurate one
 OURS, NATIVE = "udkjax", "C++"
 BESIDE = (0.0, -1.0, -0.5, 0.5, 1.0)  # degrees
 ROUNDS, AT_LEAST = 7, 0.005  # s of CPU time that a timing of one start takes at least
 
-# Coordinates (T, 12) from each start, and the CPU time of a run from any of them, from a tolerance.
+# From a tolerance: coordinates (T, 12) from each start, and the CPU time of a run.
 Candidate = tuple[Callable[[float], list[np.ndarray]], Callable[[float], float]]
 
 
 def compiled(run: Callable, y0s: Sequence[Any], at_least: float) -> tuple[Candidate, float]:
-    """A candidate of a function of (y0, tolerance) that returns coordinates, and how long it took to compile (s)."""
+    """Return a candidate from a function of (y0, tolerance) that returns coordinates, and the time to compile it (s)."""
     run = Compiled(run, y0s[0], jnp.asarray(TOLERANCES[0]))
 
     def seconds(tol: float) -> float:
@@ -39,7 +39,7 @@ def compiled(run: Callable, y0s: Sequence[Any], at_least: float) -> tuple[Candid
 
 
 def ours(mechanism: Any, ts: Any) -> Callable:
-    """q (T, 12) by `udk.simulate` with its defaults but for the tolerance."""
+    """Return q (T, 12) by `udk.simulate` with its defaults except the tolerance."""
 
     def run(y0, tol):
         state = udk.State(y0[:12].reshape(4, 3), y0[12:].reshape(4, 3))
@@ -49,7 +49,7 @@ def ours(mechanism: Any, ts: Any) -> Callable:
 
 
 def cpp(starts: Sequence[float], ts: Any, at_least: float) -> Candidate:
-    """The C++ program."""
+    """Return the candidate of the C++ program."""
 
     def runs(tol: float, states: bool, seconds: float) -> list[dict[str, Any]]:
         times = {"t1": float(ts[-1]), "outputs": len(ts)}
@@ -62,13 +62,13 @@ def cpp(starts: Sequence[float], ts: Any, at_least: float) -> Candidate:
 
 
 def error(tasks: Sequence[Problem], found: Sequence[np.ndarray]) -> float:
-    """The geometric mean of the errors of runs from starts beside each other; nan where one broke down."""
+    """Return the geometric mean of the errors of runs from neighbouring starts; nan if one failed."""
     errors = [task.error(q) for task, q in zip(tasks, found, strict=True)]
     return float(np.exp(np.mean(np.log(errors))))
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print the CPU time that each takes at errors of 1e-6, 1e-8 and 1e-10, and how many times udkjax's that is."""
+    """Print the CPU time of each at errors of 1e-6, 1e-8 and 1e-10, also relative to udkjax."""
     rounds, tolerances, at_least = (1, TOLERANCES[2:9:2], 0.0) if smoke else (ROUNDS, TOLERANCES, AT_LEAST)
     figures, seconds_to_compile = [], {}
     print(f"{'20 s, 401 outputs':20} {'start':>6} {'error':>7} {'ms':>9} {'times ours':>11}")
@@ -89,7 +89,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
             (name, tol): lambda timer=timer, tol=tol: timer(tol)
             for tol in tolerances
             for name, (_, timer) in candidates.items()
-            if np.isfinite(errors[name, tol])  # not of what has come to no end
+            if np.isfinite(errors[name, tol])  # except for runs that did not end
         }
         times = in_turn(timers, rounds)
         for (name, tol), seconds in times.items():

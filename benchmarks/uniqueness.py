@@ -1,4 +1,4 @@
-"""Which multipliers of the paper's linkage are unique, for a thousand states in one call, beside NumPy scripts that say the same.
+"""Unique multipliers of the paper's linkage for a thousand states in one call, compared with NumPy scripts for the same.
 
 The scripts have the Jacobian of this one linkage written by hand; here it is differentiated from the joints of any scene.
 """
@@ -16,23 +16,23 @@ from benchmarks.common import Compiled, cpu_seconds, in_turn
 
 STATES, FEW = 1000, 20
 ROUNDS = 9
-TOL = 1e-6  # of the rank and of the shares, as in the package
+TOL = 1e-6  # thresholds of the rank and of the shares, as in the package
 
 
 def angles(count: int) -> np.ndarray:
-    """Of the links (rad): outside of the singular configurations."""
+    """Return angles of the links (rad) away from singular configurations."""
     return np.random.default_rng(0).uniform(-3.0, -0.2, count)
 
 
 def coordinates(theta: np.ndarray) -> np.ndarray:
-    """Of all bodies (states, 4, 3)."""
+    """Return coordinates of all bodies (states, 4, 3)."""
     e, zero = np.stack([np.cos(theta), np.sin(theta)], axis=1), np.zeros((len(theta), 1))
     links = [np.concatenate([[x, 0.0] + e / 2, theta[:, None]], axis=1) for x in (0.0, 1.0, 2.0)]
     return np.stack([*links, np.concatenate([[1.0, 0.0] + e, zero], axis=1)], axis=1)
 
 
 def hand_written(q: np.ndarray) -> np.ndarray:
-    """Psi_q (states, 12, 12) of the linkage."""
+    """Return Psi_q (states, 12, 12) of the linkage."""
     matrix = np.zeros((len(q), 12, 12))
     across = np.stack([-np.sin(q[:, :, 2]), np.cos(q[:, :, 2])], axis=2) / 2
     for k, spot in enumerate((-1.0, 0.0, 1.0)):
@@ -45,22 +45,22 @@ def hand_written(q: np.ndarray) -> np.ndarray:
 
 
 def share(u: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """The length of each row of the left null space."""
+    """Return the length of each row of the left null space."""
     return np.sqrt(np.sum(np.where((sigma <= TOL * sigma[..., :1])[..., None, :], u, 0.0) ** 2, axis=-1))
 
 
 def state_by_state(q: np.ndarray) -> np.ndarray:
-    """As a script would: one after another."""
+    """Compute one state after another, as a script would."""
     return np.array([share(*np.linalg.svd(hand_written(one[None])[0])[:2]) for one in q])
 
 
 def all_at_once(q: np.ndarray) -> np.ndarray:
-    """By NumPy's stacked matrices."""
+    """Compute all states by NumPy's stacked matrices."""
     return share(*np.linalg.svd(hand_written(q))[:2])
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print how long a state takes, by each; all agree to 1e-10, or the figures would be worthless."""
+    """Print the time of a state by each way; all must agree to 1e-10."""
     mechanism, count = udk.library.parallelogram(), FEW if smoke else STATES
     q = coordinates(angles(count))
     here = Compiled(jax.vmap(lambda q: udk.uniqueness(mechanism, 0.0, q).share), jnp.asarray(q))

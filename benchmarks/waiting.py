@@ -1,7 +1,7 @@
-"""How long one waits for what is asked once: eager transformations, events, kinematics, statics and modes, and commands.
+"""Waiting times of single requests: eager transformations, events, kinematics, statics and modes, and commands.
 
-Each in a fresh process, first with nothing cached, then with what that has left on disk; and the second call within a process.
-What a call itself waits for is told apart from Python, JAX and the package, which a process imports once.
+Each runs in a fresh process, first with nothing cached, then with the files of that run; and the second call within a process.
+The time of the call is separated from the imports of Python, JAX and the package, once per process.
 """
 
 import statistics
@@ -15,7 +15,7 @@ from benchmarks.common import cpu_seconds
 from benchmarks.startup import SCENE, waited
 
 TIMES = 3
-WARM_CALLS = 200  # the first ones are by code that was compiled quickly
+WARM_CALLS = 200  # the first ones use code that was compiled quickly
 LINKAGE, CRANK_ROCKER = (SCENE.format(scene=f"{name}()", end=5.0) for name in ("parallelogram", "four_bar"))
 EVENT = """
 import jax, numpy as np
@@ -44,11 +44,11 @@ CASES = {
     "udkjax modes": COMMAND.format(words=f"modes {FOUR_BAR}"),
     "udkjax animate": COMMAND.format(words=f"animate {FOUR_BAR} --out {{folder}}/page.html --t1 5"),
 }
-QUICK = (IMPORT, "travel")  # by themselves where nothing is measured
+QUICK = (IMPORT, "travel")  # imported even if nothing is measured
 
 
 def waits(name: str, code: str, bytecode: Path) -> dict[str, Any]:
-    """Return the wall and CPU times of a process (s), with nothing cached and again: medians."""
+    """Return the median wall and CPU times of a process (s), with nothing cached and again."""
     runs: dict[str, list[dict[str, float]]] = {"cold": [], "again": []}
     for _ in range(TIMES):
         with tempfile.TemporaryDirectory() as cache:
@@ -62,7 +62,7 @@ def waits(name: str, code: str, bytecode: Path) -> dict[str, Any]:
 
 
 def call_times(smoke: bool) -> list[dict[str, Any]]:
-    """Return the times of calls with known numbers, warm (ms of CPU): medians."""
+    """Return the median times of warm calls with concrete numbers (ms of CPU)."""
     import udkjax as udk
 
     mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, 5.0, 101)
@@ -79,7 +79,7 @@ def call_times(smoke: bool) -> list[dict[str, Any]]:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print how long each case takes."""
+    """Print the time of each case."""
     figures = call_times(smoke)
     for row in figures:
         print(f"{row['name']:28} {row['milliseconds']:8.3f} ms of CPU")

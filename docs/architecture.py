@@ -22,7 +22,7 @@ HERE = Path(__file__).parent
 PICTURE, PAGE = HERE / "theory" / "architecture.svg", HERE / "theory" / "architecture.md"
 BLOCK = re.compile(r"(?<=<!-- plan -->\n).*?(?=<!-- end of the plan -->)", re.S)
 GROUND = "."  # the modules of the package that are in no folder
-ASIDE = ("integrate",)  # folders drawn beside the wing of positions
+ASIDE = ("integrate",)  # folders drawn to the right of the wing of positions
 Arrow = tuple[str, str]  # from the folder that imports to the one it imports from
 
 
@@ -259,7 +259,7 @@ def draw(house: House) -> str:
 
 
 def places(house: House) -> dict[str, tuple[int, int, int, int]]:
-    """Return where each folder is drawn: x, y, width, height. Those aside are as high as the floors beside them."""
+    """Return where each folder is drawn: x, y, width, height."""
     size = house.sizes("folder")
     rows: dict[int, list[str]] = {}
     for folder in house.folders:

@@ -1,7 +1,7 @@
-"""A hook of MkDocs: behind each public class in the reference a table of its arguments or fields, and the page of commands.
+"""A hook of MkDocs: adds a table of arguments or fields to each public class of the reference, and makes the page of commands.
 
-A class says what they are in its docstring (Args, Attributes), or by a comment beside a field; its signature says the rest.
-Commands are functions of their options, with the same sections.
+Their meanings come from the docstring of a class (Args, Attributes) or from the comment on the line of a field, the rest from its
+signature. Commands are functions of their options, with the same sections.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Put a table behind each class that a page of the reference names, and all commands where they are to be."""
+    """Add a table after each class on a page of the reference, and replace `COMMANDS` by all commands."""
     if COMMANDS in markdown:
         from udkjax.cli import COMMANDS as names
 
@@ -31,7 +31,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def command(name: str) -> str:
-    """The section of a command, in Markdown: what it does, and its options."""
+    """Return the section of a command in Markdown: description and options."""
     function = getattr(importlib.import_module(f"udkjax.cli.{name}"), name)
     said, text = sections(function), inspect.getdoc(function) or ""
     lines = [
@@ -57,13 +57,13 @@ OPTIONS = "\n    options: {show_docstring_parameters: false, show_docstring_attr
 
 
 def resolve(name: str) -> type:
-    """The class of a full name."""
+    """Return the class of a full name."""
     module, _, attribute = name.rpartition(".")
     return getattr(importlib.import_module(module), attribute)
 
 
 def table(cls: type) -> str:
-    """The table of a class in Markdown; an empty text where there is nothing to say."""
+    """Return the table of a class in Markdown; empty if it has no arguments or fields."""
     if issubclass(cls, Enum):
         lines = [f"| `{member.name}` | {comments(cls).get(member.name) or str(member)} |" for member in cls]
         return "\n".join(["| Member | Meaning |", "|---|---|", *lines, ""])
@@ -75,7 +75,7 @@ def table(cls: type) -> str:
 
 
 def described(cls: type) -> Iterator[tuple[str, str, str, str]]:
-    """Name, type, default and meaning of what a class is made of, or holds: the arguments of its constructor."""
+    """Iterate over name, type, default and meaning of the arguments of a class's constructor."""
     if cls.__init__ is object.__init__ and not hasattr(cls, "_fields"):
         return
     mentioned = set(re.findall(r"`(\w+)`", inspect.getdoc(cls) or ""))
@@ -83,12 +83,12 @@ def described(cls: type) -> Iterator[tuple[str, str, str, str]]:
     fields = {field.name: field.type for field in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else {}
     for name, parameter in inspect.signature(cls).parameters.items():
         if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            kind = type_text(fields.get(name, parameter.annotation))  # a field says the shape that its converter makes
+            kind = type_text(fields.get(name, parameter.annotation))  # a field has the shape after conversion
             yield name, kind, default_text(cls, name, parameter), meanings.get(name, "").replace("|", "\\|")
 
 
 def sections(cls: object) -> dict[str, str]:
-    """What docstrings of a class, its constructor and its bases, or of a function, say of arguments and attributes."""
+    """Return the descriptions of arguments and attributes in the docstrings of a class and its bases, or of a function."""
     found: dict[str, str] = {}
     for each in reversed(getattr(cls, "__mro__", (cls,))):
         for doc in (each.__dict__.get("__doc__") or each.__doc__, getattr(each.__dict__.get("__init__"), "__doc__", None)):
@@ -99,7 +99,7 @@ def sections(cls: object) -> dict[str, str]:
 
 
 def comments(cls: type) -> dict[str, str]:
-    """The comments beside the fields of a class and of its bases."""
+    """Return the comments on the lines of fields of a class and its bases."""
     found: dict[str, str] = {}
     for each in reversed(cls.__mro__):
         try:
@@ -121,24 +121,24 @@ def comments(cls: type) -> dict[str, str]:
 
 
 def type_text(annotation: object) -> str:
-    """A type in words: arrays by their shapes."""
+    """Return a type in words: arrays by their shapes."""
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
     text = MODULE.sub("", ARRAY.sub(shape, text)).replace("~", "")
     return "" if annotation is inspect.Parameter.empty else f"`{text}`".replace(" | ", " or ")
 
 
 def shape(found: re.Match[str]) -> str:
-    """An array's shape in words."""
+    """Return an array's shape in words."""
     sizes = found[2].split()
     return "number" if not sizes else f"array ({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"
 
 
 def default_text(cls: type, name: str, parameter: inspect.Parameter) -> str:
-    """A default as one would write it."""
+    """Return a default as written in code."""
     value = parameter.default
     if value is inspect.Parameter.empty:
         return "required"
-    if dataclasses.is_dataclass(cls):  # whose signature shows that there is a factory, not what it makes
+    if dataclasses.is_dataclass(cls):  # whose signature has a factory instead of the default
         field = {f.name: f for f in dataclasses.fields(cls)}.get(name)
         value = field.default if field is not None and field.default is not dataclasses.MISSING else value
     return f"`{value!r}`" if len(repr(value)) < 40 and "<" not in repr(value) else ""

@@ -2,12 +2,12 @@
 
 De Falco, Pennestrì and Vita (2005), section 6: the five-bar parallelogram is released from rest and simulated for 20 s. As in the
 paper the rank threshold is the tolerance, in the units of D, and the integrator is Adams-Moulton of variable order and step. Each
-run is held against the exact solution, which the paper did not have.
+run is compared with the exact solution, which the paper did not have.
 
     python examples/paper_table.py [--end 20] [--out FOLDER]
 
-Thirty runs; the stiff ones, with the paper's gains of 1000 and 100, take two minutes on two cores, beside a minute to compile.
-With a folder, what is finished is kept there, and the same command again goes on from it. What the figures mean: `udkjax report`.
+Thirty runs; the stiff ones, with the paper's gains of 1000 and 100, take two minutes on two cores, after a minute to compile.
+With a folder, finished runs are kept there, and repeating the command continues. `udkjax report` explains the figures.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def table(end: float = 20.0, out: Path | None = None, progress: Any = None) -> A
         reference=exact_coordinates(mech, ts, state.q, state.v),
         solver=udk.Adams(),
         dt0=0.66e-2,  # s, of the paper
-        drift_tol=np.inf,  # a run goes on, however open its loops
+        drift_tol=np.inf,  # a run continues, however open its loops
         max_steps=200_000,
         out=out,
         progress=progress,

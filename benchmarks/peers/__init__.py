@@ -1,7 +1,7 @@
 """Work and precision of other programs on the paper's linkage: 20 s from rest at -45 and +60 degrees, each set up for accuracy.
 
-One module for each program, which imports it only to run it: `pip install .[peers]` brings those that have wheels, and the ones
-missing are named. Each program runs in a process of its own, on one thread: one that crashes takes no other with it.
+There is one module for each program, imported only to run it: `pip install .[peers]` installs those that have wheels, and missing
+ones are named. Each program runs in its own process, on one thread, so that a crash does not affect the others.
 """
 
 import json
@@ -18,7 +18,7 @@ from benchmarks.peers.peer import Peer
 
 MODULES = ("scipy_numpy", "numba_lsoda", "pinocchio_scipy", "mujoco_rk4", "mjx_batch", "exudyn_alpha", "drake_discrete")
 SMOKE = 0.5  # s of the trajectory
-LIMIT = 1200.0  # s on the clock for all runs of one module
+LIMIT = 1200.0  # s of wall time for all runs of one module
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMBA")}
 
 
@@ -27,12 +27,12 @@ PEERS = tuple(peer for peers in PEERS_OF.values() for peer in peers)
 
 
 def missing() -> list[str]:
-    """The packages that are not installed."""
+    """Return the packages that are not installed."""
     return list(dict.fromkeys(peer.package for peer in PEERS if peer.available() is None))
 
 
 def rows(module: str, smoke: bool = False) -> Iterator[dict]:
-    """Run the measurements of a module, here and now: {name, version, batch, start, end, knob, error, seconds}.
+    """Run the measurements of a module in this process: {name, version, batch, start, end, knob, error, seconds}.
 
     `start` is in degrees, `error` the largest of any coordinate at outputs 0.05 s apart (m, rad), `seconds` the CPU time of one
     trajectory until `end` (s). In place of it, a batch has its `trajectories_per_second` of CPU time.
@@ -50,7 +50,7 @@ def rows(module: str, smoke: bool = False) -> Iterator[dict]:
 
 
 def elsewhere(module: str, smoke: bool) -> list[dict]:
-    """`rows` in a process of its own, on one thread; those before it broke down, if it did, and a line that says why."""
+    """Run `rows` in a process of its own, on one thread; return the rows until a failure, and a line with the reason."""
     command = [sys.executable, "-m", "benchmarks.peers", module, *(["--smoke"] if smoke else [])]
     place, environment = Path(__file__).parents[2], os.environ | ONE_THREAD
     with TemporaryFile("w+") as printed, TemporaryFile("w+") as errors:
@@ -64,7 +64,7 @@ def elsewhere(module: str, smoke: bool) -> list[dict]:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print the error that each program reached and the time that it took, and name the ones that are missing."""
+    """Print the error and time of each program, and name the missing ones."""
     figures = []
     print(f"{'peer':32} {'version':9} {'start':>6} {'batch':>6} {'knob':>8} {'error':>9} {'CPU time':>9}")
     for module in MODULES:

@@ -6,7 +6,7 @@ from benchmarks.peers.peer import GRAVITY, INERTIA, MASS, PINS, PIVOTS, SPACING,
 
 
 def setup(problem: Problem) -> Run:
-    """The coupler hangs on link 1."""
+    """The coupler is attached to link 1."""
     from pydrake.math import RigidTransform  # pyright: ignore[reportMissingImports]
     from pydrake.multibody import plant as multibody  # pyright: ignore[reportMissingImports]
     from pydrake.multibody import tree  # pyright: ignore[reportMissingImports]

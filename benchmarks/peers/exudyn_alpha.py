@@ -6,11 +6,11 @@ import numpy as np
 
 from benchmarks.peers.peer import GRAVITY, INERTIA, MASS, PINS, PIVOTS, SPACING, Coordinates, Peer, Problem, Run
 
-SPECTRAL_RADIUS = 0.9  # of the generalized alpha method at infinite frequency
+SPECTRAL_RADIUS = 0.9  # spectral radius of the generalized alpha method at infinite frequency
 
 
 def setup(problem: Problem, index: int, radius: float = SPECTRAL_RADIUS) -> Run:
-    """`index` 3 solves with the joints as they are, 2 with their velocities. The redundant row is left to the factorization."""
+    """`index` 3 solves with joints in positions, 2 in velocities. The factorization handles the redundant row."""
     import exudyn  # pyright: ignore[reportMissingImports]
     import exudyn.itemInterface as item  # pyright: ignore[reportMissingImports]
 
@@ -43,7 +43,7 @@ def setup(problem: Problem, index: int, radius: float = SPECTRAL_RADIUS) -> Run:
     )
     settings.timeIntegration.newton.useModifiedNewton = True
     settings.timeIntegration.newton.relativeTolerance = settings.timeIntegration.newton.absoluteTolerance = 1e-10
-    settings.timeIntegration.adaptiveStep = False  # it would only halve a step that failed
+    settings.timeIntegration.adaptiveStep = False  # it would only halve a failed step
     settings.timeIntegration.verboseMode = 0
     settings.linearSolver.solverType = exudyn.LinearSolverType.EigenDense
     settings.linearSolver.ignoreSingularJacobian = True
@@ -55,7 +55,7 @@ def setup(problem: Problem, index: int, radius: float = SPECTRAL_RADIUS) -> Run:
         settings.timeIntegration.numberOfSteps = round(SPACING / step) * (len(problem.ts) - 1)
         mbs.SolveDynamic(settings, updateInitialValues=False)
         stored = [mbs.GetSensorStoredData(sensor)[:, 1:4] for sensor in sensors]
-        return problem.q0 + np.concatenate(stored, axis=1)  # it counts from the reference
+        return problem.q0 + np.concatenate(stored, axis=1)  # it is relative to the reference
 
     return run
 

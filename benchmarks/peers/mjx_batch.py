@@ -14,12 +14,12 @@ TRAJECTORIES = 64
 
 
 def setup(batch: Batch) -> Run:
-    """One program for all steps: from the step and their number between outputs, and the angles at the start."""
+    """Return one program for all steps, of the step, the number of steps between outputs, and the initial angles."""
     mujoco = import_module("mujoco")
     mjx = import_module("mujoco.mjx")
 
     plain = mujoco.MjModel.from_xml_string(mjcf())
-    plain.opt.iterations, plain.opt.ls_iterations = 1, 4  # without inequalities the first Newton step solves it
+    plain.opt.iterations, plain.opt.ls_iterations = 1, 4  # without inequalities, one Newton step solves it
     links = [plain.joint(f"link{i + 1}").qposadr[0] for i in range(3)]
     coupler = plain.joint("coupler").qposadr[0]
     outputs = len(batch.problems[0].ts)

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.peers.peer import GRAVITY, INERTIA, MASS, PINS, PIVOTS, SPACING, Coordinates, Peer, Problem, Run, coordinates
 
 STIFFNESS = 1.5  # frequency of a connection times the step: damped critically, the method is stable up to 2.8
-HARD, SOFT = 0.9999, 0.999  # impedances: the most that MuJoCo allows; and what crosses singular configurations in larger steps
+HARD, SOFT = 0.9999, 0.999  # impedances: MuJoCo's largest; and one that crosses singular configurations in larger steps
 
 LINK = """
     <body name="link{i}" pos="{x} 0 0">
@@ -36,7 +36,7 @@ MODEL = """
 
 
 def mjcf() -> str:
-    """The linkage with all angles zero, where it is closed."""
+    """Return the linkage with all angles zero, where it is closed."""
     coupler = COUPLER.format(centre=-PINS[0], mass=MASS[3], inertia=INERTIA[3])
     numbers = [{"i": i + 1, "x": PIVOTS[i], "mass": MASS[i], "inertia": INERTIA[i]} for i in range(3)]
     links = "".join(LINK.format(**each, carried="" if each["i"] > 1 else coupler) for each in numbers)
@@ -44,7 +44,7 @@ def mjcf() -> str:
 
 
 def stiffened(model, step: float, impedance: float):
-    """The same model with this step (s), its connections critically damped and as stiff as it allows."""
+    """Return the model with this step (s), its connections critically damped and as stiff as the step allows."""
     frequency = STIFFNESS / step
     model.opt.timestep = step
     model.eq_solref[:] = -(frequency**2), -2 * frequency
@@ -53,10 +53,10 @@ def stiffened(model, step: float, impedance: float):
 
 
 def setup(problem: Problem, impedance: float = HARD) -> Run:
-    """The coupler hangs on link 1."""
+    """The coupler is attached to link 1."""
     mujoco = import_module("mujoco")
 
-    mujoco.set_mju_user_warning(lambda message: None)  # of what is unstable: the error says it, and no log is left behind
+    mujoco.set_mju_user_warning(lambda message: None)  # warnings of unstable runs: the error shows it, and no log file remains
     model = mujoco.MjModel.from_xml_string(mjcf())
     data = mujoco.MjData(model)
     links = [model.joint(f"link{i + 1}").qposadr[0] for i in range(3)]

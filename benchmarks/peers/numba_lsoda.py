@@ -6,12 +6,12 @@ from scipy.integrate import odeint
 from benchmarks.peers.peer import GRAVITY, PINS, PIVOTS, Coordinates, Peer, Problem, Run
 from benchmarks.peers.scipy_numpy import BAUMGARTE, CONSTANT, RANK, ROOT, TOLERANCES
 
-PIVOT = 0.03  # of D D^T, relative to the first: below it, a configuration counts as near a singular one
-ZERO = 1e-9  # the same: what dependent rows leave behind
+PIVOT = 0.03  # pivot of D D^T relative to the first: below it, a configuration counts as nearly singular
+ZERO = 1e-9  # likewise: remainder of dependent rows by rounding
 
 
 def right_hand_side():
-    """y' (24,), compiled: pivoted Cholesky factors of D D^T where its rank is plain, eigenvalues near singular configurations."""
+    """Return y' (24,), compiled: pivoted Cholesky factors of D D^T if its rank is clear, else eigenvalues."""
     from numba import njit  # pyright: ignore[reportMissingImports]
 
     @njit
@@ -40,7 +40,7 @@ def right_hand_side():
 
     @njit
     def multipliers(G, b):
-        """Of least norm near singular configurations, else of the rows that the pivots choose; both give the same forces."""
+        """Return multipliers of least norm near singular configurations, else of rows chosen by pivots: forces are equal."""
         n = len(b)
         A, order, x = G.copy(), np.arange(n), np.zeros(n)
         rank, first = n, 0.0
@@ -106,7 +106,7 @@ def right_hand_side():
 
 
 def by_odeint(problem: Problem) -> Run:
-    """LSODA by `odeint`, whose loop is compiled: it only calls back for y'."""
+    """Integrate by LSODA through `odeint`, whose loop is compiled: it only calls back for y'."""
     rhs = right_hand_side()
     y0 = np.concatenate([problem.q0, np.zeros(12)])
 

@@ -1,4 +1,4 @@
-"""What a peer is: a name, the package it needs, and how it runs the paper's linkage; and how its error and time are measured."""
+"""Peers: name, package, run of the paper's linkage; and the measurement of their errors and times."""
 
 import signal
 import statistics
@@ -17,15 +17,15 @@ STARTS = (-45.0, 60.0)  # degrees, at rest; from +60 it crosses singular configu
 SPACING = 0.05  # s between outputs
 END = 20.0  # s
 CAP = 4.0  # s of CPU time: a curve ends with the first run that took longer
-ENOUGH = 1.0  # s of CPU time after which a figure needs no further run, nor after `ROUNDS`
+ENOUGH = 1.0  # s of CPU time after which a figure needs no further run, as after `ROUNDS`
 ROUNDS = 5
-COMPILE = 60.0  # s of CPU time for the run before all others
+COMPILE = 60.0  # s of CPU time for the first run
 SPREAD = 15.0  # degrees to both sides of the start, in a batch
 TICKS = 0.1  # s that a timing takes at least: some systems count CPU time in steps of 4 ms
 
 # The paper's linkage: links 1, 2, 3 and the coupler; each as x, y (m) of the centre of mass and the angle (rad).
-PIVOTS = np.array([0.0, 1.0, 2.0])  # of the links on the ground, m
-PINS = np.array([-1.0, 0.0, 1.0])  # of the links on the coupler, from its centre, m
+PIVOTS = np.array([0.0, 1.0, 2.0])  # m: points of the links on the ground
+PINS = np.array([-1.0, 0.0, 1.0])  # m: points of the links on the coupler, from its centre
 MASS, INERTIA = (1.0, 1.0, 1.0, 2.0), (0.1, 0.1, 0.1, 0.2)  # kg, kg m^2
 GRAVITY = 9.81  # m/s^2
 
@@ -33,7 +33,7 @@ Coordinates = np.ndarray  # (outputs, 12)
 
 
 class Problem(NamedTuple):
-    """The linkage released from rest with its links at `angle`, and where it is at the outputs."""
+    """The linkage released from rest with its links at `angle`, and its positions at the outputs."""
 
     angle: float  # rad
     ts: np.ndarray  # s
@@ -41,11 +41,11 @@ class Problem(NamedTuple):
 
     @property
     def q0(self) -> np.ndarray:
-        """The coordinates at the start (12,), closed exactly."""
+        """Return the coordinates at the start (12,), closed exactly."""
         return coordinates(np.full((1, 3), self.angle), np.zeros(1))[0]
 
     def error(self, q: Coordinates | None) -> float:
-        """The largest error of any coordinate at any output (m, rad), nan where a run broke down."""
+        """Return the largest error of any coordinate at any output (m, rad), nan if a run failed."""
         error = np.nan if q is None or q.shape != self.exact.shape else float(np.abs(q - self.exact).max())
         return error if np.isfinite(error) else float("nan")
 
@@ -60,7 +60,7 @@ def problem(start: float, end: float = END) -> Problem:
 
 
 def coordinates(links: np.ndarray, coupler: np.ndarray) -> Coordinates:
-    """All coordinates (T, 12) from the links' angles (T, 3) and the coupler's (T,), it being hung on the first link's tip."""
+    """Return all coordinates (T, 12) from the links' angles (T, 3) and the coupler's (T,), attached to the first link's tip."""
     e = np.stack([np.cos(links), np.sin(links)], axis=-1)
     feet = np.stack([PIVOTS, 0 * PIVOTS], axis=-1)
     along = np.stack([np.cos(coupler), np.sin(coupler)], axis=-1)
@@ -75,7 +75,7 @@ class Batch(NamedTuple):
     problems: list[Problem]
 
     def error(self, q: Any) -> float:
-        """The largest error of any; `q` (batch, outputs, 12)."""
+        """Return the largest error of any; `q` (batch, outputs, 12)."""
         return float("nan") if q is None else float(np.max([task.error(each) for task, each in zip(self.problems, q)]))
 
 
@@ -83,19 +83,19 @@ Run = Callable[[float], Coordinates]  # from the knob
 
 
 class Peer(NamedTuple):
-    """A program that simulates the linkage, set up as one who knows it would for accuracy."""
+    """A program that simulates the linkage, set up for accuracy by its own best practice."""
 
     name: str
     package: str  # as it is called where it is installed from
-    knob: str  # the setting that decides on accuracy
+    knob: str  # the setting that controls accuracy
     knobs: tuple[float, ...]  # from coarse to fine
     setup: Callable[..., Run]  # from the Problem, or from the Batch; imports the package
-    batch: int = 1  # trajectories that run at once, from starts within `SPREAD`
+    batch: int = 1  # simultaneous trajectories, from starts within `SPREAD`
     end: float = END  # s
     starts: tuple[float, ...] = STARTS
 
     def available(self) -> str | None:
-        """The version that is installed, or None."""
+        """Return the installed version, or None."""
         try:
             return version(self.package)
         except PackageNotFoundError:
@@ -104,7 +104,7 @@ class Peer(NamedTuple):
     def curve(
         self, start: float, knobs: tuple[float, ...] | None = None, end: float | None = None, cap: float = CAP
     ) -> list[dict]:
-        """Rows of `knob`, `error` (m, rad) and `seconds`: the median CPU time of one trajectory, the program being warm.
+        """Return rows of `knob`, `error` (m, rad) and `seconds`: the median CPU time of one warm trajectory.
 
         The curve ends early with a run that took longer than `cap` seconds.
         """
@@ -129,7 +129,7 @@ class Peer(NamedTuple):
 
 
 def timed(run: Run, knob: float, limit: float, at_least: float = 0.0) -> tuple[Coordinates | None, float]:
-    """What a run returns, and its CPU time: the mean of as many as take `at_least` (s). None: broken down, or past `limit`."""
+    """Return a run's result and CPU time, the mean of repetitions for `at_least` (s). None: failed, or past `limit`."""
     begun, runs, q = time.process_time(), 0, None
     try:
         with interrupted(limit):
@@ -143,7 +143,7 @@ def timed(run: Run, knob: float, limit: float, at_least: float = 0.0) -> tuple[C
 
 @contextmanager
 def interrupted(limit: float) -> Iterator[None]:
-    """Raise TimeoutError once this has used `limit` seconds of CPU time: an integrator may never come to an end."""
+    """Raise TimeoutError after `limit` seconds of CPU time: an integrator may never end."""
     if not hasattr(signal, "setitimer"):  # Windows
         yield
         return

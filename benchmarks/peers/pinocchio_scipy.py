@@ -8,9 +8,9 @@ from scipy.integrate import solve_ivp
 from benchmarks.peers.peer import GRAVITY, INERTIA, MASS, PINS, PIVOTS, Coordinates, Peer, Problem, Run, coordinates
 from benchmarks.peers.scipy_numpy import TOLERANCES
 
-WEAK, STRONG = 5.0, 30.0  # 1/s, both gains: weak is less stiff, strong is what crosses singular configurations
-MU = 1e-4  # of the proximal iterations: less loses the branch where +60 degrees crosses singular configurations
-RESIDUAL = 1e-12  # at which they end
+WEAK, STRONG = 5.0, 30.0  # 1/s, both gains: weak is less stiff, strong crosses singular configurations
+MU = 1e-4  # proximal parameter: with a smaller one +60 degrees loses its branch in singular configurations
+RESIDUAL = 1e-12  # at which the proximal iterations end
 ITERATIONS = 10
 
 

@@ -9,11 +9,11 @@ from benchmarks.peers.peer import GRAVITY, INERTIA, MASS, PINS, PIVOTS, Coordina
 BAUMGARTE = 10.0  # 1/s, both gains: less drifts, more is stiffer
 RANK = 0.1  # singular values of D below this fraction of the largest are zero: from +60 degrees, 0.001 loses the branch
 
-(dsyevd,) = get_lapack_funcs(("syevd",))  # eigh takes three times as long to check what it is given
+(dsyevd,) = get_lapack_funcs(("syevd",))  # eigh takes three times as long with checks of its input
 ROOT = np.repeat(MASS, 3) ** -0.5
 ROOT[2::3] = np.array(INERTIA) ** -0.5
 WEIGHT = np.array([0.0, -GRAVITY, 0.0] * 4)
-CONSTANT = np.zeros((12, 12))  # of the Jacobian: feet 0 to 5, tips 6 to 11
+CONSTANT = np.zeros((12, 12))  # rows of the Jacobian: feet 0 to 5, tips 6 to 11
 for link in range(3):
     for axis in range(2):
         CONSTANT[2 * link + axis, 3 * link + axis] = CONSTANT[6 + 2 * link + axis, 3 * link + axis] = 1.0
@@ -22,7 +22,7 @@ FEET, TIPS, THETA = np.arange(0, 6, 2), np.arange(6, 12, 2), np.arange(2, 9, 3)
 
 
 def constraint(q, v):
-    """Psi, its Jacobian and -(Psi_q v)_q v."""
+    """Return Psi, its Jacobian and -(Psi_q v)_q v."""
     J, psi, gamma = CONSTANT.copy(), np.empty(12), np.empty(12)
     theta, rate = q[2:9:3], v[2:9:3] ** 2
     c, s = 0.5 * np.cos(theta), 0.5 * np.sin(theta)
@@ -39,7 +39,7 @@ def constraint(q, v):
 
 
 def by_eigenvalues(t, y):
-    """y' with the pseudoinverse of D from the eigenvalues of D D^T: two to three times faster than from singular values."""
+    """Return y' with the pseudoinverse of D from the eigenvalues of D D^T: two to three times faster than by an SVD."""
     v = y[12:]
     psi, J, gamma = constraint(y[:12], v)
     D = J * ROOT
@@ -50,7 +50,7 @@ def by_eigenvalues(t, y):
 
 
 def by_pinv(t, y):
-    """y' with NumPy's pseudoinverse of D."""
+    """Return y' with NumPy's pseudoinverse of D."""
     v = y[12:]
     psi, J, gamma = constraint(y[:12], v)
     b = gamma - J @ (WEIGHT + 2 * BAUMGARTE * v) - BAUMGARTE**2 * psi
@@ -58,7 +58,7 @@ def by_pinv(t, y):
 
 
 def solving(rhs, method: str):
-    """A peer's setup: `rhs` by a method of `solve_ivp`."""
+    """Return a peer's setup: `rhs` by a method of `solve_ivp`."""
 
     def setup(problem: Problem) -> Run:
         y0 = np.concatenate([problem.q0, np.zeros(12)])

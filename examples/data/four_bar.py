@@ -1,6 +1,6 @@
-"""Makes four_bar.csv: what encoders at two pins of examples/four_bar.toml would show, of a linkage that is not quite as drawn.
+"""Make four_bar.csv: readings of encoders at two pins of examples/four_bar.toml, for a linkage that differs a little from it.
 
-The coupler is heavier and longer than the scene says, the rocker is lighter, and the crank is released from another angle.
+The coupler is heavier and longer than in the scene, the rocker is lighter, and the crank is released from another angle.
 """
 
 from pathlib import Path
@@ -11,8 +11,8 @@ import udkjax as udk
 
 HERE = Path(__file__).parent
 TRUTH = {"body.coupler.mass": 3.1, "body.rocker.mass": 1.6}
-LENGTH = 2.53  # of the coupler, m
-ANGLE = np.radians(58.0)  # of the crank at its release, before the loop is closed
+LENGTH = 2.53  # m: length of the coupler
+ANGLE = np.radians(58.0)  # angle of the crank at its release, before the loop is closed
 NOISE = 0.2  # standard deviation, degrees
 SEED = 1
 

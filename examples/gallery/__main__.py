@@ -2,7 +2,7 @@
 
     python -m examples.gallery [NAME ...] [--out docs/gallery]
 
-Each example is a script that one can read and run by itself: `python examples/gallery/peaucellier.py`. The others are drawings,
+Each example is a script to read and run by itself: `python examples/gallery/peaucellier.py`. The others are drawings,
 files of at most 25 lines: `udkjax animate examples/drawings/door_closer.toml`.
 """
 
@@ -35,11 +35,11 @@ PLAYER = "player.js"  # the script of all pages
 FRAMES = 121  # of their players
 WIDTH = 720  # px, of pictures
 DPI = 96  # of plots
-MOMENT = 0.3  # of the motion: when its picture is taken
+MOMENT = 0.3  # fraction of the motion at which its picture is taken
 
 
 def make(name: str, out: Path) -> dict:
-    """Make one example, write its files, and return its title, its words, its facts and the names of its files."""
+    """Make one example, write its files, and return its title, text, facts and the names of its files."""
     start = time.perf_counter()
     if name in DRAWINGS:
         module, text, (facts, shown) = None, *make_drawing(name)
@@ -74,7 +74,7 @@ def make(name: str, out: Path) -> dict:
 
 
 def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
-    """Simulate a drawing, and return the comment that it starts with, its facts and its player."""
+    """Simulate a drawing, and return its first comment, its facts and its player."""
     import numpy as np
 
     import udkjax as udk
@@ -92,9 +92,9 @@ def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
 
 
 def share_player(player: Path) -> None:
-    """Take the program out of a page, and put that of live ones, which serves them all, into `player.js` beside it.
+    """Take the script out of a page, and put that of live pages, which serves all pages, into `player.js` in the same folder.
 
-    It is a script, since browsers read no modules from a disk, and the page loses its policy, which allows no scripts beside it.
+    It is a script, since browsers read no modules from a disk, and the page loses its policy, which allows no other scripts.
     """
     from udkjax.show.player.page import module
 
@@ -109,19 +109,19 @@ def share_player(player: Path) -> None:
 
 
 def _shrink(picture: Path) -> None:
-    """Give a picture the few colours that it has, and a third of its size."""
+    """Reduce a picture to its few colours, and to a third of its size."""
     from PIL import Image
 
     Image.open(picture).convert("RGB").quantize(96).save(picture, optimize=True)
 
 
 def page(examples: list[dict]) -> str:
-    """Return the page of the gallery in Markdown, with the players that lie beside it."""
+    """Return the page of the gallery in Markdown, with the players in the same folder."""
     lines = [
         "# Gallery",
         "",
-        "Each picture opens a player. Those of single runs are live: sliders change numbers, a hand pulls at bodies, and the",
-        "page solves the motion anew. `python -m examples.gallery` makes them all; the scripts are in `examples/gallery`,",
+        "Each picture opens a player. Players of single runs are live: sliders change numbers, bodies can be dragged, and the",
+        "page computes the motion again. `python -m examples.gallery` makes them all; the scripts are in `examples/gallery`,",
         "the drawings in `examples/drawings`.",
         "",
     ]
@@ -137,7 +137,7 @@ def page(examples: list[dict]) -> str:
 
 
 def main() -> None:
-    """Make what is asked for."""
+    """Make the chosen examples."""
     parser = argparse.ArgumentParser(prog="python -m examples.gallery", description="Make the gallery.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join((*DRAWINGS, *NAMES))}; by default all")
     parser.add_argument("--out", type=Path, default=Path("docs/gallery"), help="folder to write to")

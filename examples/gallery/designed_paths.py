@@ -1,6 +1,6 @@
 """Four-bars that were designed for a straight line, the letter D and a walking foot.
 
-A drawing says how links are joined, a goal in a file where a point goes, in order: `udk.design` finds the pins. The foot moves.
+A drawing gives the links and their joints, a goal in a file the places of a point: `udk.design` finds the pins. The foot moves.
 """
 
 from pathlib import Path
@@ -16,14 +16,14 @@ TURN = 1.0  # s, at 60 rpm
 
 
 def make():
-    """Return how far each path is from its places as the mechanism runs, the player of the last, and a plot of all."""
+    """Return the distance of each path from its places in a run, the player of the last, and a plot of all."""
     import matplotlib.pyplot as plt
 
     facts = {}
     figure, panels = plt.subplots(1, len(NAMES), figsize=(9, 3), layout="constrained")
     for file, panel in zip(NAMES, panels, strict=True):
         name, search = file.replace("_", " "), read_design(GOALS / f"{file}.toml")
-        assert isinstance(search, udk.DesignSearch)  # and none for all solutions
+        assert isinstance(search, udk.DesignSearch)  # not for all solutions
         mech, places = search(results=1)[0].mechanism, search.problem.goal.targets
         path = np.asarray(udk.path(mech, udk.simulate(mech, np.linspace(0.0, TURN, 7201)), "P"))
         off = np.linalg.norm(path[:, None] - places, axis=2).min(axis=0).max()

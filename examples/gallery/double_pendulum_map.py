@@ -14,7 +14,7 @@ END = 5.0  # s
 
 
 def make():
-    """Return what the map says, the players of two neighbours on it, and the map."""
+    """Return facts of the map, the players of two neighbours on it, and the map."""
     mech = udk.library.double_pendulum()
     angles = np.linspace(-np.pi, np.pi, MEMBERS + 1)[:-1] + np.pi / MEMBERS  # rad, from hanging straight down
     data = udk.sweep(

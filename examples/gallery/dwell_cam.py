@@ -12,7 +12,12 @@ from udkjax.show.style import COLOURS, plain
 LOW, HIGH = 0.25, 0.40  # m: the radii of the cam
 STEM = 0.15  # m: from the follower's tip to its centre
 RATE = 2.0  # rad/s
-LIVE = ["driver.motor.motion.coefficients", "gravity[1]", "body.follower.mass", "body.cam.inertia"]  # changed by its page
+LIVE = [
+    "driver.motor.motion.coefficients",
+    "gravity[1]",
+    "body.follower.mass",
+    "body.cam.inertia",
+]  # changed by sliders of its page
 
 
 def radius(angle):
@@ -22,7 +27,7 @@ def radius(angle):
 
 
 def make():
-    """Return how still the follower rests, the player, and its lift over a turn."""
+    """Return facts of the dwell, the player, and the lift over a turn."""
     angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
     bodies = {"cam": udk.Body(2.0, 0.05), "follower": udk.Body(0.5, 0.01, (0.0, radius(np.pi / 2) + STEM))}  # its tip on the cam
     joints = {

@@ -11,7 +11,7 @@ from udkjax.show import plots
 
 
 def make():
-    """Return what the weight of the arm asks of its pins, the player, and the forces over time."""
+    """Return the energy lost in dampers, the player, and the forces of pins over time."""
     mech = udk.library.excavator()
     sol = udk.simulate(mech, np.linspace(0.0, 4.0, 161))
     loads = udk.reactions(mech, sol)

@@ -1,18 +1,18 @@
 """The paper's five-bar linkage, side by side: projected, and not stabilized.
 
 Three parallel links carry a coupler: one constraint is redundant. Without stabilization it drifts, until the pseudoinverse takes
-it for independent; then no freedom is left, and the linkage stands still in the air.
+it for independent; then no degree of freedom is left, and the linkage stops in the air.
 """
 
 import numpy as np
 
 import udkjax as udk
 
-MOMENT = 0.9  # of the motion: when its picture is taken
+MOMENT = 0.9  # fraction of the motion at which its picture is taken
 
 
 def make():
-    """Return what is known of the two runs, and the player."""
+    """Return facts of the two runs, and the player."""
     mech = udk.library.parallelogram()
     ts = np.linspace(0.0, 20.0, 401)
     projected = udk.simulate(mech, ts, rtol=1e-9, atol=1e-9)

@@ -1,18 +1,18 @@
-"""A four-bar linkage of five pins, live: its pins and the speed of its motor by sliders, and a hand that pulls at its bodies.
+"""A four-bar linkage of five pins, live: sliders for its pins and the speed of its motor; its bodies can be dragged.
 
-The drawing is that of the README. Where the loops cannot be closed, or the motor cannot go on, the page says so.
+The drawing is that of the README. If the loops cannot be closed, or the motor cannot go on, the page says so.
 """
 
 import numpy as np
 
 import udkjax as udk
 
-LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # changed by its page
-FILM = {"width": 400, "fps": 12.5, "speed": 0.35}  # of one turn
+LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # changed by sliders of its page
+FILM = {"width": 400, "fps": 12.5, "speed": 0.35}  # samples of one turn
 
 
 def make():
-    """Return what the motor has to do, and the player."""
+    """Return the torque of the motor, and the player."""
     drawing = udk.Drawing(
         pins={"O": (0, 0), "A": (30, 40), "B": (120, 90), "P": (60, 120), "C": (100, 0)},  # mm
         links={

@@ -10,12 +10,12 @@ import udkjax as udk
 
 RESTITUTION = 0.6
 RAISED = np.pi / 3  # rad: the angle from which it falls
-LIVE = ["spring.drive.stiffness", "spring.drive.angle", "link.hammer.density", "gravity[1]"]  # changed by its page
-MOMENT = 0.12  # of the motion: when its picture is taken
+LIVE = ["spring.drive.stiffness", "spring.drive.angle", "link.hammer.density", "gravity[1]"]  # changed by sliders of its page
+MOMENT = 0.12  # fraction of the motion at which its picture is taken
 
 
 def make():
-    """Return what is known of the blows, and the player."""
+    """Return facts of the blows, and the player."""
     corners = np.array(
         [(0, -10), (260, -10), (260, -40), (300, -40), (300, 40), (260, 40), (260, 10), (0, 10)]
     )  # mm, along the handle

@@ -1,6 +1,6 @@
-"""Two masses of a four-bar, from its motion: as guessed, and as identified.
+"""Two masses of a four-bar, identified from its motion: the guess and the result.
 
-The measurements are made here, with noise of a hundredth of a radian, so that what should be found is known.
+The measurements are made here, with noise of a hundredth of a radian, so that the true values are known.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ NOISE = 0.01  # rad
 
 
 def make():
-    """Return what was found in standard errors from the truth, the player, and the fit."""
+    """Return the errors of the results in standard errors, the player, and the fit."""
     guess = udk.library.four_bar()
     ts = np.linspace(0.0, 4.0, 101)
     measured = udk.simulate(guess.with_parameters(TRUE), ts).q

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 import udkjax as udk
 from udkjax.show import plots
 
-# Jansen's numbers in metres: a, l are where the crank's axle is, seen from the fixed pin; m is the crank.
+# Jansen's numbers in metres: a, l are the position of the crank's axle relative to the fixed pin; m is the crank.
 A, L, M = 0.380, 0.078, 0.150
 BARS = {"b": 0.415, "c": 0.393, "d": 0.401, "e": 0.558, "f": 0.394, "g": 0.367, "h": 0.657, "i": 0.490, "j": 0.500, "k": 0.619}
-BODIES = {  # each through its pins; of two it is a bar, of three a plate
+BODIES = {  # pins of each link: two for a bar, three for a plate
     "crank": "OA",
     "upper bar": "AB",
     "upper plate": "PBD",
@@ -26,7 +26,7 @@ TURN = 2 * np.pi  # s, of the crank at 1 rad/s
 
 
 def meet(p, q, a, b, left):
-    """Return the point at distances a from p and b from q, to the left or to the right of the way from p to q."""
+    """Return the point at distances a from p and b from q, to the left or right of the line from p to q."""
     way = q - p
     square = way @ way
     x = (square + a**2 - b**2) / (2 * square)
@@ -53,7 +53,7 @@ def leg(angle=0.0, rate=1.0):
 
 
 def make():
-    """Return how flat the steps are, the player of one leg, and the feet's paths of all."""
+    """Return facts of the steps, the player of one leg, and the feet's paths of all."""
     mech = leg()
     ts = np.linspace(0.0, TURN, 121)
     cranks = np.array([0.12, 0.135, M, 0.16])

@@ -1,6 +1,6 @@
 """The friction of a pin, learned by a neural network through the simulation.
 
-A pendulum swings out under dry friction of a law that the network does not know. The network is a force element like any other;
+A pendulum swings with dry friction, whose law the network does not know. The network is a force element like any other;
 its weights are found by gradient descent through the equations of motion.
 """
 
@@ -28,7 +28,7 @@ class Network(udk.ForceElement):
         return self.law(jnp.stack([omega]))[0] - self.law(jnp.stack([-omega]))[0]
 
     def loads(self, t, *frames):
-        """Act on the body's rotation alone."""
+        """Return loads that act only on the body's rotation."""
         (body,) = frames
         return [(0.0, 0.0, self.torque(body.omega))]
 
@@ -40,7 +40,7 @@ def pendulum(element):
 
 
 def make():
-    """Return how far the learned law is from the true one, the player, and both laws."""
+    """Return the errors of the learned law, the player, and both laws."""
     (joint,) = udk.library.compound_pendulum().joint_names
     (rod,) = udk.library.compound_pendulum().body_names
     truth = pendulum(udk.Friction(joint, torque=2.0, velocity=0.5))

@@ -1,13 +1,13 @@
 """The paper's linkage, live: one constraint is redundant as long as its three links are equal and parallel.
 
-Change the length of one of them, and no freedom is left: the page says that the loops do not close, or that nothing can move.
+Change the length of one of them, and nothing is free to move: the page says so, or that the loops do not close.
 """
 
 import numpy as np
 
 import udkjax as udk
 
-LIVE = [  # changed by its page
+LIVE = [  # changed by sliders of its page
     "gravity",
     "joint.A3.points[0]",
     "joint.A3.points[1]",
@@ -17,7 +17,7 @@ LIVE = [  # changed by its page
 
 
 def make():
-    """Return how well energy and loops are kept, and the player."""
+    """Return violation and change of energy, and the player."""
     mech = udk.library.parallelogram()
     sol = udk.simulate(mech, np.linspace(0.0, 10.0, 401))
     energy = np.asarray(udk.energy(mech, sol).total)

@@ -11,7 +11,7 @@ ARM, SIDE, CRANK = 2.0, 1.2, 0.6  # m
 
 
 def make():
-    """Return how straight the line is, and the player."""
+    """Return the error and length of the line, and the player."""
     mech = udk.library.peaucellier()
     sol = udk.simulate(mech, np.linspace(0.0, 6.0, 181))
     x, y, angle = np.asarray(sol.q)[:, mech.body_names.index("AD")].T

@@ -8,7 +8,7 @@ SUN, PLANET = 0.2, 0.1  # m
 
 
 def make():
-    """Return the ratio of speeds beside that of the textbook (Willis), and the player."""
+    """Return the ratio of speeds and that of the textbook (Willis), and the player."""
     mech = udk.library.planetary_gear(sun=SUN, planet=PLANET)
     sol = udk.simulate(mech, np.linspace(0.0, 12.0, 121))
     v = np.asarray(sol.v)[:, :, 2]

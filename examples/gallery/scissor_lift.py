@@ -1,4 +1,4 @@
-"""A scissor lift comes down under its platform, with two constraints more than it needs.
+"""A scissor lift comes down under its platform, with two redundant constraints.
 
 Its platform's guide is overconstrained; it moves with one degree of freedom, and its energy is constant.
 """
@@ -11,7 +11,7 @@ from udkjax.show import plots
 
 
 def make():
-    """Return what is redundant and how well energy is kept, the player, and the energies."""
+    """Return redundant rows and change of energy, the player, and the energies."""
     mech = udk.library.scissor_lift(3, angle=1.1)
     sol = udk.simulate(mech, np.linspace(0.0, 0.8, 121))
     found, parts = udk.analyse(mech), udk.energy(mech, sol)

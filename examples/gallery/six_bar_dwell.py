@@ -1,7 +1,7 @@
-"""A six-bar that was designed for a dwell: its output stands still for a third of each turn.
+"""A six-bar that was designed for a dwell: its output rests for a third of each turn.
 
-Over that third the coupler's point P goes along an arc about the far end of its rod. Nobody drew that arc: `udk.design` was told
-what the output does (`examples/goals/dwell.toml`).
+Over that third the coupler's point P moves along an arc about the far end of its rod. Nobody drew that arc: the goal of
+`udk.design` was the motion of the output alone (`examples/goals/dwell.toml`).
 """
 
 from pathlib import Path
@@ -17,11 +17,11 @@ STILL = 121  # samples of 361 over which the output rests
 
 
 def make():
-    """Return how far the output swings, and how far in its rest, as the mechanism runs; the player, and a plot."""
+    """Return the swings of the output over a turn and in its rest, the player, and a plot."""
     import matplotlib.pyplot as plt
 
     search = read_design(GOAL)
-    assert isinstance(search, udk.DesignSearch)  # and none for all solutions
+    assert isinstance(search, udk.DesignSearch)  # not for all solutions
     mech = search(results=1)[0].mechanism
     sol = udk.simulate(mech, np.linspace(0.0, 2 * TURN, 721))
     angle = np.rad2deg(np.asarray(sol.q)[:, mech.body_names.index("output"), 2])
