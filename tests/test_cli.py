@@ -16,7 +16,7 @@ from udkjax.cli import COMMANDS
 from udkjax.cli.datasets import save
 from udkjax.extras import MissingExtraError
 from udkjax.integrate import Result
-from udkjax.scene.wording import plain
+from udkjax.study.report import plain
 from udkjax.study.sweep.executors import ClusterError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

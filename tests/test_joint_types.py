@@ -20,7 +20,6 @@ import udkjax as udk
 from tests.elements import BODIES, JOINTS, P
 from udkjax.integrate.causes.reach import Reach, dead_point
 from udkjax.integrate.events.conditions import joint_coordinate
-from udkjax.scene.wording import row_label
 from udkjax.show.player.marks import marks
 from udkjax.show.player.symbol_updates import symbol_updates
 from udkjax.show.player.symbols import symbols_of
@@ -29,6 +28,7 @@ from udkjax.studio.drawn_scenes import drawing_text_of
 from udkjax.studio.findings import drawn_change
 from udkjax.study.diagnosis.configuration import RankedPositions
 from udkjax.study.diagnosis.fixes import Fix, changes_of
+from udkjax.study.report import row_label
 
 TABLE = """
                   Revolute  Prismatic Slot      Weld      Distance  Angle     Gear      Rack      Cam

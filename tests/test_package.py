@@ -15,7 +15,8 @@ from udkjax.extras import EXTRAS
 
 ROOT = Path(udkjax.__file__).parent
 
-GROUND_FLOOR = {"annotations", "extras", "lazy_names", "printing", "progress"}  # every floor may import them
+# every floor may import them
+GROUND_FLOOR = {"annotations", "arrays", "extras", "lazy_names", "printing", "progress", "requirements", "wording"}
 PROGRAMS = {"expressions", "programs"}
 EQUATIONS = PROGRAMS | {"pinv", "scene", "transforms", "equations"}
 POSITIONS = EQUATIONS | {"native", "positions"}

@@ -14,7 +14,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.fuzz import Case
-from udkjax.scene.checks import quote
+from udkjax.wording import quote
 
 POINTS = [[0.0, 0.0], [0.1, 0.2]]
 ELEMENTS: dict[str, dict[str, Any]] = {

@@ -119,9 +119,9 @@ def test_a_pull_is_a_spring_to_a_place_and_a_damper():
 
 def test_numbers_of_conditions_follow_those_of_the_mechanism():
     """The axis of a slide is a number of the scene, and of a condition that looks along it."""
+    from udkjax.arrays import number
     from udkjax.integrate.events.condition_program import condition_numbers
     from udkjax.integrate.events.conditions import WithinLimit, joint_coordinate
-    from udkjax.scene.fields import number
 
     class Passes:
         def expand(self, mechanism):

@@ -3,7 +3,8 @@
 import numpy as np
 
 from udkjax.pinv.row_spaces import connected_columns, echelon, null_space, row_space
-from udkjax.scene.wording import join_names, ratio
+from udkjax.study.report import ratio
+from udkjax.wording import join_names
 
 
 def test_spaces_of_rows():

@@ -93,7 +93,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
         json: True for JSON.
     """
     if json:
-        from udkjax.scene.wording import plain
+        from udkjax.study.report import plain
 
         print(text, file=sys.stderr)
         print(json_text.dumps(plain(results), ensure_ascii=False, allow_nan=False), flush=True)

@@ -115,9 +115,9 @@ def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], result
     import json
 
     import udkjax as udk
-    from udkjax.scene.wording import plain
     from udkjax.show.identify_figures import save_fit_pictures
     from udkjax.study.identify.estimate import Row
+    from udkjax.study.report import plain
 
     out.mkdir(exist_ok=True)
     udk.save(estimate.mechanism, out / "identified.toml")

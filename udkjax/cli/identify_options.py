@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from udkjax.scene import Mechanism
-from udkjax.scene.checks import quote, suggestion
+from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify import IdentificationError, Parameter, Record, Start
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.record_reader import records_of
 from udkjax.study.identify.records import Estimated
+from udkjax.wording import quote, suggestion
 
 Groups = Iterable[Iterable[str]]
 Found = TypeVar("Found")

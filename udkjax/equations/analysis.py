@@ -22,14 +22,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
+from udkjax.arrays import is_traced
 from udkjax.equations.redundancy import redundant_rows
 from udkjax.equations.scales import Scales, concrete_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import is_traced
-from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked for longest ago makes room

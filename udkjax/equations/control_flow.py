@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from udkjax.arrays import is_traced, is_within_jit
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.programs.deferred import deferred
-from udkjax.scene.fields import is_traced, is_within_jit
 
 Carry = TypeVar("Carry")
 Result = TypeVar("Result")

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
+from udkjax.arrays import number, number_called
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import exceeds
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number, number_called
 
 
 class Formulation(PrintsLine):

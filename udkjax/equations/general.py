@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Time, Vector
+from udkjax.arrays import number, number_called
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number, number_called
 
 
 class ConstrainedSystem(PrintsLine):

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
+from udkjax.arrays import number_called
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
 from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
-from udkjax.scene.fields import number_called
 
 PARTITION_NEWTON_STEPS = 10  # from the prediction of a step; three or four are usual
 

@@ -32,10 +32,10 @@ from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
-from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.drivers import Driver
 from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote, suggestion
 
 Axes = Literal["ground", "body", "joint"]
 About = Literal["centre", "joint"]

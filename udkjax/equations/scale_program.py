@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.arrays import ROUNDING
 from udkjax.equations.element_programs import VELOCITY_INPUTS
 from udkjax.equations.scene_layout import BODY_COORDINATES, ROW, ConstraintGroup
 from udkjax.equations.scene_terms import SceneTerms
 from udkjax.expressions import Scalar, ScalarProgram
 from udkjax.expressions.loop_program import MAXIMUM, Kernel, KernelLoop, KernelWriter, LoopProgram, Reset
 from udkjax.expressions.selection import absolute, greater, maximum, where
-from udkjax.scene.fields import ROUNDING
 from udkjax.scene.mechanism import Mechanism
 
 # Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in

@@ -15,6 +15,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import AnyArray, NumericArray
+from udkjax.arrays import library_for, number
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import ArrayLibrary, join_concrete_numbers, numbers_as_vector
@@ -23,7 +24,6 @@ from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
-from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
 
 NO_THRESHOLDS = 0.0, 0.0  # of pivots, which the prologue takes behind the numbers of a scene

@@ -16,10 +16,10 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.annotations import NumericArray, TreeDef
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.element_setup import attached_bodies
 from udkjax.scene.forces import ForceElement
-from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 

@@ -25,11 +25,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.annotations import NumberLike
+from udkjax.arrays import number_called
 from udkjax.equations import constraints, loads
 from udkjax.equations.constraints import BodyArray, vector
 from udkjax.pinv import Plus, Pseudoinverse
 from udkjax.printing import PrintsLine
-from udkjax.scene.fields import number_called
 from udkjax.scene.mechanism import Mechanism
 
 Weights = Float[ArrayLike, "m"] | None

@@ -29,7 +29,7 @@ from udkjax.native.run.formulations import FormulationCode, formulation_code
 from udkjax.native.runs import RunStates, Tableau
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from udkjax.native.run.formulations import formulation_tol
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, OneOf
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from udkjax.arrays import number
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -20,9 +21,8 @@ from udkjax.integrate.solvers import is_explicit
 from udkjax.native.base.steps import LEAST_ATOL, SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.checks import traced_numbers_are_valid
-from udkjax.scene.fields import number
-from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 

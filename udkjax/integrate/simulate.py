@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
@@ -30,10 +31,9 @@ from udkjax.native.base.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembly import AssemblyWarning, Closure, State, require_closed
 from udkjax.programs.deferred import deferred
+from udkjax.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import is_traced, is_within_jit, make_module, number, put_arrays
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 from udkjax.transforms.gradients import stop_gradients
 
 if TYPE_CHECKING:

@@ -12,12 +12,12 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import number
 from udkjax.equations.quantities import efforts
 from udkjax.extras import OptionalImport
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
 from udkjax.scene.bodies import COORDINATES, Frame, frame_over_time
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
@@ -222,7 +222,8 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
 
 def scene_text(mechanism: Mechanism) -> str:
     """Return a mechanism as the text of a scene file, or why it has none."""
-    from udkjax.scene import SceneError, dumps
+    from udkjax.scene.checks import SceneError
+    from udkjax.scene.files import dumps
 
     try:
         return dumps(mechanism)

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import is_within_jit, make_module, number
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -20,9 +21,8 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State
 from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import is_within_jit, make_module, number
-from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 

@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import ROUNDING, is_traced, is_within_jit, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
@@ -34,10 +35,9 @@ from udkjax.positions.closure import close_by_jax, close_by_machine_code, from_m
 from udkjax.positions.open_rows import explain_open
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
-from udkjax.scene.description import poses_table
-from udkjax.scene.fields import ROUNDING, is_traced, is_within_jit, number, number_called
-from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.scene.description import size_of
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import body_sizes, suspicions
 
@@ -308,3 +308,15 @@ def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) 
     moves = moves_of_assembly(mechanism, closure.state.q)
     cure = "if you did not intend this, a number of these bodies or of their joints is wrong; see udk.check"
     return f"{'; '.join(moves)}: {cure}" if moves else ""
+
+
+def poses_table(title: str, names: Sequence[str], q: ArrayLike, v: ArrayLike | None = None) -> PrintedTable:
+    """Return the table of coordinates, and velocities, (bodies, 3); bodies without names are numbered."""
+    arrays = [np.asarray(x, float) for x in ((q,) if v is None else (q, v))]
+    heads = ["body", "x (m)", "y (m)", "angle (rad)", "vx (m/s)", "vy (m/s)", "omega (rad/s)"][: 1 + 3 * len(arrays)]
+    scales = [scale for x in arrays for scale in (size_of(x), size_of(x), float(np.nanmax(np.abs(x[..., 2]), initial=0.0)))]
+    rows = [
+        [names[k] if names else str(k), *map(format_number, np.concatenate([x[k] for x in arrays]), [""] * len(scales), scales)]
+        for k in range(len(arrays[0]))
+    ]
+    return PrintedTable(title, rows, heads)

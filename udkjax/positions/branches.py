@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.arrays import number
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import Scales
 from udkjax.positions.assembly import State, close
 from udkjax.positions.drive import Drive, drive
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 
 

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.arrays import library_for
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSED_TOL
 from udkjax.positions.drive import Coordinate, element_of
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import library_for
 from udkjax.scene.mechanism import Mechanism, Origin
 
 ANY_MOTION = (0.3, -0.2, 0.7)  # characteristic lengths and rad: generic, so that an invariance under it is general

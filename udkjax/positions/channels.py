@@ -20,11 +20,11 @@ from typing import Literal, Protocol
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import number
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import number
 from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote, suggestion
 
 Needs = Literal["states", "accelerations", "reactions"]
 LocalPoint = tuple[float, float]  # in a body's own frame (m)

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
 from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
@@ -16,7 +17,6 @@ from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.svd import SVDFactors
 from udkjax.positions.drive import Driven
-from udkjax.scene.fields import library_for, number
 from udkjax.scene.mechanism import Mechanism
 
 NEWTON_STEPS = 8  # three are usual

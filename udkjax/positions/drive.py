@@ -16,6 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
@@ -24,12 +25,12 @@ from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.channels import channel_of, point_of_pin
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import is_traced, names, number, number_called
+from udkjax.scene.fields import names
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
-from udkjax.scene.wording import join_names
+from udkjax.wording import join_names, quote, suggestion
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)

@@ -9,9 +9,10 @@ from jaxtyping import Array, Float
 
 from udkjax.equations import constraints
 from udkjax.positions.drive import Drive, drive
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import split_index
+from udkjax.wording import quote, suggestion
 
 
 class FreeNumbers:

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.positions.assembly import State, assemble
@@ -25,7 +26,6 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 

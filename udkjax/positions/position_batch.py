@@ -13,9 +13,9 @@ from udkjax.positions.drive import Drive, Driven, drive
 from udkjax.positions.free_numbers import FreeNumbers, position_model
 from udkjax.positions.native_positions import compile_programs, position_code
 from udkjax.printing import PrintedTable, PrintsTable, prints_table, units
+from udkjax.requirements import require_finite
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import require_finite
 
 
 class BatchPositions(PrintsTable):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import number
 from udkjax.positions.assembly import State
 from udkjax.positions.channels import StateHistory
 from udkjax.positions.drive import Coordinate, value_of
@@ -15,10 +16,10 @@ from udkjax.positions.kinematics import Kinematics, kinematics
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
-from udkjax.scene.checks import SceneError, quote, suggestion
-from udkjax.scene.fields import number
+from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote, suggestion
 
 
 @prints_table

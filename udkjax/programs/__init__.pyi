@@ -5,6 +5,7 @@ from udkjax.programs.deferred import deferred_if_traced as deferred_if_traced
 from udkjax.programs.deferred import deferred_p as deferred_p
 from udkjax.programs.deferred import trace_once as trace_once
 from udkjax.programs.deferred import traced_once as traced_once
+from udkjax.programs.identity_cache import cached_by_identity as cached_by_identity
 from udkjax.programs.numpy_program import Meter as Meter
 from udkjax.programs.numpy_program import TooLongError as TooLongError
 from udkjax.programs.numpy_program import evaluate_as as evaluate_as

@@ -13,18 +13,10 @@ from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args
 
 import numpy as np
 
-from udkjax.scene.checks import quote, suggestion
+from udkjax.requirements import ArgumentCheck, ArgumentError, ArgumentTypeError, GivenArguments, describe
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.named_arguments import CHECKS
-from udkjax.scene.requirements import (
-    ArgumentCheck,
-    ArgumentError,
-    ArgumentTypeError,
-    GivenArguments,
-    article,
-    describe,
-    require_history,
-)
+from udkjax.scene.named_arguments import CHECKS, require_history
+from udkjax.wording import article, quote, suggestion
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

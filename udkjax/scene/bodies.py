@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import array_namespace
 from udkjax.printing import PrintsLine, one_line
-from udkjax.scene.fields import POSITIVE, array_namespace, given_number
+from udkjax.scene.fields import POSITIVE, given_number
 
 GROUND = "ground"
 COORDINATES = ("x", "y", "angle")  # of a body, in their order in q and v

@@ -1,7 +1,6 @@
 """Checks of a scene from a file or from Python, which find all mistakes at once."""
 
 import dataclasses
-import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Any, Literal, NamedTuple, get_args, get_origin
@@ -14,13 +13,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from udkjax.annotations import TomlTable
+from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import FieldMetadata, is_traced
+from udkjax.scene.fields import FieldMetadata
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
+from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
-LONGEST_QUOTE = 60  # characters of a value or a name in a message
 KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements, by kind (body, revolute) and by name
 
 
@@ -277,37 +277,3 @@ def _check_bodies(where: str, cls: type, table: TomlTable) -> Iterator[str]:
     attached = [name for name in (*bodies, *carrier) if isinstance(name, str)]
     twice = {name: None for name in attached if attached.count(name) > 1}
     yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quote(name)} is connected to itself" for name in twice)
-
-
-def suggestion(name: object, choices: Iterable[str]) -> str:
-    """Return '; did you mean "..."?' if one of the choices is similar, else an empty text."""
-    if not isinstance(name, str):
-        return ""
-    lowered = {choice.lower(): choice for choice in choices}
-    close = difflib.get_close_matches(name.lower(), lowered, n=1)
-    return f"; did you mean {quote(lowered[close[0]])}?" if close else ""
-
-
-def unknown_key(key: object, expected: Iterable[str]) -> str:
-    """Return the message for an unknown key, with the most similar expected key, or else all of them."""
-    known = tuple(expected)
-    return "unknown key" + (suggestion(key, known) or f"; known are {', '.join(known)}")
-
-
-def quote(name: str) -> str:
-    """Return a name in double quotes, with unprintable characters escaped as in TOML."""
-    escaped = name.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
-
-
-def abbreviate(value: object) -> str:
-    """Return a value as text for a message: as in a TOML file, at most `LONGEST_QUOTE` long."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return quote(value if len(value) <= LONGEST_QUOTE else value[: LONGEST_QUOTE - 3] + "...")
-    if isinstance(value, list | tuple):
-        text = f"[{', '.join(map(abbreviate, value))}]"
-    else:
-        text = f"shape {value.shape}" if isinstance(value, Tracer) else str(getattr(value, "tolist", lambda: value)())
-    return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."

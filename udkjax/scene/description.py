@@ -81,15 +81,3 @@ def size_of(q: ArrayLike) -> float:
     """Return the largest finite coordinate x or y (m) of poses (..., 3)."""
     lengths = np.abs(np.asarray(q, float)[..., :2])
     return float(np.max(lengths, where=np.isfinite(lengths), initial=0.0))
-
-
-def poses_table(title: str, names: Sequence[str], q: ArrayLike, v: ArrayLike | None = None) -> PrintedTable:
-    """Return the table of coordinates, and velocities, (bodies, 3); bodies without names are numbered."""
-    arrays = [np.asarray(x, float) for x in ((q,) if v is None else (q, v))]
-    heads = ["body", "x (m)", "y (m)", "angle (rad)", "vx (m/s)", "vy (m/s)", "omega (rad/s)"][: 1 + 3 * len(arrays)]
-    scales = [scale for x in arrays for scale in (size_of(x), size_of(x), float(np.nanmax(np.abs(x[..., 2]), initial=0.0)))]
-    rows = [
-        [names[k] if names else str(k), *map(format_number, np.concatenate([x[k] for x in arrays]), [""] * len(scales), scales)]
-        for k in range(len(arrays[0]))
-    ]
-    return PrintedTable(title, rows, heads)

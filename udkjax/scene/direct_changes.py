@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.scene.fields import is_traced, number
+from udkjax.arrays import is_traced, number
 from udkjax.scene.number_fields import (
     ElementGroups,
     NumberField,

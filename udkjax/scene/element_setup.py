@@ -10,13 +10,15 @@ import jax
 import numpy as np
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import is_traced, number
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
-from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, problems_of
+from udkjax.scene.checks import SceneEntry, SceneError, problems_of
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import Requirement, StaticValue, given_number, is_traced, number
+from udkjax.scene.fields import Requirement, StaticValue, given_number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
 from udkjax.scene.schema import table_of, type_name
+from udkjax.wording import abbreviate
 
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:

@@ -5,89 +5,18 @@ the metadata below all other requirements. Files and Python are checked by the s
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import wraps
-from types import ModuleType
-from typing import Any, Literal, NamedTuple, TypedDict, TypeVar
+from typing import Any, Literal, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers
-
-# Bound on a computed number that is zero in theory, relative to the largest of its kind: some hundred rounding units.
-ROUNDING = 256 * float(np.finfo(float).eps)
-
-Module = TypeVar("Module")
-
-
-def array_namespace(*numbers: ArrayLike | Sequence[ArrayLike]) -> ModuleType:
-    """Return jax.numpy if one of the numbers is a JAX array, else NumPy."""
-    return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(numbers)) else np
-
-
-def is_traced(tree: Any) -> bool:
-    """Return True if any number in a tree is traced."""
-    return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
-
-
-def is_within_jit() -> bool:
-    """Return True while a program is traced, in which concrete numbers become constants."""
-    return isinstance(jax.device_put(0.0), Tracer)
-
-
-def library_for(tree: Any) -> ModuleType:
-    """Return jax.numpy if a number in a tree is traced, else NumPy: JAX would compile a program for each operation."""
-    return jnp if is_traced(tree) else np
-
-
-def stored(x: Any) -> Any:
-    """Convert a NumPy array to a JAX array, without compiling anything; return anything else unchanged."""
-    return jax.device_put(x) if isinstance(x, np.ndarray | np.generic) else x
-
-
-_put_together = jax.jit(lambda *arrays: arrays)
-_WORTH_A_PROGRAM = 60  # calls: putting arrays one by one takes 0.3 ms longer than a program, which takes 15 ms to compile
-_calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # by shapes
-
-
-def put_arrays(arrays: Any) -> Any:
-    """Convert a tree of NumPy arrays and numbers to JAX arrays."""
-    leaves, tree = jax.tree.flatten(arrays)
-    _calls[shapes := tuple(map(np.shape, leaves))] += 1
-    if _calls[shapes] <= _WORTH_A_PROGRAM:
-        return jax.device_put(arrays)
-    return jax.tree.unflatten(tree, _put_together(*leaves))
-
-
-def make_module(cls: type[Module], **fields: Any) -> Module:
-    """Make an instance from all of its fields, without the checks and conversions of its constructor."""
-    made = object.__new__(cls)
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made
-
-
-def number(value: Numbers) -> Float[Array, "..."]:
-    """Convert a number to an array leaf: a Python float as a field would be static, and each new value would recompile."""
-    dtype = jnp.result_type(float)
-    if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
-        value = np.asarray(value, dtype)
-        found = jax.device_put(value)  # jnp.asarray would compile a program for each shape
-        if not isinstance(found, Tracer):
-            return found
-        with jax.ensure_compile_time_eval():  # concrete numbers stay concrete while something else is traced
-            return jax.device_put(value)
-    return jnp.asarray(value, dtype=dtype)
-
-
-def optional_number(value: Numbers | None) -> Float[Array, "..."] | None:
-    """Like `number`, but None, an absent number, stays None."""
-    return None if value is None else number(value)
+from udkjax.arrays import array_namespace, is_traced, number, optional_number
 
 
 def number_or_guess(value: Numbers | None) -> Float[Array, "..."]:
@@ -119,21 +48,6 @@ def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return convert(value)
         except (TypeError, ValueError, OverflowError):
             return value
-
-    return converted
-
-
-def number_called(name: str, optional: bool = False) -> Callable[[Any], Any]:
-    """Return `number` as a converter whose errors name the field or argument; if `optional`, None stays None."""
-
-    def converted(value: Any) -> Any:
-        if optional and value is None:
-            return None
-        try:
-            return number(value)
-        except (TypeError, ValueError, OverflowError):
-            kind = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
-            raise TypeError(f"{name} must be a number or an array of numbers, not {kind}") from None
 
     return converted
 

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import make_module
 from udkjax.printing import PrintsLine
 from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import NOT_EMPTY, POSITIVE, given_number, make_module
+from udkjax.scene.fields import NOT_EMPTY, POSITIVE, given_number
 from udkjax.scene.splines import spline_pieces
 
 

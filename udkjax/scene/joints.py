@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number, Numbers
+from udkjax.arrays import ROUNDING, array_namespace, number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import (
@@ -23,13 +24,10 @@ from udkjax.scene.fields import (
     POSITIVE,
     PROFILE_ANGLES,
     PROFILE_RADII,
-    ROUNDING,
-    array_namespace,
     given_direction,
     given_names,
     given_number,
     given_or_guess,
-    number,
 )
 from udkjax.scene.splines import count_knots, periodic_spline, wrap
 

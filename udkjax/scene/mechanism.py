@@ -13,17 +13,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import is_traced, make_module, number
 from udkjax.printing import PrintedTable, PrintsTable
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.direct_changes import count_marks, directly_changed, mark_changes, marks_by_name
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import attached_bodies, check_elements, complete, completion_mistakes, name_elements
-from udkjax.scene.fields import is_traced, make_module, number
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
-from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.number_fields import (
     groups_of,

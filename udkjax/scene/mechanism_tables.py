@@ -9,12 +9,14 @@ import equinox as eqx
 import numpy as np
 
 from udkjax.annotations import TomlTable
-from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, abbreviate, find_class, problems_of, unknown_key
+from udkjax.arrays import is_traced
+from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, find_class, problems_of
 from udkjax.scene.element_setup import name_elements
-from udkjax.scene.fields import is_traced, vector_as_angle
+from udkjax.scene.fields import vector_as_angle
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import groups_of
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
+from udkjax.wording import abbreviate, unknown_key
 
 FORMAT_VERSION = 1  # of the format of scenes with bodies and joints
 

@@ -14,22 +14,71 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import (
+from udkjax.requirements import (
     ArgumentCheck,
     ArgumentError,
     ArgumentTypeError,
     GivenArguments,
     array,
     describe,
-    require_coordinates,
     require_count,
     require_finite,
-    require_history,
     require_number,
-    require_single,
     require_times,
 )
+from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote
+
+
+def require_coordinates(name: str, value: Any, given: GivenArguments, flat: bool = True) -> None:
+    """Require x, y and angle of each body of the mechanism, or their rates: (bodies, 3), or (n,) if `flat`."""
+    mechanism, found = given["mechanism"], array(name, value)
+    if not isinstance(mechanism, Mechanism):  # the number of coordinates of a user-written system is not known
+        if found.ndim != 1:
+            raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {found.shape}")
+        require_finite(name, value)
+        return
+    names = mechanism.body_names
+    right = (len(names), 3)
+    if found.shape != right and not (flat and found.shape == (3 * len(names),)):
+        rest = f": x, y and angle of {', '.join(map(quote, names[:4]))}{', ...' if len(names) > 4 else ''}"
+        cure = "; a batch of states is for jax.vmap" if found.ndim > 2 and found.shape[-2:] == right else ""
+        raise ArgumentError(f"{name} must have the shape {right}{rest}; it has the shape {found.shape}{cure}")
+    require_finite(name, found, lambda *k: _place(names, k))
+
+
+def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
+    body, coordinate = index if len(index) == 2 else divmod(index[0], 3)
+    return f" ({COORDINATES[coordinate]} of {quote(names[body])})"
+
+
+def require_single(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a single mechanism, not a batch."""
+    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
+        cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
+        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
+
+
+def require_history(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
+    mechanism = given["mechanism"]
+    missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
+    if missing or isclass(value):
+        raise ArgumentTypeError(f"{name} must have times and states, ts, q and v, as a Solution: {describe(value)}")
+    bodies = getattr(value, "bodies", None)
+    if isinstance(mechanism, Mechanism) and isinstance(bodies, tuple) and bodies and bodies != mechanism.body_names:
+        listed = [", ".join(map(quote, x[:6])) + (", ..." if len(x) > 6 else "") for x in (bodies, mechanism.body_names)]
+        raise ArgumentError(f"{name} is of another mechanism: its bodies are {listed[0]}, those of the mechanism {listed[1]}")
+    ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
+    right = (*ts.shape, len(mechanism.body_names), 3) if isinstance(mechanism, Mechanism) else q.shape
+    if q.ndim == 4:
+        one, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
+        raise ArgumentError(f"{name} is a batch of {len(q)} solutions: take one of them, {one}, or map over them, {all_of_them}")
+    if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != right or v.shape != q.shape:
+        meant = "ts (T,), q and v (T, bodies, 3)" if isinstance(mechanism, Mechanism) else "ts (T,), q and v (T, n)"
+        is_of = f" of {len(mechanism.body_names)} bodies" if isinstance(mechanism, Mechanism) else ""
+        raise ArgumentError(f"{name} must have {meant}{is_of}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
 
 
 def _check_state(name: str, value: Any, given: GivenArguments) -> None:

@@ -8,10 +8,11 @@ import equinox as eqx
 from jaxtyping import Array
 
 from udkjax.annotations import Numbers
-from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
-from udkjax.scene.fields import number
+from udkjax.arrays import number
+from udkjax.scene.checks import SceneError
 from udkjax.scene.held import Held, given_sampled
 from udkjax.scene.schema import numbers_in
+from udkjax.wording import abbreviate, quote, suggestion
 
 _SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
 ElementGroups = dict[str, dict[str, Any]]  # elements by section and name

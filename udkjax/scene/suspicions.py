@@ -7,9 +7,9 @@ import jax
 import numpy as np
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.reshaping import attachments
+from udkjax.wording import quote
 
 # Relative to the size of the largest body. A point farther from its own body is probably in the wrong unit (mm). The size of a
 # body is the distance to its other points, or twice its radius of gyration.

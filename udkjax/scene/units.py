@@ -8,9 +8,9 @@ import math
 import re
 from typing import NamedTuple
 
-from udkjax.scene.checks import quote
 from udkjax.scene.held import Held
 from udkjax.scene.number_fields import Sections, owner_of, parameters_of, split_index
+from udkjax.wording import quote
 
 # Numeric settings of a run; one program serves all values.
 NUMBERS = {

@@ -19,7 +19,8 @@ from udkjax.equations import analyse, energy, violation
 from udkjax.equations.quantities import Energy
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
-from udkjax.scene import GROUND, Mechanism
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.mechanism import Mechanism
 from udkjax.show import fit_figures, sweep_figures
 from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.marks import body_points, marks, to_ground

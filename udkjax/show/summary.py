@@ -10,9 +10,10 @@ from udkjax.integrate import Solution
 from udkjax.integrate.solution import format_work
 from udkjax.positions.assembly import Check, check_lines, numbered
 from udkjax.printing import align_columns, format_number
-from udkjax.scene import Mechanism
-from udkjax.scene.wording import plural, row_label
+from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import Accuracy
+from udkjax.study.report import row_label
+from udkjax.wording import plural
 
 
 def check_summary(mech: Mechanism, found: Check) -> str:

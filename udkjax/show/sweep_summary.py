@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from udkjax.integrate import Result
-from udkjax.scene.wording import plural
 from udkjax.show.summary import table
 from udkjax.show.sweep_figures import RESULT_VARIABLE, scalars
 from udkjax.study.sweep.chunks import SweepCost
 from udkjax.study.sweep.dataset import bytes_per_member, variables_of
 from udkjax.study.sweep.plan import SweepPlan
 from udkjax.study.sweep.sweep import duration
+from udkjax.wording import plural
 
 if TYPE_CHECKING:
     import xarray

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.arrays import library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.equations.load_scale import LoadScale, load_scale
@@ -22,7 +23,6 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.linearization import Linearization, linearize, with_unit_mass
 from udkjax.transforms.gradients import stop_gradients

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from udkjax.annotations import NumberLike
+from udkjax.arrays import library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.control_flow import ControlFlow, solve
 from udkjax.equations.structure import ArrayLibrary
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import library_for, number, stored
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.statics.linearization import linearize, solver_of_mass, with_unit_mass

@@ -9,14 +9,16 @@ from udkjax.integrate import SimulationError
 from udkjax.positions.assembly import AssemblyError
 from udkjax.positions.continuation import Reached
 from udkjax.positions.kinematics import travel
-from udkjax.scene import GROUND, Mechanism, SceneError
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Revolute, Slot
-from udkjax.scene.wording import plural
+from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.equilibrium import equilibrium
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import force_curves, holding_curves
 from udkjax.study.diagnosis import Diagnosis, diagnose
 from udkjax.study.diagnosis.fixes import Fix
+from udkjax.wording import plural
 
 MOST_FIXES = 8  # fixes listed for one redundancy
 IN_LINE = 1e-4  # rad: a dead point is found to rounding, and its angle to the square root of rounding

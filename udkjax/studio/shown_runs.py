@@ -11,7 +11,9 @@ from udkjax.integrate import Solution, simulate
 from udkjax.positions.assembly import close
 from udkjax.positions.channels import StateHistory
 from udkjax.positions.drive import constant_speed, with_halted_drivers
-from udkjax.scene import Driver, Mechanism, SceneError
+from udkjax.scene.checks import SceneError
+from udkjax.scene.drivers import Driver
+from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.measure_curves import measures_of
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 

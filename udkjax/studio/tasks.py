@@ -9,8 +9,10 @@ from udkjax.annotations import JsonObject
 from udkjax.equations import analyse
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.base.program import UnsupportedError
-from udkjax.scene import Mechanism, SceneError, loads
+from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
+from udkjax.scene.files import loads
+from udkjax.scene.mechanism import Mechanism
 from udkjax.studio.drawn_scenes import drawing_text_of
 from udkjax.studio.exports import exported
 from udkjax.studio.findings import examine

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Mapping
 
-from udkjax.scene import Mechanism, library
+from udkjax.scene import library
+from udkjax.scene.mechanism import Mechanism
 from udkjax.studio.drawn_scenes import drawing_text_of
 
 Maker = Callable[[], Mechanism]

@@ -38,6 +38,8 @@ from udkjax.study.members import cores as cores
 from udkjax.study.members import processor as processor
 from udkjax.study.power_balance import PowerBalance as PowerBalance
 from udkjax.study.power_balance import power_balance as power_balance
+from udkjax.study.report import plain as plain
+from udkjax.study.report import row_label as row_label
 from udkjax.study.sweep import Axis as Axis
 from udkjax.study.sweep import LatinHypercube as LatinHypercube
 from udkjax.study.sweep import Random as Random

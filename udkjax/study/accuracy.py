@@ -9,7 +9,9 @@ from jaxtyping import ArrayLike, Float
 from udkjax.equations import energy, violation
 from udkjax.equations.analysis import analyse
 from udkjax.integrate import Solution
-from udkjax.scene import GROUND, Mechanism, Revolute
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Revolute
+from udkjax.scene.mechanism import Mechanism
 
 N_SAMPLES = 5  # times at which drivers and potentials are checked for change
 

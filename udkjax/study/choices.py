@@ -10,7 +10,7 @@ from udkjax.equations.formulations import Formulation
 from udkjax.integrate import Projection
 from udkjax.integrate.solvers import Solver, solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
-from udkjax.scene.checks import abbreviate, quote, suggestion
+from udkjax.wording import abbreviate, quote, suggestion
 
 Choice: TypeAlias = "Pseudoinverse | Formulation | Projection | Baumgarte | Solver | None"
 Constructors = dict[str, Callable[..., Choice]]

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from udkjax.arrays import number
 from udkjax.equations import constraints, determinacy, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis, analyse
@@ -16,7 +17,6 @@ from udkjax.pinv import SVD
 from udkjax.positions.assembly import State, assemble
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
-from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.explanation import Explanation, Gauss
 

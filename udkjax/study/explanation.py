@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from udkjax.equations import determinacy
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.wording import plain, plural, row_label
+from udkjax.study.report import plain, row_label
+from udkjax.wording import plural
 
 MOST_MATRIX_COLUMNS = 18  # columns of a matrix on one line
 SMALLEST_PRINTED = 1e-12  # relative to the largest entry of an array; smaller ones are printed as 0

@@ -23,6 +23,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.arrays import number, number_called
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.load_scale import load_sizes
@@ -34,11 +35,12 @@ from udkjax.positions.kinematics import Kinematics, kinematics
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import CALLED, number, number_called
+from udkjax.scene.fields import CALLED
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote
 
 
 class InverseDynamics(PrintsTable):

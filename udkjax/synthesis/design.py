@@ -7,11 +7,11 @@ import numpy as np
 
 from udkjax.positions.drive import Drive
 from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.requirements import require_count, require_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import require_count, require_number
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
 from udkjax.synthesis.goals import Goal

@@ -14,13 +14,14 @@ from udkjax.positions.drive import Drive, drive
 from udkjax.positions.free_numbers import FreeNumbers, position_model
 from udkjax.positions.kinematics import FULL_TURN
 from udkjax.positions.native_positions import compile_programs, position_code
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.goals import Goal, goal_scale, place_of
 from udkjax.synthesis.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.motion_terms import CompiledTerm
 from udkjax.synthesis.trials import TrialResiduals, Trials, Turn
+from udkjax.wording import quote
 
 TURN_VALUES = 72  # of a turn from which searches start
 FINE_VALUES = 720  # of a turn that is to be made, in the end

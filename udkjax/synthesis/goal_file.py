@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from udkjax.annotations import TomlTable
-from udkjax.scene.checks import SceneError, quote, unknown_key
+from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import load
 from udkjax.scene.mechanism import Mechanism
@@ -16,6 +16,7 @@ from udkjax.synthesis.complete.complete_design import CompleteSearch
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
+from udkjax.wording import quote, unknown_key
 
 TOP = (
     "mechanism",

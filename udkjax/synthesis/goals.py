@@ -18,10 +18,11 @@ from udkjax.annotations import Numbers, NumericArray
 from udkjax.positions.channels import locate
 from udkjax.positions.drive import Coordinate, value_of
 from udkjax.printing import PrintedTable, PrintsTable
+from udkjax.requirements import require_finite
 from udkjax.scene.bodies import GROUND, Frame
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import require_finite
+from udkjax.wording import quote, suggestion
 
 
 def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:

@@ -10,8 +10,9 @@ from jaxtyping import Array
 from scipy.spatial import ConvexHull, QhullError
 
 from udkjax.positions.free_numbers import FreeNumbers
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote, suggestion
 
 Range = tuple[float, float]
 # Distance of a position from where branches meet, over a turn that has to be complete, whatever transmission is required:

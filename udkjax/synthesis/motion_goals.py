@@ -19,10 +19,11 @@ from udkjax.equations import constraints, loads
 from udkjax.positions.drive import Driven
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.requirements import require_count, require_number
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import require_count, require_number
 from udkjax.synthesis.goals import check_place, place_of
+from udkjax.wording import quote, suggestion
 
 
 class MotionPoint(NamedTuple):

@@ -10,8 +10,8 @@ from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
 from udkjax.annotations import TreeDef
+from udkjax.arrays import number
 from udkjax.programs.varying_axes import vary_together
-from udkjax.scene.fields import number
 
 Mask = tuple[bool, ...]  # True for the arrays of a list that have tangents
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.scene.wording import format_value
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.optimizer import squares
 from udkjax.study.identify.records import Record, labels
 from udkjax.study.identify.uncertainty import Uncertainty
+from udkjax.study.report import format_value
 
 
 @pytest.mark.parametrize(

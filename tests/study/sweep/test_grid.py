@@ -8,7 +8,7 @@ import xarray
 from scipy import stats
 
 import udkjax as udk
-from udkjax.scene.quantities import InitialAngle, Length, Scaled
+from udkjax.study.quantities import InitialAngle, Length, Scaled
 from udkjax.study.sweep.axes import Axis, LatinHypercube, Sobol, Zipped
 from udkjax.study.sweep.grid import GridError, load_grid, loads_grid
 

@@ -10,15 +10,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from udkjax.arrays import number, optional_number
 from udkjax.integrate.events.checks import number_if_any, require_joint, require_name_text, require_restitution
 from udkjax.integrate.events.conditions import JointCoordinate, joint_coordinate, require_name
 from udkjax.printing import PrintsLine
+from udkjax.requirements import describe
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote
-from udkjax.scene.fields import number, optional_number
 from udkjax.scene.joints import Angle, Joint, fill
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import describe
+from udkjax.wording import quote
 
 
 class Action(PrintsLine):

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from udkjax.scene.fields import number
+from udkjax.arrays import number
+from udkjax.requirements import ArgumentTypeError, array, describe, require_finite, require_number
 from udkjax.scene.joints import Joint
-from udkjax.scene.requirements import ArgumentTypeError, array, describe, require_finite, require_number
 
 
 def number_if_any(value: Any) -> Any:

@@ -16,7 +16,7 @@ from udkjax.integrate.events.conditions import frames_of, sees_velocity
 from udkjax.integrate.events.event import Event
 from udkjax.native.base.program import UnsupportedError, consecutive, write
 from udkjax.native.watching.conditions import Conditions
-from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import library_for
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame, Point, between
-from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import library_for
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote, suggestion
 
 Frames = Mapping[str, Frame]
 

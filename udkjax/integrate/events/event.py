@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import Number, NumberLike
+from udkjax.arrays import is_traced, number
 from udkjax.integrate.events.actions import Action, Impact, Stop
 from udkjax.integrate.events.checks import (
     number_if_any,
@@ -31,11 +32,11 @@ from udkjax.integrate.events.checks import (
 )
 from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name, sees_velocity
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
+from udkjax.requirements import describe
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import Mistakes, quote, suggestion
-from udkjax.scene.fields import is_traced, number
+from udkjax.scene.checks import Mistakes
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import describe
+from udkjax.wording import quote, suggestion
 
 
 class Event(PrintsLine):

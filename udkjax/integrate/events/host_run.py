@@ -29,8 +29,8 @@ from udkjax.integrate.events.runs import EventRun, RunState, results, runs_befor
 from udkjax.integrate.problem import Problem
 from udkjax.native.base.host_function import call_host
 from udkjax.native.watching.conditions import Conditions
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.numpy_program import Meter, numpy_program
-from udkjax.scene.identity_cache import cached_by_identity
 from udkjax.transforms.gradients import stop_gradients
 
 SHARED, NUMBERS = 9, 5  # arrays of a run besides those of its phases, and which are the numbers of conditions

@@ -14,14 +14,14 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from udkjax.annotations import Number
+from udkjax.arrays import number
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.events.conditions import Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
-from udkjax.scene.checks import quote, suggestion
-from udkjax.scene.fields import number
 from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism, Origin
+from udkjax.wording import quote, suggestion
 
 MOST_PHASES = 32  # each is compiled
 

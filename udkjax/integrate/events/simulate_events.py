@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
@@ -29,11 +30,10 @@ from udkjax.integrate.solution import Result, Solution
 from udkjax.native.watching.conditions import Conditions
 from udkjax.positions.assembly import Closure, State
 from udkjax.programs.deferred import deferred
-from udkjax.scene.checks import quote
-from udkjax.scene.fields import is_traced, is_within_jit, number, put_arrays
-from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
+from udkjax.wording import quote
 
 UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
 

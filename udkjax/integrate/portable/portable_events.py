@@ -17,9 +17,9 @@ from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents
 from udkjax.native.runs import RunStates
 from udkjax.native.watching.conditions import HEAD
-from udkjax.scene.checks import quote
+from udkjax.requirements import ArgumentError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import ArgumentError
+from udkjax.wording import quote
 
 CONTACT = "{}.contact"  # name of the joint that holds the contact of an event
 MOST_EVENTS = 1000  # of a run in a page: beyond, nobody would look at them

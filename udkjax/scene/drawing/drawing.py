@@ -7,10 +7,11 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, TomlTable
+from udkjax.arrays import make_module, number
 from udkjax.printing import PrintedTable
 from udkjax.programs.deferred import deferred_if_traced
 from udkjax.scene.bodies import Body
-from udkjax.scene.checks import SceneEntry, SceneError, abbreviate, quote, suggestion
+from udkjax.scene.checks import SceneEntry, SceneError
 from udkjax.scene.description import drawing_table
 from udkjax.scene.drawing.drawing_reader import (
     BY_HAND,
@@ -28,11 +29,11 @@ from udkjax.scene.drawing.link import Link, Pin
 from udkjax.scene.drawing.mistakes import joint_names, where
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import name_elements
-from udkjax.scene.fields import make_module, number
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.scene.schema import table_of
+from udkjax.wording import abbreviate, quote, suggestion
 
 
 class Drawing(AbstractDrawing):

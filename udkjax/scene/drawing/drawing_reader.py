@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from udkjax.annotations import TomlTable
+from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import SceneEntry, abbreviate, check_table, gravity_mistakes, quote, suggestion
+from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
@@ -15,10 +16,10 @@ from udkjax.scene.drawing.link import Link, Pin, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import is_traced
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.schema import build
+from udkjax.wording import abbreviate, quote, suggestion
 
 SECTIONS: Mapping[str, type[DrawnElement]] = {
     "slide": Slide,

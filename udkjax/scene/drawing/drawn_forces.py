@@ -8,12 +8,13 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import array_namespace
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, pair_mistakes
 from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
-from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, array_namespace, given_names, given_number, given_or_none
+from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, given_names, given_number, given_or_none
 from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring
+from udkjax.wording import quote
 
 
 class Motor(DrawnElement):

@@ -4,11 +4,12 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import array_namespace
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
-from udkjax.scene.fields import LINK, PIN, POSITIVE, array_namespace, given_direction, given_names, given_or_none
+from udkjax.scene.fields import LINK, PIN, POSITIVE, given_direction, given_names, given_or_none
 from udkjax.scene.joints import Cam, Gear, Prismatic, Profile, Slot, as_profile
+from udkjax.wording import quote
 
 
 class Slide(DrawnElement):

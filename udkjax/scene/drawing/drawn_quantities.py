@@ -10,11 +10,11 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.annotations import TomlTable
-from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.fields import vector_as_angle
 from udkjax.scene.joints import Profile
 from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
+from udkjax.wording import abbreviate, quote, suggestion
 
 # Quantities whose units a file may choose, with their SI units, the default.
 QUANTITY_KINDS = {

@@ -10,9 +10,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import array_namespace
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Body, Frame
-from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, array_namespace, given_names, given_number, given_or_none
+from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_number, given_or_none
 
 PointArray = Float[Array, "n 2"] | np.ndarray
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import quote
 from udkjax.scene.drawing.drawn_joints import GearPair, PinInSlot
 from udkjax.scene.drawing.link import Link, PointArray, twice_area
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
+from udkjax.wording import quote
 
 DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name
 

@@ -7,14 +7,14 @@ from typing import NamedTuple, Protocol
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import array_namespace
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
-from udkjax.scene.checks import quote
 from udkjax.scene.drawing.link import DrawnBody, Link, PointArray
 from udkjax.scene.drivers import Driver
-from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint
+from udkjax.wording import quote
 
 
 class SlidingLink(Protocol):

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import array_namespace
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, between
 from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.fields import array_namespace
 from udkjax.scene.forces import Spring
 from udkjax.scene.joints import Revolute
 from udkjax.scene.library.posed_bodies import (

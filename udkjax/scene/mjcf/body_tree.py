@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mjcf.geom_masses import SpaceMass, geom_mass, geom_shape, inertial_mass
 from udkjax.scene.mjcf.model_settings import MAIN, ModelSettings
 from udkjax.scene.mjcf.orientations import WORLD, SpaceFrame
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+from udkjax.wording import quote, suggestion
 
 JOINTS = ("hinge", "slide")
 

@@ -4,13 +4,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from udkjax.scene.checks import quote
 from udkjax.scene.joints import Angle, Distance, Gear, Joint, Revolute, Weld
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneMotion
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+from udkjax.wording import quote
 
 MESHED = 1e-9  # rad; rounding between gears
 

@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.scene.checks import quote
 from udkjax.scene.forces import Force, ForceElement, Spring, Torque, TorsionSpring
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+from udkjax.wording import quote
 
 LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # parts of a model that a caller may leave out
 FAR_AWAY = 16.0  # times the size of a model: a point that a slide cannot reach, but not so far that the number looks mistyped

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body
-from udkjax.scene.checks import SceneError, abbreviate, suggestion
+from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml
@@ -21,6 +21,7 @@ from udkjax.scene.mjcf.model_settings import ModelSettings, merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, PlaneModel, PlaneMotion, contact_pairs, plane_of
 from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
+from udkjax.wording import abbreviate, suggestion
 
 INITIAL = "initial"  # the keyframe with velocities and controls that `mjcf_text` writes
 OPEN_LOOP = 1e-9  # relative to the size of the model: rounding of a closed loop

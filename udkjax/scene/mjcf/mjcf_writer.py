@@ -11,7 +11,7 @@ from jaxtyping import Array
 from udkjax.annotations import Number
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError
 from udkjax.scene.forces import Spring, Torque, TorsionSpring
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
@@ -23,6 +23,7 @@ from udkjax.scene.mjcf.mjcf_reader import INITIAL, OPEN_LOOP
 from udkjax.scene.reshaping import attachments
 from udkjax.scene.spanning_tree import spanning_tree
 from udkjax.scene.suspicions import body_sizes
+from udkjax.wording import quote
 
 IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # joints that no equality can express come first
 NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, with x to the right and z up

@@ -2,10 +2,10 @@
 
 import math
 
-from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mjcf.orientations import SpaceFrame, frame_of
 from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
+from udkjax.wording import abbreviate, quote, suggestion
 
 MAIN = "main"  # the default class
 _COMMON_TO_ACTUATORS = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")

@@ -6,8 +6,8 @@ Elements and attributes that are not listed here are refused by name.
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from udkjax.scene.checks import quote
 from udkjax.scene.mjcf.xml_tree import XmlElement
+from udkjax.wording import quote
 
 WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on motions
 TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # parents whose children have the tags of other elements

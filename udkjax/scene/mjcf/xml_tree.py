@@ -6,7 +6,8 @@ from xml.parsers import expat
 
 import numpy as np
 
-from udkjax.scene.checks import SceneError, abbreviate, quote, suggestion
+from udkjax.scene.checks import SceneError
+from udkjax.wording import abbreviate, quote, suggestion
 
 
 class XmlElement:

@@ -13,9 +13,9 @@ from udkjax.annotations import JsonObject
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
-from udkjax.scene import Mechanism
 from udkjax.scene.arguments import checked, require_mechanism
-from udkjax.scene.requirements import require_history
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.named_arguments import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live

@@ -18,8 +18,8 @@ from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.base.program import UnsupportedError
 from udkjax.positions.assembly import close
-from udkjax.scene import Mechanism
-from udkjax.scene.requirements import ArgumentError
+from udkjax.requirements import ArgumentError
+from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.live_parameters import Live, Slider, in_sections, names_in, sliders_of
 from udkjax.show.player.measure_curves import ShownMotion
 from udkjax.show.player.player_data import MOST_INSTANTS

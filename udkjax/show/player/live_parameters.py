@@ -9,9 +9,9 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.equations import analyse
 from udkjax.integrate.portable import scalar_parameters
-from udkjax.scene import Mechanism
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import conversion_factor, units_of
 
 # Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.

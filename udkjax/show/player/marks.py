@@ -13,27 +13,22 @@ from numpy.typing import ArrayLike
 
 from udkjax.annotations import JsonObject
 from udkjax.integrate.events.conditions import Gap
-from udkjax.scene import (
-    GROUND,
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.drivers import Driver
+from udkjax.scene.forces import Force, ForceElement, Friction, Spring, Torque, TorsionSpring
+from udkjax.scene.held import value_at
+from udkjax.scene.joints import (
     Cam,
     Distance,
-    Driver,
-    Force,
-    ForceElement,
-    Friction,
     Gear,
     Joint,
-    Mechanism,
     Prismatic,
     Rack,
     Revolute,
     Slot,
-    Spring,
-    Torque,
-    TorsionSpring,
     Weld,
 )
-from udkjax.scene.held import value_at
+from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
 
 Mark = JsonObject

@@ -21,7 +21,8 @@ from udkjax.equations import (
     violation,
 )
 from udkjax.programs.deferred import deferred
-from udkjax.scene import GROUND, Mechanism
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import conserves_energy
 
 SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis: less than any nonzero violation or singular value

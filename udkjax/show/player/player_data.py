@@ -33,7 +33,7 @@ from udkjax.equations import analyse
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
 from udkjax.positions.channels import locate
-from udkjax.scene import Mechanism
+from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.marks import BodyPoints, body_points, marks, to_ground
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows

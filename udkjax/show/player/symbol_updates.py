@@ -19,7 +19,9 @@ import numpy as np
 
 from udkjax.annotations import JsonObject
 from udkjax.integrate.portable import drawn_points
-from udkjax.scene import GROUND, Gear, Mechanism, Rack
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Gear, Rack
+from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
 
 SAME_DIGITS = 7  # significant digits of the points of symbols

@@ -6,12 +6,13 @@ import numpy as np
 
 from udkjax.printing import PrintedTable, html_table
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.wording import plain, plural, row_label
 from udkjax.study.diagnosis.clearance import Clearance, RankChange
 from udkjax.study.diagnosis.configuration import JointForces
 from udkjax.study.diagnosis.fixes import Fix, Redundancy
 from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
+from udkjax.study.report import plain, row_label
+from udkjax.wording import plural
 
 LABEL_WIDTH = 14  # characters of a section's title
 MOST_FIXES_SHOWN = 8  # printed fixes of one set

@@ -14,9 +14,7 @@ from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import scene_text, versions
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
-from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.wording import format_value, join_names, plain, plural
 from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.optimizer import Loss, squares, weighted_residuals
@@ -27,6 +25,8 @@ from udkjax.study.identify.records import IdentificationError, dataset_of_fit, l
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import apply_values
 from udkjax.study.noise import Whiteness
+from udkjax.study.report import format_value, plain
+from udkjax.wording import join_names, plural, quote, suggestion
 
 if TYPE_CHECKING:
     import xarray

@@ -21,7 +21,6 @@ from udkjax.integrate.solution import Result
 from udkjax.positions.assembly import AssemblyError, State, assemble
 from udkjax.positions.channels import Quantity, channel_of
 from udkjax.scene.arguments import argument_problems
-from udkjax.scene.checks import suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
 from udkjax.study.identify.parameters import ParametersLike, unknowns_of
@@ -29,6 +28,7 @@ from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Pred
 from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
+from udkjax.wording import suggestion
 
 STILL_DEVIATION = 1e-12  # relative to the largest number in a channel: with a smaller deviation the channel is constant
 # Relative to the largest singular value of a Jacobian: measurements do not determine directions with smaller ones. A change that

@@ -22,7 +22,6 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.wording import join_names
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
 from udkjax.study.identify import prediction
 from udkjax.study.identify.fit_problem import FitProblem, Residuals, build_problem
@@ -30,6 +29,7 @@ from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import TIGHT_TOL, TolerancePair
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
+from udkjax.wording import join_names
 
 AGREEMENT = 3.0  # floors up to which a discrepancy is agreement: the parts of a floor are single samples of errors
 USEFUL_PRECISION = 0.1  # relative to the derivative: with a higher floor agreement means little

@@ -25,11 +25,12 @@ from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.positions.assembly import close, require_closed
 from udkjax.programs.deferred import deferred
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.wording import join_names, ratio
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesses
+from udkjax.study.report import ratio
+from udkjax.wording import join_names, quote
 
 # Part of a parameter's effect on Psi along N that counts as zero. Differences at positions that are closed to 1e-11 leave 5e-12;
 # a parameter that opens a loop has a tenth or more.

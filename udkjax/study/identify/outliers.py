@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udkjax.scene.wording import plural
 from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.records import label_prefixes, output_times
 from udkjax.study.noise import outlier_rows
+from udkjax.wording import plural
 
 NOISE_FLOOR = 1e-6  # relative to a channel's scale: least noise of measurements
 MOST_OUTLIERS_NAMED = 5  # outliers listed per channel, the largest; the others are counted

@@ -8,16 +8,17 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from typing_extensions import TypeAliasType
 
-from udkjax.scene.checks import SceneError, quote, suggestion
+from udkjax.scene.checks import SceneError
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import owner_of, parameters_of, split_index
-from udkjax.scene.quantities import Length, Setter, parameter_value
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.schema import keys
 from udkjax.scene.units import units_of
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
+from udkjax.study.quantities import Length, Setter, parameter_value
+from udkjax.wording import quote, suggestion
 
 
 def length(*bodies: str, as_rod: bool = False) -> Length:

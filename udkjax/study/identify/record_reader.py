@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from udkjax.positions.channels import Channel, Quantity, channel_of
-from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import conversion_factor
 from udkjax.study.identify.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
 from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
+from udkjax.wording import abbreviate, quote, suggestion
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
 MOST_SHOWN = 3  # mistakes of one kind listed per column; the others are counted

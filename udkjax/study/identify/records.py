@@ -12,8 +12,9 @@ from typing_extensions import TypeAliasType
 from udkjax.extras import OptionalImport
 from udkjax.positions.assembly import State
 from udkjax.positions.channels import Channel, Quantity
-from udkjax.scene.checks import Mistakes, quote
-from udkjax.scene.requirements import describe
+from udkjax.requirements import describe
+from udkjax.scene.checks import Mistakes
+from udkjax.wording import quote
 
 if TYPE_CHECKING:
     import xarray

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from udkjax.extras import OptionalImport
 from udkjax.positions.channels import RATES
 from udkjax.scene.bodies import COORDINATES
-from udkjax.scene.checks import abbreviate, quote, suggestion
 from udkjax.study.identify.records import ByChannel
+from udkjax.wording import abbreviate, quote, suggestion
 
 if TYPE_CHECKING:  # imported only if one of their tables is given
     import pandas

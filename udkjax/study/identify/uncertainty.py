@@ -19,9 +19,9 @@ from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
 from udkjax.pinv.row_spaces import echelon, null_space
-from udkjax.scene.wording import join_names
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
+from udkjax.wording import join_names
 
 POOR_ERROR = 0.5  # standard error relative to the value, or to the scale of a parameter of either sign
 HIGH_CORRELATION = 0.98  # of two parameters: one combination of them is ten times less accurate than the other

@@ -19,11 +19,12 @@ from udkjax.equations.scales import concrete_scales
 from udkjax.positions.assembly import State, assemble
 from udkjax.positions.channels import RATES, UNITS
 from udkjax.scene.bodies import COORDINATES
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.scene.quantities import Setter, parameter_value
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
+from udkjax.study.quantities import Setter, parameter_value
+from udkjax.wording import quote
 
 Transform = Literal["positive", "bounded", "free"]
 BOUND_DISTANCE = 1e-3  # relative to the distance between the bounds: a closer value is at a bound

@@ -23,8 +23,8 @@ from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.pinv import Auto, Dense, Elimination, OneOf
 from udkjax.positions.assembly import State
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.quantities import Setter
 from udkjax.study.choices import Choice
+from udkjax.study.quantities import Setter
 
 # The settings of a run that are choices, each with the label of None.
 CHOICES = {

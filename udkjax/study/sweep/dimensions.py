@@ -13,7 +13,7 @@ from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
 from udkjax.positions.assembly import State
 from udkjax.scene.arguments import argument_problems
-from udkjax.scene.checks import Mistakes, SceneError, abbreviate, quote, suggestion
+from udkjax.scene.checks import Mistakes, SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.units import NUMBERS, units_of
@@ -30,6 +30,7 @@ from udkjax.study.sweep.axes import (
     labels_of,
     scale_to_range,
 )
+from udkjax.wording import abbreviate, quote, suggestion
 
 Settings: TypeAlias = Mapping[str, Any]  # arguments of `simulate`
 MEMBER = "member"  # the dimension of a design

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from udkjax.integrate.solution import Solution, scene_text, versions
-from udkjax.scene.checks import abbreviate
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import AxisColumn
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import SweepPlan
+from udkjax.wording import abbreviate
 
 JsonValue: TypeAlias = "str | int | float | bool | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
 MOST_LINES = 24  # lines on differences; further ones are counted

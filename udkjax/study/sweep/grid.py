@@ -11,11 +11,12 @@ from scipy import stats
 
 from udkjax.annotations import TomlTable
 from udkjax.extras import OptionalImport
-from udkjax.scene.checks import Mistakes, abbreviate, quote, suggestion, unknown_key
+from udkjax.scene.checks import Mistakes
 from udkjax.scene.mechanism_tables import parse_toml
-from udkjax.scene.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.choices import CHOICES, Choice, choice
+from udkjax.study.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped
+from udkjax.wording import abbreviate, quote, suggestion, unknown_key
 
 Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"
 TOP = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")

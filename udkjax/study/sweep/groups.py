@@ -14,17 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
+from udkjax.arrays import number
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import is_explicit
 from udkjax.pinv import Auto, Elimination
 from udkjax.positions.assembly import Closure, State, close
-from udkjax.scene.fields import number
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.quantities import parameter_value
 from udkjax.scene.units import NUMBERS
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
+from udkjax.study.quantities import parameter_value
 from udkjax.study.sweep.plan import SweepPlan, stack_choices
 
 RESULT, END, STEPS = "result", "end_time", "steps"  # variables stored for every member

@@ -17,10 +17,10 @@ from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.positions.channels import Channel, channel_of
-from udkjax.scene.checks import quote, suggestion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
 from udkjax.study.sweep.dimensions import SweepError
+from udkjax.wording import quote, suggestion
 
 UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, NumberLike]])
 OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from udkjax.equations.analysis import analyse
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.simulate import simulate
+from udkjax.requirements import require_output_times
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.requirements import require_output_times
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign, structure_of
 from udkjax.study.sweep.dimensions import Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of

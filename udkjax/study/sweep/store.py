@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
-from udkjax.scene.checks import abbreviate
 from udkjax.study.sweep.fingerprint import JsonValue, differences, digest
 from udkjax.study.sweep.plan import Chunk
+from udkjax.wording import abbreviate
 
 FORMAT = 2  # of the folder; a folder of another format counts as another sweep
 UNFINISHED_SUFFIX = ".unfinished"  # suffix of a file while it is written

@@ -7,9 +7,10 @@ import numpy as np
 
 from udkjax.positions.drive import Drive, element_of
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import SceneError, quote
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.complete.four_bars import FourBars
+from udkjax.wording import quote
 
 OTHERS = ("slide", "slot", "gear", "cam", "body", "joint")
 

@@ -9,21 +9,8 @@ import numpy as np
 
 from udkjax.scene.mechanism import Mechanism
 
-MOST_LISTED = 8  # most names in one sentence
 MOST_DIGITS = 12  # most digits of a number in a table
 _ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
-
-
-def plural(count: int, noun: str) -> str:
-    """Return a count with its noun, in the plural if needed."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def join_names(names: Sequence[str]) -> str:
-    """Join names for a sentence: "a, b and c"."""
-    if len(names) > MOST_LISTED:
-        return f"{', '.join(names[:MOST_LISTED])} and {len(names) - MOST_LISTED} more"
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def ratio(values: Sequence[float] | np.ndarray) -> str:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from udkjax.scene import identity_cache
-from udkjax.scene.identity_cache import cached_by_identity
+from udkjax.programs import identity_cache
+from udkjax.programs.identity_cache import cached_by_identity
 
 
 class Thing:
