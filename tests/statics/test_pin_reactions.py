@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.statics.reaction_peaks import cam_forces
+from udkjax.statics.reaction_peaks import RestingPositions, cam_forces
 
 
 def test_the_forces_of_all_links_at_a_pin_balance():
@@ -51,3 +51,18 @@ def test_a_cam_would_have_to_pull_above_its_jump_speed(share, side):
     slope = e * np.sin(np.pi / 2 - side * speed * ts) / exact
     assert_allclose(pressed, upwards * np.hypot(1.0, slope), atol=0.01 * 2.0 * 9.81)
     assert (pressed.min() < 0) == (share > 1)
+
+
+@pytest.mark.parametrize("follower", ["ground", "post"])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_cam_on_a_fixed_point_presses_with_its_weight_or_hangs_on_it(side, follower):
+    """A disc above or below the point; the point is of the ground, or of a body that the ground holds."""
+    disc, radius = udk.Body(2.0, 0.01, (0.0, side * 0.05)), np.full(8, 0.05)
+    joints = {
+        "guide": udk.Prismatic(("ground", "disc"), np.zeros((2, 2)), np.pi / 2, 0.0),
+        "contact": udk.Cam(("disc", follower), np.zeros((2, 2)), udk.Profile(np.arange(8) * np.pi / 4, radius)),
+        "foot": udk.Weld(("ground", "post"), np.zeros((2, 2)), 0.0),
+    }
+    mech = udk.Mechanism({"disc": disc, "post": udk.Body(1.0, 1.0)}, joints)
+    rest = RestingPositions(np.zeros(1), mech.q0[None], mech.v0[None])
+    assert_allclose(cam_forces(mech, rest)["contact"], side * 2.0 * 9.81, rtol=1e-12)
