@@ -1,12 +1,12 @@
-"""How every study runs: compute, write the data with all that it takes to repeat them, draw the figure from the file alone.
+"""Running of studies: compute, write the data with everything needed to repeat them, draw the figure from the file alone.
 
-A study is one module that says in its docstring what it claims and why, and has
+A study is one module whose docstring gives the claim and its reasons. It has
 
-    study(smoke) -> xarray.Dataset     compute; in small if `smoke`; `described` adds what belongs to the data
-    holds(data) -> {part: bool}        the claim in parts, each held against the data, of the small run as well
+    study(smoke) -> xarray.Dataset     compute; a small version if `smoke`; `described` adds the attributes
+    holds(data) -> {part: bool}        the claim in parts, each compared with the data, also of the small run
     headline(data) -> str              the claim in figures, in one line; the README quotes it
     figure(data) -> Figure             from the data alone
-    page(data) -> str                  a page of its own, NAME.md, where it has one
+    page(data) -> str                  a page of its own, NAME.md, if it has one
 """
 
 import inspect
@@ -30,13 +30,13 @@ from udkjax.scene import Mechanism, dumps
 HERE = Path(__file__).parent
 NAMES = tuple(sorted(file.stem for file in HERE.glob("*.py") if file.stem not in ("__init__", "__main__", "common")))
 DPI = 110
-COLOURS = 128  # of a figure: enough for lines and a colour map, and a third of the size
+COLOURS = 128  # colours of a figure: enough for lines and a colour map, and a third of the size
 
 Item = TypeVar("Item")
 
 
 def run(name: str, smoke: bool = False, out: Path | None = None, **choices: Any) -> xarray.Dataset:
-    """Compute a study with some choices of its own, write its data, draw its figure from the file; return what was written."""
+    """Compute a study with its choices, write its data, draw its figure from the file; return the written paths."""
     module: Any = import_module(f"experiments.{name}")
     if smoke and out is None:
         out = Path(tempfile.mkdtemp(prefix="experiments-"))
@@ -72,25 +72,25 @@ def redraw(name: str, out: Path | None = None) -> None:
 
 
 def load(name: str, out: Path | None = None) -> xarray.Dataset:
-    """Return the data of a study, by default those that are committed."""
+    """Return the data of a study, by default the committed ones."""
     with xarray.open_dataset(data_file(name, out), engine="h5netcdf") as data:
         return data.load()
 
 
 def data_file(name: str, out: Path | None = None) -> Path:
-    """Return where the data of a study are."""
+    """Return the path of the data of a study."""
     return (HERE / "data" if out is None else out) / f"{name}.nc"
 
 
 def described(data: xarray.Dataset, scene: Mechanism | str, settings: Mapping[str, Any], seed: int | None = None):
-    """Return the data with what they were computed from: the scene's text, all settings (as JSON), the seed."""
+    """Return the data with their origin: the scene's text, all settings (as JSON), the seed."""
     text = scene if isinstance(scene, str) else dumps(scene)
     numbers = {key: np.asarray(value).tolist() if not isinstance(value, str) else value for key, value in settings.items()}
     return data.assign_attrs(scene=text, settings=json.dumps(numbers), seed="none" if seed is None else seed)
 
 
 def tracked(items: Sequence[Item] | Iterable[Item], what: str) -> Iterator[Item]:
-    """Iterate over the parts of a study; say on stderr which one is at work and how long it has been so far."""
+    """Iterate over the parts of a study; say on stderr the current one and its time so far."""
     items, start = list(items), time.perf_counter()
     end = "\r" if sys.stderr.isatty() else "\n"
     for number, item in enumerate(items, 1):
@@ -99,7 +99,7 @@ def tracked(items: Sequence[Item] | Iterable[Item], what: str) -> Iterator[Item]
 
 
 def panels(rows: int, columns: int, width: float, height: float, **choices: Any) -> tuple[Figure, Any]:
-    """Return a figure (inches) that belongs to nobody else, and its axes as an array (rows, columns)."""
+    """Return a new figure (inches), and its axes as an array (rows, columns)."""
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **choices)
     for one in axes.ravel():

@@ -94,7 +94,7 @@ def at(data: xarray.Dataset, alpha: float, beta: float | None = None) -> xarray.
 
 
 def price(data: xarray.Dataset, runs: xarray.Dataset) -> np.ndarray:
-    """Return how many times the right-hand sides of the reference gains runs take at equal error, where these reach it."""
+    """Return the right-hand sides of runs relative to those of the reference gains at equal error, if these reach it."""
     found = []
     for k in range(data.sizes["start"]):
         known = at(data, REFERENCE).isel(start=k).sortby("error")
@@ -117,7 +117,7 @@ def present(data: xarray.Dataset) -> set[tuple[float, float]]:
 
 
 def holds(data: xarray.Dataset) -> dict[str, bool]:
-    """The claim, part by part."""
+    """Return whether each part of the claim holds."""
     bound = 100 * data.tol
     parts = {"without gains every run is lost": bool((at(data, 0.0).error > LOST).all())}
     for gain in (a for a in ENOUGH if (a, a) in present(data)):
@@ -128,7 +128,7 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
 
 
 def headline(data: xarray.Dataset) -> str:
-    """What large gains cost."""
+    """Return the cost of large gains as text."""
     dear = ", ".join(f"{name}: {p.min():.0f} to {p.max():.0f} times" for name, p in stiff(data).items())
     middle = {"start": 0, "tol": -2}
     one, other = (at(data, *pair).isel(middle) for pair in ((REFERENCE,), PAPER))

@@ -77,7 +77,7 @@ def study(smoke: bool) -> xarray.Dataset:
 
 
 def residue(name: str, cond: np.ndarray) -> np.ndarray:
-    """What rounding leaves of a row that depends on others, relative to the longest one."""
+    """Return the remainder by rounding of a row that depends on others, relative to the longest one."""
     return {"Greville": EPS * cond, "Elimination": np.sqrt(EPS) + 0.0 * cond}.get(name, EPS + 0.0 * cond)
 
 

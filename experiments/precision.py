@@ -1,6 +1,6 @@
 """In float32 errors are larger by the ratio of the units of rounding, 5e8; to cross singularities it takes wider thresholds.
 
-The same programs, in a process that is told `JAX_ENABLE_X64=0`, and in one that is not. Of the pseudoinverses the orthogonal
+The same programs, in a process with `JAX_ENABLE_X64=0`, and in one without. Of the pseudoinverses the orthogonal
 ones stay at eps cond; the default thresholds follow eps, and so does the condition from which a method loses the rank. A run of
 the paper's linkage, 20 s with projection, follows its tolerance until rounding takes over: each of n steps leaves some eps |y|,
 and a smaller tolerance takes more steps, which makes it no better; from about 10 eps on the steps fall to nothing.

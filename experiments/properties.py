@@ -133,7 +133,7 @@ def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
     both["worst"] = np.maximum(old.worst, new.worst)
     at = zip(json.loads(old.worst_at), json.loads(new.worst_at), old.worst.values >= new.worst.values, strict=True)
     out = Counter(json.loads(old.left_out)) + Counter(json.loads(new.left_out))
-    # What has been mended since is no fault any more.
+    # Faults that have been fixed since are left out.
     faults = [Fault(*f) for f in json.loads(old.listed)]
     stands = [f for f in faults if _is_severe(f) or verdict(cases_of(f.kind, f.seed)(f.case))[0]]
     gone = Counter(f.kind for f in faults) - Counter(f.kind for f in stands)

@@ -75,7 +75,7 @@ def starts(members: int) -> list[udk.State]:
 
 
 def study(smoke: bool) -> xarray.Dataset:
-    """How each run ends, and its error."""
+    """Return the result of each run, and its error."""
     members = 1 if smoke else MEMBERS
     thresholds = THRESHOLDS[1:2] if smoke else THRESHOLDS
     compared = dict(list(variants().items())[: 2 if smoke else None])
@@ -139,7 +139,7 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
 
 
 def headline(data: xarray.Dataset) -> str:
-    """How many fail at a threshold of 1e-4."""
+    """Return the numbers of failures at a threshold of 1e-4 as text."""
     count = data.sizes["group"] * data.sizes["member"]
 
     def one(name: str) -> str:

@@ -44,7 +44,7 @@ MAX_STEPS = 3_000  # three times what the most exact run takes that is not lost
 
 
 def study(smoke: bool) -> xarray.Dataset:
-    """When each method, at each threshold and tolerance, loses the linkage, and its error at 20 s: three sweeps."""
+    """Return the time at which each method loses the linkage, by threshold and tolerance, and its error at 20 s: three sweeps."""
     thresholds = THRESHOLDS[:3:2] if smoke else THRESHOLDS
     tolerances = TOLERANCES[1:2] if smoke else TOLERANCES
     ts, state, mech = np.linspace(0.0, END, OUTPUTS), start(DEGREES), parallelogram()
@@ -52,7 +52,7 @@ def study(smoke: bool) -> xarray.Dataset:
 
     def run(mechanism: udk.Mechanism, solution: Any) -> dict[str, Any]:
         wrong = jnp.abs(solution.q - exact_q)
-        is_lost = ~jnp.all(wrong <= LOST, (1, 2))  # a maximum may leave out what is not a number
+        is_lost = ~jnp.all(wrong <= LOST, (1, 2))  # a maximum may ignore NaN
         error = jnp.where(jnp.isfinite(solution.q[AT]).all(), wrong[AT].max(), jnp.nan)
         return {"lost": jnp.append(ts, jnp.inf)[jnp.argmax(jnp.append(is_lost, True))], "error": error}
 
@@ -120,7 +120,7 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
 
 
 def headline(data: xarray.Dataset) -> str:
-    """When runs are lost, and the errors of those that are not."""
+    """Return the times at which runs are lost, and the errors of the others, as text."""
     text = f"lost with the rank held at {_range(held(data))} s, with threshold TOL at {_range(tied(data))} s; "
     text += "rate by the times of loss " + ", ".join(f"{name} {x:.2f} /s" for name, x in zip(unstable(data), rates(data)))
     rows = data.error.sel(variant="11 rows").isel(threshold=0)
@@ -132,7 +132,7 @@ def _range(times: np.ndarray) -> str:
 
 
 def figure(data: xarray.Dataset) -> Figure:
-    """Draw a map of failure times for every method, threshold = TOL framed, and the errors of what is not lost."""
+    """Draw a map of failure times for every method, threshold = TOL framed, and the errors of the runs that are not lost."""
     names = [name for name in data.variant.values if name != "11 rows"]
     figure, axes = panels(2, 4, 13, 6.2)
     for one, name in zip(axes.ravel(), names, strict=False):

@@ -164,7 +164,7 @@ def price(data: xarray.Dataset) -> xarray.DataArray:
 
 
 def misfit(data: xarray.Dataset, key: str) -> np.ndarray:
-    """How far, of the size of the changes of drift between neighbouring gains, derivatives are from these: medians (scene,)."""
+    """Return the errors of derivatives relative to changes of drift between neighbouring gains: medians (scene,)."""
     step = np.diff(np.log(data.scanned))
     changes = np.diff(np.log(data[f"scan_{key}"].values), axis=1)
     slopes = data[f"slope_{key}"].values

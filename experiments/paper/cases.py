@@ -13,7 +13,7 @@ TOLERANCES = (1e-10, 1e-8, 1e-6)
 GAINS = (1000.0, 100.0)  # alpha, beta of the paper, 1/s
 FIRST_STEP = 0.66e-2  # s, of the paper
 END = 20.0  # s
-# Of the largest singular value of D at the start: a twentieth of sigma_11 at its smallest, and below it no drift that is small.
+# Relative to the largest singular value of D at the start: a twentieth of the smallest sigma_11, and above any small drift.
 RANK_HELD = 1e-2
 SMALL_GAINS = (2.0, 3.0, 5.0)  # alpha = beta, 1/s: above the rate at which a drift grows
 LAW_GAINS = (0.5, 1.0)  # alpha = beta, 1/s: too small, so that the drift grows, at a rate that the law says
@@ -22,7 +22,7 @@ WORK_TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 
 
 class Program(NamedTuple):
-    """What is compiled."""
+    """The key of its compiled program."""
 
     method: str  # of `METHODS`, the first stands for all: which one is a number
     solver: str
@@ -30,7 +30,7 @@ class Program(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """How long that takes, roughly: loops of multistep methods are compiled by XLA, all else is machine code of its own."""
+        """The rough time of that: XLA compiles the loops of multistep methods, all else is machine code."""
         return 6.0 if self.solver in ("Adams", "BDF") else 1.0
 
 
@@ -51,28 +51,28 @@ class Case:
 
     @property
     def program(self) -> Program:
-        """What it runs on."""
+        """The program that runs it."""
         return Program(METHODS[0] if self.method in METHODS else self.method, self.solver, self.projected)
 
     @property
     def stiff(self) -> bool:
-        """Whether the gains dictate the step, not the motion."""
+        """True if the gains dictate the step, not the motion."""
         return self.alpha > 100
 
     @property
     def timed(self) -> bool:
-        """Whether its time is shown: not of runs of which only the drift is, nor where Python takes part."""
+        """True if its time is shown: not of runs that show only drift, nor if Python takes part."""
         return self.group not in ("start", "law") and self.solver != "VODE"
 
     @property
     def seconds(self) -> float:
-        """How long it takes, roughly: what is said of the time left rests on it."""
+        """The rough time that it takes, for estimates of the time left."""
         return 6.0 * self.end / END if self.stiff else 0.3
 
 
 @dataclass(frozen=True)
 class Scope:
-    """How much of the study is done."""
+    """The part of the study that is done."""
 
     name: str
     methods: tuple[str, ...] = METHODS

@@ -1,4 +1,4 @@
-"""Why a run of ours ended as it did where the paper's ended otherwise: what is known, and what is not.
+"""Reasons for runs of ours that ended otherwise than the paper's, as far as they are known.
 
 A remark is a letter, and `REMARKS` says what it stands for. Which remark a run gets follows from the two verdicts alone.
 """
@@ -65,7 +65,7 @@ def published_kind(row: Row) -> str:
 
 
 def published_time(row: Row) -> float:
-    """Return the time (s) in a result such as "correct to 17.5 s"; NaN where there is none."""
+    """Return the time (s) in a result such as "correct to 17.5 s"; NaN without a time."""
     found = re.search(r"([\d.]+) s", row.result)
     return float(found[1]) if found else float("nan")
 

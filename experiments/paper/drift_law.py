@@ -38,7 +38,7 @@ class Swing(NamedTuple):
 
 
 def swing_of(mech: Mechanism, q: Float[ArrayLike, "bodies 3"]) -> Swing:
-    """Return the swing of a parallelogram linkage that is released from rest at `q`; ValueError where it is none."""
+    """Return the swing of a parallelogram linkage that is released from rest at `q`; raise ValueError for other mechanisms."""
     linkage = parallelogram(mech, np.asarray(q), ALIKE)
     if linkage is None:
         raise ValueError(f"{mech.name} is no parallelogram linkage that moves under gravity alone")

@@ -54,7 +54,7 @@ def linkage(data) -> Figure:
 
 
 def figure_2(data) -> Figure:
-    """Draw violation over time without and with Baumgarte's terms, the paper's figure 2, and the error beside it."""
+    """Draw violation over time without and with Baumgarte's terms, the paper's figure 2, and next to it the error."""
     rows = tolerances(data)
     figure = Figure(figsize=(WIDTH, 1.1 + 2.1 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), 3, sharex="col", squeeze=False)

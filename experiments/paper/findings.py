@@ -1,4 +1,4 @@
-"""What the report says it found: sentences whose numbers are read from the dataset."""
+"""The findings of the report: sentences whose numbers are read from the dataset."""
 
 import json
 from itertools import pairwise
@@ -80,7 +80,7 @@ def _sentences(data):
 
 
 def _spacing(data):
-    """How much sooner a run is lost for a smaller TOL: by the law, here, and in the paper where a run halts."""
+    """Say how much sooner a run is lost for a smaller TOL: by the law, here, and in the paper, where a run halts."""
     tols = tolerances(data)
     free = {tol: [float(run.correct_to) for run in runs(data, "paper", tol=tol, alpha=0.0)] for tol in tols}
     if not np.isfinite(list(free.values())).any(axis=1).all():
@@ -102,13 +102,13 @@ def _spacing(data):
 
 
 def _halted(table: dict, method: str) -> float:
-    """When a run of the paper halted (s); NaN where it did not."""
+    """Return the time at which a run of the paper halted (s); NaN if it did not."""
     (row,) = [Row(**row) for row in table["rows"] if row["method"] == method]
     return published_time(row) if published_kind(row) == "fails" else float("nan")
 
 
 def _nearest(data):
-    """What the paper's nearest relative of an integrator makes of its runs."""
+    """Say how the paper's runs end with the nearest relative of its integrator."""
     groups = {"with the threshold TOL": "other integrators", "with the rank held at 11": "rank held"}
     found = {name: list(runs(data, group, solver="VODE", alpha=0.0)) for name, group in groups.items()}
     if all(found.values()):

@@ -20,9 +20,9 @@ from .verdict import LOST, LOST_EARLY, LOST_LATE, Verdict, classify, lost_at
 
 SECOND = -50.0  # degrees: the start that fits the paper's tables second best
 FORMAT = "udkjax report 1"
-# Between these sizes of sigma_12, above rounding and below what is no longer small, growth is held against the law.
+# Growth is compared with the law between these sizes of sigma_12, above rounding and where it is still small.
 FITTED = 1e-12, 1e-4
-GROWN = 30.0  # by how much it must have grown for a rate to be read from it
+GROWN = 30.0  # growth needed to read a rate from it
 
 HISTORIES = {
     "time": ("s", "instants at which the run was looked at"),
@@ -76,7 +76,7 @@ def dataset(
 ) -> Any:
     """Return an xarray Dataset over `run` (and `instant`): the cases, their histories, verdicts and counts.
 
-    Whatever the page says besides is in the attributes: the paper's own tables, settings, versions, machine, scene.
+    All else on the page is in the attributes: the paper's own tables, settings, versions, machine, scene.
     """
     import xarray
 
@@ -127,7 +127,7 @@ def _thresholds() -> dict[str, Any]:
 
 
 def _judged(cases: list[Case], rows: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, str, str]]:
-    """Verdicts, and what a table says of a run in one number."""
+    """Return verdicts, and the numbers of runs in tables."""
     verdicts = [classify(row["time"], row["angle_error"], row["end"], row["result"] == "successful") for row in rows]
     when = {
         name: np.array([lost_at(row["time"], row["angle_error"], row["end"], size) for row in rows])

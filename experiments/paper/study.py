@@ -1,8 +1,8 @@
-"""The study of the paper, done again: which pseudoinverse, which tolerance, which stabilization, and what was wrong with it.
+"""The study of the paper repeated: pseudoinverses, tolerances, stabilizations, and its errors.
 
 The paper's five-bar parallelogram is released from rest and simulated for 20 s by five pseudoinverses, at three tolerances, with
-and without Baumgarte's stabilization; its section 6 counts how that went. Here each run is held against the exact solution, and
-beside the paper's runs stand those that would have been better. `study` returns everything as one dataset.
+and without Baumgarte's stabilization; its section 6 lists the results. Here each run is compared with the exact solution, and
+better runs are added to the paper's. `study` returns everything as one dataset.
 """
 
 import time
@@ -31,12 +31,12 @@ from . import vode
 from .cases import FIRST_STEP, FULL, RANK_HELD, Case, Program, Scope, plan
 from .record import dataset
 
-INSTANTS = 401  # at which each run is looked at
+INSTANTS = 401  # times at which each run is examined
 START = -45.0  # degrees. Inferred: the paper does not print its initial state, and -45 fits its tables best, then -50
-NUDGE = 1e-16  # m, rad: what the starts of the group "start" differ by, the rounding of a coordinate
+NUDGE = 1e-16  # m, rad: differences between the starts of the group "start", the rounding of a coordinate
 DENSE = {"SVD": SVD(), "Varga": Varga(), "Greville": Greville(), "Householder": Householder(), "GramSchmidt": GramSchmidt()}
 
-Tell = Callable[[str, float], None]  # what is being done, and which part of all of it is done
+Tell = Callable[[str, float], None]  # the current work, and the part of all work that is done
 
 
 def study(
@@ -78,7 +78,7 @@ def study(
 
 
 def _compiled(mech: Mechanism, state: State, cases: list[Case], max_steps: int, tell: Tell) -> dict[Program, Callable]:
-    """All programs, compiled on as many threads as there are cores: XLA does it without Python's lock."""
+    """Compile all programs, on one thread per core: XLA does it without Python's lock."""
     numbers = (jnp.linspace(0.0, 1.0, INSTANTS), state, *(jnp.asarray(x) for x in (1e-6, 1e-6, 0.0, 0.0, 0.0)))
 
     def build(program: Program) -> Callable:
@@ -107,21 +107,21 @@ def _run(mech: Mechanism, program: Program, max_steps: int, ts, state, tol, rank
         stabilization=Projection() if program.projected else Baumgarte(alpha, beta),
         solver=solver_named(program.solver),
         dt0=None if program.projected else FIRST_STEP,
-        drift_tol=np.inf,  # a run goes on, however open the loops
+        drift_tol=np.inf,  # a run continues, however open the loops
         max_steps=max_steps,
         throw=False,
     )
 
 
 def pseudoinverse(name: str, rank_tol: Any, number: Any) -> Pseudoinverse:
-    """Return the paper's methods with their threshold in the units of D; of the others, which have their own, the default."""
+    """Return the paper's methods with their threshold in the units of D; the others have their own default."""
     if name in DENSE:
         return OneOf.absolute(rank_tol, methods=tuple(DENSE.values()), number=number)
     return {"Auto": Auto, "Elimination": Elimination}[name]()
 
 
 def _inputs(case: Case, state: State, sigma: float, seed: int) -> tuple:
-    """What a program is called with. `sigma` is the largest singular value of D at the start."""
+    """Return the arguments of a program. `sigma` is the largest singular value of D at the start."""
     if case.start:
         nudge = np.random.default_rng((seed, case.start)).normal(scale=NUDGE, size=state.q.shape)
         state = State(state.q + nudge, state.v)
@@ -131,12 +131,12 @@ def _inputs(case: Case, state: State, sigma: float, seed: int) -> tuple:
 
 
 def number_of(method: str) -> int:
-    """Return the number of one of the paper's methods; zero of others, whose programs do not ask for it."""
+    """Return the number of one of the paper's methods; zero for others, whose programs do not need it."""
     return list(DENSE).index(method) if method in DENSE else 0
 
 
 def _timed(run: Callable, repeats: int, patience: float) -> tuple[Any, list[float]]:
-    """A solution, and the wall time (s) of each repeat of the run; no further repeat after `patience` (s)."""
+    """Return a solution, and the wall time (s) of each repeat of the run; no further repeat after `patience` (s)."""
     seconds: list[float] = []
     sol: Any = None
     while len(seconds) < repeats and sum(seconds) <= patience:
@@ -147,7 +147,7 @@ def _timed(run: Callable, repeats: int, patience: float) -> tuple[Any, list[floa
 
 
 def _row(mech: Mechanism, case: Case, inputs: tuple, sol: Any, seconds: list[float]) -> dict[str, Any]:
-    """Everything that is kept of one run."""
+    """Return the record of one run."""
     ts, state, _, rank_tol, *_ = inputs
     D, psi, psi_dot = (np.asarray(x) for x in _matrices(mech, ts, sol.q, sol.v))
     q, alive = np.asarray(sol.q), np.isfinite(np.asarray(sol.q)).all((1, 2))
@@ -181,7 +181,7 @@ def _row(mech: Mechanism, case: Case, inputs: tuple, sol: Any, seconds: list[flo
 
 @eqx.filter_jit
 def _matrices(mech: Mechanism, ts, q, v) -> tuple:
-    """D, Psi and Psi_dot of all rows, at each time."""
+    """Return D, Psi and Psi_dot of all rows at each time."""
     equations: Any = prepare(mech, SVD())
 
     def one(t, q, v):

@@ -70,7 +70,7 @@ def seconds(value: float | None) -> str:
 
 
 def result(run) -> str:
-    """Say how a run ended: its verdict, and the cause where the solver gave up."""
+    """Return how a run ended: its verdict, and the cause if the solver gave up."""
     words = escape(str(run.verdict.item()))
     cause = str(run.result.item())
     return words if cause == "successful" else f"{words} ({CAUSES.get(cause, cause)})"
@@ -109,7 +109,7 @@ def rules(data) -> str:
 
 
 def paper_tables(data) -> str:
-    """Return tables 2 to 7 of the paper with our figures beside."""
+    """Return tables 2 to 7 of the paper together with our figures."""
     found = []
     for published in json.loads(data.attrs["published"]):
         stabilized = published["alpha"] > 0
@@ -150,14 +150,14 @@ def _paper_table(published: dict, ours: dict) -> str:
 
 
 def remarks(data) -> str:
-    """Return what the letters in the tables stand for, those that occur."""
+    """Return the meanings of the letters that occur in the tables."""
     texts = json.loads(data.attrs["remarks"])
     used = sorted(set(data.remark.values) & set(ascii_lowercase))
     return "<dl>" + "".join(f"<dt>{letter}</dt><dd>{escape(texts[letter])}</dd>" for letter in used) + "</dl>"
 
 
 def better(data) -> str:
-    """Return what would have been better, one table a tolerance."""
+    """Return better runs than the paper's, one table for each tolerance."""
     names = ("method", "result", "Σψ² (m²)", "NFUNC", "NSTEPS", "CPU (s)", "largest<br>error (rad)", "error at the<br>end (rad)")
     head = columns(*names, words=2)
     found = []
@@ -214,7 +214,7 @@ def explained(data) -> str:
 
 
 def _lost(run) -> float:
-    """When a run ceased to be right (s): when it was lost, or given up, or at its end."""
+    """Return the time at which a run ceased to be right (s): when it was lost or given up, or its end."""
     times = [float(run[name]) for name in ("correct_to", "failed_at")]
     return min((time for time in times if isfinite(time)), default=float(run.t_end))
 

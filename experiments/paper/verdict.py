@@ -1,4 +1,4 @@
-"""Was a run right, and until when? The paper's three verdicts, against an exact solution instead of by eye."""
+"""Was a run right, and until when? The paper's three verdicts, by an exact solution instead of by eye."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ LOST_EARLY, LOST_LATE = 1e-3, 1e-1
 
 
 class Verdict(NamedTuple):
-    """`kind` is "correct", "correct up to" or "fails"; times in s are not a number where there is none."""
+    """`kind` is "correct", "correct up to" or "fails"; times in s, or NaN."""
 
     kind: str
     correct_to: float  # the last output time at which the angles were right
@@ -21,7 +21,7 @@ class Verdict(NamedTuple):
 
     @property
     def words(self) -> str:
-        """As the paper says it."""
+        """Return the words of the paper."""
         if self.kind == "correct":
             return "correct"
         if self.kind == "fails":

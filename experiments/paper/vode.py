@@ -2,7 +2,7 @@
 
 IMSL's DIVPAG and VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038) both descend from Gear's and
 Hindmarsh's programs: Adams-Moulton of variable order and step in Nordsieck form. VODE calls the right-hand side from Python, so
-its times say nothing and are left out.
+its times are meaningless and left out.
 """
 
 import warnings
@@ -24,7 +24,7 @@ CAUSES = {-1: Result.step_limit, -4: Result.step_too_small, -5: Result.step_too_
 
 
 class Run(NamedTuple):
-    """What a solution of `simulate` has, as far as the study asks."""
+    """The part of the interface of a `simulate` solution that the study uses."""
 
     ts: np.ndarray
     q: np.ndarray
@@ -52,7 +52,7 @@ def run(
 
 
 def _along(solver: Any, ts: np.ndarray, calls: Callable[[], int]) -> Run:
-    """The run at the instants `ts`, up to the one that it does not reach."""
+    """Return the run at the instants `ts`, up to the first that it does not reach."""
     ys = np.full((len(ts), len(solver.y)), np.nan)
     ys[0], reached, steps = solver.y, 0, 0
     with warnings.catch_warnings():

@@ -1,1 +1,1 @@
-"""What several studies, or one that is long, are made of."""
+"""Parts that several studies share, or of long studies."""

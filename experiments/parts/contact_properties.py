@@ -85,7 +85,7 @@ def _plate_on_beam(rng: np.random.Generator) -> Throw:
 
 
 class _RoundGap(eqx.Module):
-    """How far a wheel is from a wall, or from another wheel."""
+    """Return the distance of a wheel from a wall, or from another wheel."""
 
     wheels: tuple[str, ...] = eqx.field(static=True)
     reach: Any  # of the wheels together
@@ -143,7 +143,7 @@ def _body(rng: np.random.Generator, length: float, mass: float, speed: float, po
 
 
 def _point(q: np.ndarray, p: Any) -> tuple[Any, Any]:
-    """Where a point of a body is, of its x, y and angle."""
+    """Return the position of a point of a body from its x, y and angle."""
     c, s = np.cos(q[..., 2]), np.sin(q[..., 2])
     return q[..., 0] + c * p[0] - s * p[1], q[..., 1] + s * p[0] + c * p[1]
 
@@ -171,7 +171,7 @@ def _check_impacts(tally: Tally, mechanism: udk.Mechanism, gaps: list[Gap], leng
 
 
 def _check_pull(tally: Tally, mechanism: Any, gaps: list[Gap], q: Any, jump: Any, mass: Any, length: float, at: str) -> None:
-    """Split a jump into impulses of the joints and of what touches; by least squares, not negative."""
+    """Split a jump into impulses of the joints and of contacts; by least squares, not negative."""
     from scipy.optimize import nnls
 
     unit = np.tile([length, length, 1.0], len(q))

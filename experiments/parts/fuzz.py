@@ -44,7 +44,7 @@ class Case(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """What a case did that it must not: which case, what it is about, what is wrong, and the error's text."""
+    """A forbidden outcome of a case: the case, its subject, the fault, and the error's text."""
 
     kind: str
     seed: int
@@ -112,7 +112,7 @@ def work(kind: str, seed: int, first: int, last: int, report: Path, end: float) 
 
 
 def run(kind: str, seed: int, first: int, count: int, seconds: float) -> Iterator[tuple[int, list[Fault]]]:
-    """Run cases in processes of their own, and go on behind what kills one; iterate over how many are done, and all faults."""
+    """Run cases in processes of their own, and continue after one is killed; iterate over the number done, and all faults."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz-report-"))
     report, begin, last, end = folder / "faults", first, first + count, time.time() + seconds
     extra: list[Fault] = []

@@ -53,7 +53,7 @@ EVENTS: dict[str, dict[str, Any]] = {
     "Release": {"name": "pin"},
     "Impact": {"restitution": 0.5, "at_rest": "hold"},
 }
-# What takes long where it turns out to be right, and what writes or shows: less often, or not at all.
+# Functions that take long with valid arguments, or that write or show: called less often, or not at all.
 SELDOM = {
     "identify",
     "check_gradients",
@@ -285,7 +285,7 @@ def draw(rng: np.random.Generator) -> Case:
         given.setdefault("max_steps", 100)
     traced = [p for p, value in wrong.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fic"]
     about = f"{name}({', '.join(wrong)})"
-    # What is right by itself, and does not belong to the rest, may be blamed on anything.
+    # An argument that is valid alone but does not fit the others may be reported under any name.
     mismatched = any(isinstance(value, udk.Mechanism | udk.Analysis | udk.State | SimpleNamespace) for value in wrong.values())
     names = [] if mismatched else _names(wrong)
     if traced and rng.random() < 0.3:

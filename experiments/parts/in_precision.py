@@ -1,4 +1,4 @@
-"""What `precision` computes, in the precision of the environment: `python -m experiments.parts.in_precision FILE [--smoke]`."""
+"""The computations of `precision`, by the environment's precision: `python -m experiments.parts.in_precision FILE [--smoke]`."""
 
 import sys
 from typing import Any

@@ -39,7 +39,7 @@ class RandomScene(NamedTuple):
 
     @property
     def label(self) -> str:
-        """How to draw it again."""
+        """The call that draws it again."""
         return f"random_scene{self.seed}"
 
 
@@ -143,7 +143,7 @@ def _moves(table: Table, draw: "_Draw") -> bool:
 
 
 class _Draw:
-    """What is drawn of one scene: `pick` decides on the structure, `of` gives numbers."""
+    """Random draws for one scene: `pick` decides on the structure, `of` gives numbers."""
 
     def __init__(self, pick: np.random.Generator, of: np.random.Generator, bodies: tuple[int, int], forces: bool):
         self.pick, self.of, self.forces = pick, of, forces

@@ -112,7 +112,7 @@ def solve(scene: RandomScene, terms: Terms | None = None) -> Solved:
 
 
 def growth(solved: Solved, power: int = 2, without: Sequence[int] = ()) -> float:
-    """How much more than at an ordinary state rounding errors may be; `without` the rows that elimination leaves out."""
+    """Return the amplification of rounding errors relative to a generic state; `without` the rows that elimination leaves out."""
     condition = solved.condition
     if without:
         rows = (
@@ -127,7 +127,7 @@ class Programs:
     """The programs of mechanisms of one structure with their numbers in, run by NumPy on all of them at once."""
 
     def __init__(self, mechanism: udk.Mechanism, redundant: Sequence[int], tables: Sequence[Table] = ()):
-        """Of one mechanism, or of `tables` of its structure, whose numbers take the places of its own."""
+        """Evaluators of one mechanism, or of `tables` of its structure, whose numbers replace its own."""
         programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
         self._written_out = WrittenOut(programs, ["accelerations", "tangent_part", "rows_and_loads"])
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
@@ -201,7 +201,7 @@ def _number(table: Table, entries: dict[str, Table], frames: dict[str, Any], nam
         for key in path:
             entry = entry[key]
         return entry
-    # What is left to the guess.
+    # Numbers left to the guess.
     if section == "driver":
         return np.zeros((2, 2))
     (x1, y1, a1), (x2, y2, a2) = one, two = [frames[b] for b in entry["bodies"]]
@@ -355,7 +355,7 @@ def moved(scene: RandomScene, angle: float, shift: np.ndarray) -> RandomScene:
 
 
 def can_be_turned(table: Table) -> bool:
-    """Whether no element is tied to the axes of the ground itself, or to its origin."""
+    """Return True if no element is tied to the axes or the origin of the ground."""
     axes = [e for e in table["driver"] if e["coordinate"] in ("x", "y") and e["bodies"][0] == "ground"]
     return not axes and not any(e["type"] == "rack" and e["bodies"][1] == "ground" for e in table["joint"])
 

@@ -19,7 +19,7 @@ from udkjax.integrate.solvers.counting import CountingController, evaluations
 from udkjax.integrate.solvers.multistep import Multistep, Tolerances
 
 GROWTH = 1.1  # of the steps of the start; beyond 1.127 the formula of order five is unstable
-# The first step, relative to the steps to come: with order one it errs by 1e-12 of what a step of that size does.
+# The first step, relative to the steps to come: with order one its error is 1e-12 of that of a later step.
 SMALLEST = 1e-6
 STARTING = int(np.ceil(np.log(1 / SMALLEST) / np.log(GROWTH)))  # steps of the start
 NEWTON, ACCEPT = 1e-11, 1.0  # tolerances: implicit equations are solved well, and what an Adams method estimates is accepted

@@ -1,4 +1,4 @@
-"""What was found of each property: how many cases, the worst error, and where it was."""
+"""Results of each property: number of cases, the worst error, and its place."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class Tally:
     left_out: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, errors: ArrayLike | Sequence[float], at: str) -> None:
-        """Count errors, one or many, of a case; what is not a number is the worst of all."""
+        """Count one or several errors of a case; NaN is the worst of all."""
         found = self.found.setdefault(name, Found())
         for error in np.ravel(np.asarray(errors, float)):
             error = math.inf if math.isnan(error) else float(error)

@@ -24,8 +24,8 @@ REFERENCE = (5.0, 5.0)
 GUESSES = ((1.0, 1.0), REFERENCE, (10.0, 10.0), (2.0, 8.0))
 SPAN = 4.0  # s
 ENDS = (2.5, 3.0, 3.5, SPAN)  # s, of adaptive runs
-# Of a start's coordinates and velocities, in tolerances: what adaptive steps leave of Psi. A start that is closed but for
-# rounding, at rest, does not excite what redundancy lets grow: gains tuned from it do not hold that (see `from_closed`).
+# Violation of a start in coordinates and velocities, in tolerances, as adaptive steps leave it. A start closed to rounding, at
+# rest, does not excite the drift that redundancy lets grow: gains tuned from it do not hold that (see `from_closed`).
 OPEN, SEED = 1e-2, 1
 MOST = 256  # steps of the longest run by equal steps
 LANES = len(GUESSES)
