@@ -1,14 +1,14 @@
-"""The programs of a scene, written out and run on Python's floats."""
+"""The programs of a scene, unrolled and run on Python floats."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
+from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 
 
-def run(program: WrittenOutProgram, given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def run(program: UnrolledProgram, given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the outputs of a program by array, from its inputs by array; what is not given is zero."""
     values = [float(given[x][k]) if x in given else 0.0 for x, k in program.inputs]
     found: dict[str, list[float]] = {}
@@ -21,10 +21,10 @@ def evaluate_programs(
     programs: ScenePrograms, names: Sequence[str], numbers: Sequence[float], t: float, q: np.ndarray, v: np.ndarray, **more
 ) -> dict[str, np.ndarray]:
     """Return the results of some programs at a state."""
-    written_out, found = WrittenOut(programs, names), {}
-    given = {"constants": np.array(written_out.prologue(list(numbers))), "t": np.array([t]), "q": np.ravel(q), "v": np.ravel(v)}
+    unrolled, found = Unrolled(programs, names), {}
+    given = {"constants": np.array(unrolled.prologue(list(numbers))), "t": np.array([t]), "q": np.ravel(q), "v": np.ravel(v)}
     for name in names:
-        found |= run(written_out.program(name), given | more)
+        found |= run(unrolled.program(name), given | more)
     return found
 
 

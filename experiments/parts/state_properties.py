@@ -20,7 +20,7 @@ from experiments.parts.tally import Property, Tally, relative
 from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.equations.written_out import WrittenOut
+from udkjax.equations.unrolled import Unrolled
 from udkjax.expressions import ScalarProgram
 from udkjax.pinv.rank_policy import RankPolicy
 
@@ -129,17 +129,17 @@ class Programs:
     def __init__(self, mechanism: udk.Mechanism, redundant: Sequence[int], tables: Sequence[Table] = ()):
         """Evaluators of one mechanism, or of `tables` of its structure, whose numbers replace its own."""
         programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
-        self._written_out = WrittenOut(programs, ["accelerations", "tangent_part", "rows_and_loads"])
+        self._unrolled = Unrolled(programs, ["accelerations", "tangent_part", "rows_and_loads"])
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
         own = np.concatenate([np.ravel(x) for x in jax.tree.leaves(mechanism)])
         rows = _at_start(mechanism, numbers_of(mechanism, tables) if tables else own[None])
         numbers = np.hstack([rows, np.tile([0.0, SAFE], (len(rows), 1))])
-        self._constants = _run(self._written_out.prologue, numbers)
+        self._constants = _run(self._unrolled.prologue, numbers)
 
     def run(self, name: str, q: np.ndarray, v: np.ndarray, dv: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
         """Return the results (members, ...) of a program at q and v (members, n), t = 0, by array."""
         given = {"constants": self._constants, "t": np.zeros((len(q), 1)), "q": q, "v": v, "dq": 0.0 * q, "dv": dv + 0.0 * v}
-        program, inputs, outputs = self._written_out.program(name)
+        program, inputs, outputs = self._unrolled.program(name)
         values = _run(program, np.stack([given[x][:, k] for x, k in inputs], 1))
         return {x: values[:, [i for i, (y, _) in enumerate(outputs) if y == x]] for x in dict.fromkeys(y for y, _ in outputs)}
 

@@ -9,7 +9,7 @@ import udkjax as udk
 from udkjax.equations.analysis import analyse
 from udkjax.equations.differentiable_programs import FORWARD, REVERSE
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
+from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.pinv.rank_policy import RankPolicy
 
 GROUND = "ground"
@@ -22,18 +22,18 @@ def programs(mechanism, policy=RankPolicy.DROP, baumgarte=False, analysis=None):
     return scene_programs(mechanism, (analysis or analyse(mechanism)).redundant_rows or (), baumgarte, policy)
 
 
-def written_out(mechanism, name="accelerations", **choices) -> WrittenOutProgram:
-    return WrittenOut(programs(mechanism, **choices), [name]).program(name)
+def unrolled(mechanism, name="accelerations", **choices) -> UnrolledProgram:
+    return Unrolled(programs(mechanism, **choices), [name]).program(name)
 
 
 def right_hand_side(mechanism, name="accelerations", **choices):
     """How many operations of each kind the accelerations take, or another program."""
-    return written_out(mechanism, name, **choices).program.count()
+    return unrolled(mechanism, name, **choices).program.count()
 
 
 def uses(mechanism, array, **choices) -> list[int]:
     """The numbers of an array that the accelerations depend on."""
-    program, inputs, _ = written_out(mechanism, **choices)
+    program, inputs, _ = unrolled(mechanism, **choices)
     return [k for s, (name, k) in zip(program.inputs, inputs, strict=True) if name == array and program.uses(s)]
 
 
@@ -74,7 +74,7 @@ def test_the_papers_linkage_pinned(linkage, plain):
     assert "sqrt" not in plain
     assert trigonometry(plain) == {"sincos": 4}  # one pair a body
     assert arithmetic(plain) <= 520
-    assert arithmetic(WrittenOut(programs(linkage), ["accelerations"]).prologue.count()) <= 40  # what parameters alone determine
+    assert arithmetic(Unrolled(programs(linkage), ["accelerations"]).prologue.count()) <= 40  # what parameters alone determine
 
 
 # --- what a scene does not have
@@ -188,7 +188,7 @@ def test_pivots_that_are_refused_are_only_asked_about(linkage, plain):
 def test_pivots_that_need_not_wait_for_each_other_do_not(mechanism, pivots, most):
     """A division takes several times as long as what is between two of them: those in a row are what a single run waits for."""
     found = programs(mechanism, RankPolicy.REFUSE)
-    program, row = written_out(mechanism, policy=RankPolicy.REFUSE).program, {}
+    program, row = unrolled(mechanism, policy=RankPolicy.REFUSE).program, {}
     for index in program.order:
         node = program.graph.nodes[index]
         row[index] = max((row.get(a.index, 0) for a in node.arguments), default=0) + (node.kind == "div")
@@ -228,7 +228,7 @@ def derivative(mechanism, name="accelerations", mode=FORWARD, numbers=()):
     """How many operations of each kind an evaluation takes that derivatives follow, and these."""
     found = programs(mechanism)
     active = [k in numbers for k in range(found.number_count)]
-    both = WrittenOut(found, [], [name], active, mode).derivative(name)
+    both = Unrolled(found, [], [name], active, mode).derivative(name)
     return tuple(x.program.count() for x in both)
 
 

@@ -69,7 +69,7 @@ FUNCTIONS = {
     "whole numbers": lambda x, y: x * jnp.sum(jnp.where(y > 0, 1, 2)),
     "norm": lambda x, y: jnp.linalg.norm(x) * jnp.hypot(y[0], y[1]),
 }
-WRITTEN_OUT = list(FUNCTIONS)[: list(FUNCTIONS).index("cond")]
+ELEMENTWISE = list(FUNCTIONS)[: list(FUNCTIONS).index("cond")]
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
 XS, YS = np.stack([X, -X, X[::-1]]), np.stack([Y, Y + 0.2, -Y])
 
@@ -93,9 +93,9 @@ def test_read(function, emit):
     def total(outputs):
         return sum(jnp.sum(jnp.asarray(o, float) ** 2) for o in jax.tree.leaves(outputs))
 
-    def point(g, x, y):  # only one function is unrolled and differentiated: its program consists of JAX's operations
+    def point(g, x, y):  # one elementwise function is differentiated: its program consists of JAX operations
         slope = jax.grad(lambda x, y: total(g(x, y)), argnums=(0, 1))
-        return g(x, y), slope(x, y) if name not in WRITTEN_OUT or name == "arithmetic" else ()
+        return g(x, y), slope(x, y) if name not in ELEMENTWISE or name == "arithmetic" else ()
 
     program = emit(f, X, Y)
     if name == "custom_jvp":  # the rule belongs to a derivative that is traced; of the program the body counts
@@ -116,8 +116,8 @@ def test_branches_and_steps_of_values_that_are_not_finite(emit):
     np.testing.assert_array_equal([np.ravel(program.on_floats(row)) for row in rows], expected)
 
 
-@pytest.mark.parametrize("name", WRITTEN_OUT)
-def test_what_acts_element_by_element_is_written_out(name, emit):
+@pytest.mark.parametrize("name", ELEMENTWISE)
+def test_elementwise_functions_have_no_calls(name, emit):
     assert not [node for node in emit(FUNCTIONS[name], X, Y).program.graph.nodes if node.kind == "call"]
 
 

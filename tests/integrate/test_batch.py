@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.written_out import WrittenOut
+from udkjax.equations.unrolled import Unrolled
 from udkjax.native import primitive, runs
 
 TS = np.linspace(0.0, 2.0, 21)
@@ -108,5 +108,5 @@ def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
     jax.jit(jax.jacfwd(angle)).lower(1.0)
     (run,) = (x for x in found if isinstance(x, runs.RunTangents))
     assert sum(run.active) == 1 and len(run.active) > 30
-    written_out = WrittenOut(run.code, [], ["accelerations"], run.active)
-    assert 1 <= len(written_out.moving) <= 8 < len(run.code.constants)
+    unrolled = Unrolled(run.code, [], ["accelerations"], run.active)
+    assert 1 <= len(unrolled.moving) <= 8 < len(run.code.constants)

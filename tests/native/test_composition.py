@@ -264,12 +264,12 @@ def test_equal_programs_are_equal_texts_in_every_process():
     program = """
 import udkjax as udk
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.written_out import WrittenOut
+from udkjax.equations.unrolled import Unrolled
 import hashlib
 mechanism = udk.library.parallelogram()
 programs = scene_programs(mechanism, udk.analyse(mechanism).redundant_rows)
-written_out = WrittenOut(programs, [], ["projection"], [True] * programs.number_count, mode="reverse")
-program = written_out.derivative("projection").derivative.program
+unrolled = Unrolled(programs, [], ["projection"], [True] * programs.number_count, mode="reverse")
+program = unrolled.derivative("projection").derivative.program
 graph, order = program.graph, program.order
 text = str([(graph.nodes[k].kind, [a.index for a in graph.nodes[k].arguments]) for k in order])
 print(hashlib.sha256(text.encode()).hexdigest())

@@ -20,7 +20,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.differentiable_programs import PREFIXES, TWICE
 from udkjax.equations.scene_arrays import constants_of
 from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.written_out import WrittenOut
+from udkjax.equations.unrolled import Unrolled
 from udkjax.expressions.loop_derivative import LoopDerivative
 from udkjax.expressions.loop_program import KernelLoop, Reset
 from udkjax.native.base import machine
@@ -337,19 +337,19 @@ def test_blocks_that_are_alike_are_eliminated_in_a_run():
     assert len(found) <= 8
 
 
-# --- written out
+# --- unrolled
 
 
 PROGRAMS = "accelerations newton_q newton_v_and_psi project end_of_step tangent_part equation_terms psi psi_dot".split()
 
 
-def test_written_out_programs_compute_what_loops_do(at):
+def test_unrolled_programs_equal_loops(at):
     code, random = at.code, np.random.default_rng(6)
     dq, dv = random.standard_normal((2, code.coordinate_count))
-    written_out = WrittenOut(code, PROGRAMS)
-    given = {"constants": np.array(written_out.prologue(at.numbers.tolist())), "t": np.array([at.t]), "q": at.q, "v": at.v}
+    unrolled = Unrolled(code, PROGRAMS)
+    given = {"constants": np.array(unrolled.prologue(at.numbers.tolist())), "t": np.array([at.t]), "q": at.q, "v": at.v}
     for name in PROGRAMS:
-        found, expected = run(written_out.program(name), given | {"dq": dq, "dv": dv}), at.run(name, dq=dq, dv=dv)
+        found, expected = run(unrolled.program(name), given | {"dq": dq, "dv": dv}), at.run(name, dq=dq, dv=dv)
         assert found or not code.row_count
         for x, value in found.items():
             size = max(1.0, np.abs(expected[x]).max(initial=0.0))

@@ -99,7 +99,7 @@ from udkjax.equations.structure import numbers_as_vector as numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.textbook import prepare as prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte as Baumgarte
-from udkjax.equations.written_out import WrittenOut as WrittenOut
-from udkjax.equations.written_out import WrittenOutProgram as WrittenOutProgram
+from udkjax.equations.unrolled import Unrolled as Unrolled
+from udkjax.equations.unrolled import UnrolledProgram as UnrolledProgram
 
 __all__: list[str]

@@ -1,8 +1,8 @@
 """The programs of a scene: each computes its results, and nothing else.
 
 Terms come from loops over elements of the same structure (scene_terms.py), linear systems from elimination by blocks
-(block_elimination.py, scene_solver.py), and derivatives from loops, too (differentiable_programs.py). Small scenes run them
-written out (written_out.py).
+(block_elimination.py, scene_solver.py), and derivatives from loops, too (differentiable_programs.py). The programs of small
+scenes are unrolled (unrolled.py).
 """
 
 from collections.abc import Hashable
@@ -23,9 +23,9 @@ from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, Lo
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
-# Operations of the accelerations up to which programs are written out. Written out they evaluate faster, up to several times this
-# size, but take the longer to trace and compile, the larger the scene is (python -m benchmarks scaling).
-WRITTEN_OUT_OPERATIONS = 2800
+# Operations of the accelerations up to which programs are unrolled. Unrolled programs evaluate faster up to several times this
+# size, but tracing and compiling them takes longer the larger the scene is (python -m benchmarks scaling).
+UNROLLED_SCENE_OPERATIONS = 2800
 
 # The arrays that programs return; all others are scratch.
 RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent multipliers".split())
@@ -87,9 +87,9 @@ class ScenePrograms:
 
     @cached_property
     def is_small(self) -> bool:
-        """True if the programs are written out, as the accelerations take few operations."""
+        """True if the programs are unrolled because the accelerations take few operations."""
         loops = [part for part in self.accelerations.parts if isinstance(part, KernelLoop)]
-        return sum(len(part.table) * part.kernel.operation_count for part in loops) <= WRITTEN_OUT_OPERATIONS
+        return sum(len(part.table) * part.kernel.operation_count for part in loops) <= UNROLLED_SCENE_OPERATIONS
 
     @property
     def drop_tol_index(self) -> int:

@@ -28,7 +28,7 @@ from udkjax.native.base.steps import SMALLEST_STEP as SMALLEST_STEP
 from udkjax.native.base.steps import STEP_LIMIT as STEP_LIMIT
 from udkjax.native.base.steps import STEP_TOO_SMALL as STEP_TOO_SMALL
 from udkjax.native.base.steps import UNIT as UNIT
-from udkjax.native.base.steps import UNSURE as UNSURE
+from udkjax.native.base.steps import UNRESOLVED as UNRESOLVED
 from udkjax.native.base.tableau import DOPRI8 as DOPRI8
 from udkjax.native.base.tableau import Method as Method
 from udkjax.native.base.tableau import method as method

@@ -58,7 +58,7 @@ class RunStates(Operation):
             breaks=self.breaks,
             width=width,
             vector=vector,
-            written_out=self.code.is_small,
+            unrolled=self.code.is_small,
             sampled=self.sampled,
             pseudoinverse=self.pseudoinverse,
             formulation=self.formulation,

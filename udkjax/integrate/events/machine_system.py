@@ -1,6 +1,6 @@
 """Runs with events by machine code: all members of a batch together, from one crossing to the next.
 
-Where machine code cannot tell what happens, as conditions vary too quickly or are no numbers, members are `unsure`, and run no
+Where machine code cannot tell what happens, as conditions vary too quickly or are no numbers, members are `unresolved` and run no
 farther: the plain form (`plain_system`) takes them.
 """
 
@@ -19,7 +19,7 @@ from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunS
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.solution import Result
 from udkjax.native.base.layout import INFO
-from udkjax.native.base.steps import CROSSED, DONE, LOST, NOT_FINITE, STEP_LIMIT, UNSURE
+from udkjax.native.base.steps import CROSSED, DONE, LOST, NOT_FINITE, STEP_LIMIT, UNRESOLVED
 
 STATUS, TIME, COUNTS, WRITTEN = 0, 1, slice(2, 5), 5  # of `INFO`
 
@@ -185,7 +185,7 @@ class MachineSystem:
     ):
         """Take over how the runs have ended that do not go on, and where."""
         status, (n, fails) = found.info[:, STATUS], (runs.q.shape[1], ~known)
-        self.unresolved[some] |= (status == UNSURE) & ~drifts
+        self.unresolved[some] |= (status == UNRESOLVED) & ~drifts
         code = np.where(status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
         code = np.where(status == NOT_FINITE, Result.not_finite, code)
         code = np.where((status == LOST) | drifts, Result.drift, code)

@@ -45,7 +45,7 @@ class Plan:
     breaks: bool
     width: int  # lanes
     vector: int  # numbers that a register holds
-    written_out: bool  # programs are written out, or loops
+    unrolled: bool  # programs are unrolled instead of loops
     steps: bool = True  # it integrates
     sampled: tuple[int, ...] = ()  # places of the numbers of the scene that have samples
     pseudoinverse: Any = None  # the `DenseMethod` that solves; None: elimination

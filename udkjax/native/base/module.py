@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 
 from udkjax.equations.differentiable_programs import FORWARD
-from udkjax.equations.written_out import WrittenOut, WrittenOutProgram
+from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.native.base.ir import POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
@@ -52,15 +52,15 @@ class Module(Memory):
         self.takes_dense_rows = self.is_dense or self.is_formulated
         self.pieces = code.piece_count if plan.breaks else 0
         self.programs = {name: getattr(code, name) for name in self.program_names()}
-        self.written_out = WrittenOut(code, list(self.programs), differentiated, active, self.mode) if plan.written_out else None
-        self.constants = len(self.written_out.constants if self.written_out else code.constants)
-        self.moving = range(self.constants if any(active) else 0) if self.written_out is None else self.written_out.moving
+        self.unrolled = Unrolled(code, list(self.programs), differentiated, active, self.mode) if plan.unrolled else None
+        self.constants = len(self.unrolled.constants if self.unrolled else code.constants)
+        self.moving = range(self.constants if any(active) else 0) if self.unrolled is None else self.unrolled.moving
         """The constants, by their numbers in the layout of the scene, along which there are derivatives."""
         self._lay_out()
         self.tangents = self.places  # of one direction of a derivative
         self.functions: list[Function] = []
         self.begins = []
-        self.loops = LoopWriter(plan.width, cold=plan.written_out)
+        self.loops = LoopWriter(plan.width, cold=plan.unrolled)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
 
@@ -101,15 +101,15 @@ class Module(Memory):
             p.add(name, self.pieces)
         if plan.sampled:
             p.add("numbers", -(-code.number_count // plan.width))
-        if not self.written_out:
+        if not self.unrolled:
             self._add_arrays("", code.scratch)
         if self.takes_dense_rows and "root" not in p.places:
-            self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.written_out else {}))
+            self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.unrolled else {}))
         if self.is_formulated:
             p.add("saved v", n)
         if self.falls_back:
             self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
-            if self.written_out:
+            if self.unrolled:
                 self._add_arrays("", {"psi_q": code.scratch["psi_q"], "psi_dot": m, "root": n})
             else:
                 self._add_arrays("fallback ", code.with_all_rows.scratch | {"constants": len(code.constants)})
@@ -117,7 +117,7 @@ class Module(Memory):
     @property
     def drop_tol_place(self) -> int | None:
         """The place of the threshold of pivots; None if no pivot is compared with it."""
-        place = (self.written_out or self.code).drop_tol_index
+        place = (self.unrolled or self.code).drop_tol_index
         return None if place is None else self.places["constants"] + place
 
     def _add_arrays(self, prefix: str, sizes: Mapping[str, int]):
@@ -150,7 +150,7 @@ class Module(Memory):
             names += self.solving
         if self.is_formulated and not self.is_dense:
             names.append("dense_accelerations")
-        if self.falls_back and self.plan.written_out:
+        if self.falls_back and self.plan.unrolled:
             names.append("rows_and_loads")
         return names
 
@@ -170,7 +170,7 @@ class Module(Memory):
         named |= {"dq1": "result dq", "dv1": "result dv"} | {
             x: x for x in ("constants", "psi", "terms", "pieces", "safe", "distance", "rank")
         }
-        if not self.written_out:
+        if not self.unrolled:
             named |= {x: x for x in self.code.scratch}
         elif self.falls_back:
             named |= {x: x for x in ("psi_q", "psi_dot", "root")}
@@ -182,18 +182,18 @@ class Module(Memory):
         for name in self.programs:
             out = {"a": ("out", 0)} if name == "accelerations" else {}
             self.write_program(name, self.arrays | out)
-        self.write_prologue("prologue", self.written_out)
+        self.write_prologue("prologue", self.unrolled)
 
     def write_program(self, name: str, at: Mapping[str, PointerPlace]):
         """Write one of the scene's programs, with its arrays where `at` says, as a function of `work` and `out`."""
-        if self.written_out:
-            self.write_scalars(self.written_out.program(name), name, ("work", "out"), at)
+        if self.unrolled:
+            self.write_scalars(self.unrolled.program(name), name, ("work", "out"), at)
         else:
             self.loops.write(self.programs[name], name, ("work", "out"), at)
 
     def write_scalars(
         self,
-        program: WrittenOutProgram,
+        program: UnrolledProgram,
         name: str,
         pointers: Sequence[str],
         at: Mapping[str, PointerPlace],
@@ -219,11 +219,11 @@ class Module(Memory):
             )
         )
 
-    def write_prologue(self, name: str, written_out: WrittenOut | None):
+    def write_prologue(self, name: str, unrolled: Unrolled | None):
         """Write `name(numbers, constants)`, of one member."""
-        if written_out:
+        if unrolled:
             inputs, outputs = consecutive("numbers", self.code.number_count), consecutive("constants", self.constants)
-            self.functions.append(write(written_out.prologue, name, 1, ("numbers", "constants"), inputs, outputs))
+            self.functions.append(write(unrolled.prologue, name, 1, ("numbers", "constants"), inputs, outputs))
         else:
             at = {"numbers": ("numbers", 0), "constants": ("constants", 0)}
             self.loops.write(self.code.prologue, name, ("numbers", "constants"), at, width=1)

@@ -1,4 +1,4 @@
-"""The functions of the derivatives of a scene's programs, written out or as loops.
+"""The functions of the derivatives of a scene's programs, unrolled or as loops.
 
 For the accelerations (no suffix), for the projection of a state on the manifold ("_projection") and for the corrections that
 close a mechanism ("_newton_q", "_newton_v") there are
@@ -37,9 +37,9 @@ class ProgramDerivative:
         self._fixed = [] if module.moving else ["constants"]
         self._stored: dict[str, int] = {}  # the arrays of loops, and where they begin
         self.stored = 0
-        if module.written_out:
-            self._written_out = module.written_out.derivative(name)
-            self.stored = sum(x == "stored" for x, _ in self._written_out.evaluation.outputs)
+        if module.unrolled:
+            self._unrolled = module.unrolled.derivative(name)
+            self.stored = sum(x == "stored" for x, _ in self._unrolled.evaluation.outputs)
             return
         parts = self._evaluated.second_parts if module.mode == TWICE else self._evaluated.parts
         used = self._evaluated.program.arrays | LoopProgram(parts).arrays
@@ -60,7 +60,7 @@ class ProgramDerivative:
         return self._module.arrays | results | {"stored": ("stored", 0)}
 
     def _along(self, prefixes: Sequence[str]) -> dict[str, PointerPlace]:
-        if self._module.written_out:
+        if self._module.unrolled:
             return {}
         start, size = self._module.places["along"], sum(self._module.code.stored_sizes.values())
         return {
@@ -72,8 +72,8 @@ class ProgramDerivative:
     def evaluation(self):
         at = self._at | {"a": ("out", 0)}
         pointers, name = ("work", "out", "stored"), self._evaluation
-        if self._module.written_out:
-            self._module.write_scalars(self._written_out.evaluation, name, pointers, at)
+        if self._module.unrolled:
+            self._module.write_scalars(self._unrolled.evaluation, name, pointers, at)
         else:
             self._module.loops.write(self._evaluated.program, name, pointers, at)
 
@@ -103,7 +103,7 @@ class ProgramDerivative:
         self._write(program, f"reverse{self._suffix}", ("work", "stored", "bar"), at | {f"{COTANGENT}a": ("bar", 0)})
 
     def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, PointerPlace]):
-        if self._module.written_out:
-            self._module.write_scalars(self._written_out.derivative, name, pointers, at)
+        if self._module.unrolled:
+            self._module.write_scalars(self._unrolled.derivative, name, pointers, at)
         else:
             self._module.loops.write(program, name, pointers, at)

@@ -22,8 +22,8 @@ def write_prologue_derivative(module: Module, active: Sequence[bool], mode: str)
     changes = ("constants", "numbers") if mode == REVERSE else ("numbers", "constants")
     pointers = ("numbers", "constants", *(prefix + x for x in changes for prefix in PREFIXES[mode]))
     at = {x: (x, 0) for x in pointers}
-    if module.written_out:
-        module.write_scalars(module.written_out.prologue_derivative(active, mode), PROLOGUE[mode], pointers, at, 1)
+    if module.unrolled:
+        module.write_scalars(module.unrolled.prologue_derivative(active, mode), PROLOGUE[mode], pointers, at, 1)
         return
     derivative = LoopDerivative(module.code.prologue.parts, ())
     if mode == REVERSE:

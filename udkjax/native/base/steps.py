@@ -48,9 +48,9 @@ POINTS = 4  # states that an interpolating polynomial goes through: with three, 
 SHORTEST_LAST = 0.25
 STRETCH = 12.0  # ratio of the last step to those before, at most: steps grow tenfold
 
-# The states of a run. `NOT_FINITE`: its step became too small because of a number that is not finite. `LOST`: it left the
-# constraint manifold. Of runs that watch conditions: `CROSSED`: at the time at which one crosses zero. `UNSURE`: one may.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, CROSSED, UNSURE = range(8)
+# The states of a run. `NOT_FINITE`: the step became too small because of a non-finite number. `LOST`: the run left the constraint
+# manifold. Runs that watch conditions also end as `CROSSED`, at a zero crossing, or `UNRESOLVED`, where a crossing is possible.
+RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, CROSSED, UNRESOLVED = range(8)
 # Each row of Psi over its scale, after a step whose end was projected, which leaves some 1e-12: a row so far open is one that no
 # position near it closes, as where a driver asks for more than a linkage reaches. Behind that there is no motion to follow.
 LOST_TOL = 1e-2

@@ -32,7 +32,7 @@ class Closing(Module):
     further = 1  # corrections of a closed state, which change nothing but derivatives
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
-        plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, written_out=False, steps=False)
+        plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, unrolled=False, steps=False)
         super().__init__(plan, active=active)
         self.active, self.count = active, len(self.moving)
         self._rows = WeightedRows(self, SVDCode(relative=True)) if code.is_small else None

@@ -37,9 +37,7 @@ class Marching(Module):
     results = ("qs", "dqs", "ddqs", "sides", "trusted")
 
     def __init__(self, code: ScenePrograms, width: int, vector: int):
-        plan = Plan(
-            code, EULER, projected=False, breaks=False, width=width, vector=vector, written_out=code.is_small, steps=False
-        )
+        plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small, steps=False)
         super().__init__(plan)
         for name in ("previous dq", "previous ddq", "third derivative", "prediction"):
             self.places.add(name, self.n)

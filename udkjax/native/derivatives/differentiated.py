@@ -35,10 +35,10 @@ class Differentiated(Trajectory):
         super().write_programs()
         for each in self._linearizations:
             each.evaluation()
-        if self.written_out and self.of_projection:
+        if self.unrolled and self.of_projection:
             names = ("accelerations", "projection")
             at = {f"stored {name}": (name, 0) for name in names} | self.arrays
-            self.write_scalars(self.written_out.evaluations(names), "evaluation_end", ("work", *names), at)
+            self.write_scalars(self.unrolled.evaluations(names), "evaluation_end", ("work", *names), at)
 
     @property
     def _linearizations(self) -> list[ProgramDerivative]:
@@ -48,7 +48,7 @@ class Differentiated(Trajectory):
     def _evaluate_end(self, f: Function):
         """Evaluate accelerations and a projection at the end of a step, for their derivatives: by the same factors."""
         accelerations = self.address(f, f"stage{self.last} linearization")
-        if self.written_out and self.of_projection:
+        if self.unrolled and self.of_projection:
             f.call("evaluation_end", f.given["work"], accelerations, self.address(f, "projection linearization"))
         else:
             f.call("evaluation", f.given["work"], self.address(f, "corrected q"), accelerations)

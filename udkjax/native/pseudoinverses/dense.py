@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
 from udkjax.native.base.memory import Memory
 
-UNROLLED = 16  # registers of a row up to which operations on it are written out; of longer ones, as many a round
+UNROLLED = 16  # registers of a row up to which operations on it are unrolled; longer rows take this many per iteration
 SUMS = 4  # independent partial sums of a scalar product: as many as hide the latency of an addition
 
 
@@ -221,7 +221,7 @@ class DenseMatrices:
                 f.store(f.load(source, j * f.width + k), to.address, j * f.width + k)
 
     def over_registers(self, registers: int, do: Callable[[Operand], None]):
-        """Do something with each register of a row: written out, or in rounds of several."""
+        """Do something with each register of a row: unrolled, or in a loop over several at a time."""
         f = self.f
         if registers <= UNROLLED:
             for r in range(registers):

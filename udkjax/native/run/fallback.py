@@ -23,7 +23,7 @@ from udkjax.native.run.manifold import iterate_newton, with_threshold
 
 def write_fallback(module: Module):
     """Write what a fallback step does besides: accelerations, the end of a step, outputs that elimination leaves open."""
-    (_write_singular_values if module.written_out else _write_elimination)(module)
+    (_write_singular_values if module.unrolled else _write_elimination)(module)
 
     def invoke(f: Function, s: Lane, mask: Value, name: str = "fallback"):
         s.wanted = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)

@@ -35,9 +35,7 @@ class RowMarks(Module):
     results = ("marks",)
 
     def __init__(self, code: ScenePrograms, width: int, vector: int):
-        plan = Plan(
-            code, EULER, projected=False, breaks=False, width=width, vector=vector, written_out=code.is_small, steps=False
-        )
+        plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small, steps=False)
         super().__init__(plan)
         self.places.add("independent", self.m)
 

@@ -39,7 +39,7 @@ class StateFunction(Trajectory):
                 breaks=False,
                 width=width,
                 vector=vector,
-                written_out=code.is_small,
+                unrolled=code.is_small,
                 pseudoinverse=pseudoinverse,
                 formulation=formulation,
             )

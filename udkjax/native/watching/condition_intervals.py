@@ -22,11 +22,11 @@ from udkjax.native.watching.conditions import (
 from udkjax.native.watching.watch_memory import WatchMemory
 
 
-def write_judge(module: WatchMemory):
+def write_classification(module: WatchMemory):
     """`judge(work)`: in lanes where `low` is one, what becomes of the two intervals whose last node was looked at."""
     f, s = module.function("judge")
     mask, length = s.low > 0.5, s.look - s.first_t
-    unsure = [f.variable(0.0), f.variable(0.0)]
+    unresolved = [f.variable(0.0), f.variable(0.0)]
     hits = [f.variable(0.0), f.variable(0.0)]
     steps = (s.middle_t - s.first_t, s.look - s.middle_t)
     x = steps[0] / length
@@ -39,20 +39,20 @@ def write_judge(module: WatchMemory):
         side, on, floor = module.condition(f, "side", c), module.condition(f, "on", c) > 0.5, module.condition(f, "floor", c)
         for k in range(2):
             after = f.select(f.abs(g[k + 1]) <= floor, side, _sign(f, g[k + 1]))
-            hit, sure = _judge_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)
+            hit, sure = _classify_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)
             bad = on & ~(sure & smooth)
             direction = module.condition(f, "direction", c)
             counts = hit & on & (direction.is_(0.0) | direction.is_(after))
             fault = f.select(finite, f.select(bad, f.const(VARIES_FAST, DOUBLE, f.width), 0.0), UNDEFINED)
-            unsure[k].value = f.max(fault, unsure[k].value)
+            unresolved[k].value = f.max(fault, unresolved[k].value)
             hits[k].value = f.select(counts, f.const(1.0, DOUBLE, f.width), hits[k].value)
             module.put_condition(f, f"hit{k + 1}", c, f.select(counts, after, f.const(0.0, DOUBLE, f.width)))
             module.put_condition(f, f"side{k + 1}", c, after)
             side = after
-    _advance(module, f, s, mask, unsure, hits)
+    _advance(module, f, s, mask, unresolved, hits)
 
 
-def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unsure: list[Variable], hits: list[Variable]):
+def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved: list[Variable], hits: list[Variable]):
     """Go on behind the intervals that are sure; locate what crosses in them; look closer at others, or stop."""
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
     behind_break = s.fresh > s.first_t  # the polynomial is that of another piece of the motion
@@ -63,7 +63,7 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unsure: lis
     s.stops, s.seeks = zero, zero
     s.low, s.high = s.first_t, s.middle_t
     for k, states in enumerate((("middle q", "middle v"), ("state q", "result v"))):
-        fault = unsure[k].value
+        fault = unresolved[k].value
         is_jump = mask & fault.is_(VARIES_FAST) & may_jump
         jumps.value = f.select(is_jump, one, jumps.value)
         unclear = mask & (fault > 0.0) & ~is_jump
@@ -113,7 +113,7 @@ def _error(f: Function, g: list[Value], rate: list[Value], length: Value, x: Val
     return f.select(of_value > of_rate, of_value, of_rate)
 
 
-def _judge_interval(
+def _classify_interval(
     f: Function,
     ends: tuple[Value, Value, Value, Value],
     step: Value,

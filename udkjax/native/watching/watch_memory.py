@@ -2,7 +2,7 @@
 
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.steps import CROSSED, UNIT, UNSURE
+from udkjax.native.base.steps import CROSSED, UNIT, UNRESOLVED
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import HEAD, MIDDLE, PER_TIME, SECOND, TURN, VARIES, Conditions
 
@@ -107,7 +107,7 @@ class WatchMemory(Trajectory):
     def stop(self, f: Function, s: Lane):
         """End the runs of lanes that stop."""
         stops = s.stops > 0.5
-        s.where(stops, code=f.select(s.event >= 0.0, f.const(float(CROSSED), DOUBLE, f.width), float(UNSURE)))
+        s.where(stops, code=f.select(s.event >= 0.0, f.const(float(CROSSED), DOUBLE, f.width), float(UNRESOLVED)))
         s.where(stops, until=f.min(s.until, s.sure_t), stops=0.0, landing=0.0)
 
     def begin_intervals(self, f: Function, s: Lane, mask: Value):

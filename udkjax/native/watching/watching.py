@@ -14,7 +14,7 @@ from udkjax.native.base.layout import Lane
 from udkjax.native.base.program import write
 from udkjax.native.base.steps import DONE, POINTS, RUNNING
 from udkjax.native.run.manifold import project_output
-from udkjax.native.watching.condition_intervals import write_judge
+from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import FIRST, FORCE_STEP, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
 from udkjax.native.watching.watch_memory import WatchMemory
@@ -26,7 +26,7 @@ class Watching(WatchMemory):
     def write_derivatives(self):
         self._write_conditions()
         self._write_look()
-        write_judge(self)
+        write_classification(self)
         write_locate(self)
         write_land(self)
         write_approach(self)

@@ -19,7 +19,7 @@ from udkjax.expressions.unroll import ArrayPlace, Arrays, unroll
 WITH_ENTRIES = ("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v")  # programs that return Psi_q
 
 
-class WrittenOutProgram(NamedTuple):
+class UnrolledProgram(NamedTuple):
     """A program, and where each of its inputs and outputs is."""
 
     program: ScalarProgram
@@ -27,14 +27,14 @@ class WrittenOutProgram(NamedTuple):
     outputs: list[ArrayPlace]
 
 
-class WrittenOutDerivative(NamedTuple):
+class UnrolledDerivative(NamedTuple):
     """A program, and its derivative along directions, or the transpose of that."""
 
-    evaluation: WrittenOutProgram  # the results, and "stored": numbers that the derivative needs
-    derivative: WrittenOutProgram
+    evaluation: UnrolledProgram  # the results, and "stored": numbers that the derivative needs
+    derivative: UnrolledProgram
 
 
-class WrittenOut:
+class Unrolled:
     """Programs of a scene, by their names, and the derivatives of some of them.
 
     Args:
@@ -82,20 +82,20 @@ class WrittenOut:
         self._inputs = {s: ("constants", k) for k, s in enumerate(self.constants)}
         self._inputs |= {s: (x, k) for x, scalars in state.items() for k, s in scalars.items()}
 
-    def program(self, name: str) -> WrittenOutProgram:
+    def program(self, name: str) -> UnrolledProgram:
         """Return one of the programs."""
         return self._program(self._results[name], {})
 
-    def derivative(self, name: str) -> WrittenOutDerivative:
+    def derivative(self, name: str) -> UnrolledDerivative:
         """Return one of the differentiable programs with its derivative."""
         results, outputs = self._derivatives[name]
         early = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
         stored = [s for s in early if s not in self._inputs]
         at = {s: ("stored", k) for k, s in enumerate(stored)}
         evaluation = self._program(results | {place: s for s, place in at.items()}, {})
-        return WrittenOutDerivative(evaluation, self._program(outputs, at | self._seeds))
+        return UnrolledDerivative(evaluation, self._program(outputs, at | self._seeds))
 
-    def evaluations(self, names: Sequence[str]) -> WrittenOutProgram:
+    def evaluations(self, names: Sequence[str]) -> UnrolledProgram:
         """Return the numbers that derivatives of several programs need of one state, as "stored" and a program's name."""
         found: dict[ArrayPlace, Scalar] = {}
         for name in names:
@@ -104,7 +104,7 @@ class WrittenOut:
             found |= {(f"stored {name}", k): s for (x, k), s in scalars if x == "stored"}
         return self._program(found, {})
 
-    def prologue_derivative(self, active: Sequence[bool], mode: str) -> WrittenOutProgram:
+    def prologue_derivative(self, active: Sequence[bool], mode: str) -> UnrolledProgram:
         """Return the program from the changes of the active numbers to those of the moving constants, or its transpose."""
         graph, layout = self.graph, self._arrays["constants"]
         numbers = {s: ("numbers", k) for k, s in enumerate(self.numbers)}
@@ -129,12 +129,12 @@ class WrittenOut:
                 found[SECOND] = tangents(graph, found[TANGENT], dict(zip(variables, some, strict=True)))
             outputs = {(prefix + "constants", k): s for prefix, scalars in found.items() for k, s in enumerate(scalars)}
         program = ScalarProgram(graph, [*numbers, *seeds], list(outputs.values()))
-        return WrittenOutProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
+        return UnrolledProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
 
-    def _program(self, outputs: dict[ArrayPlace, Scalar], further: dict[Scalar, ArrayPlace]) -> WrittenOutProgram:
+    def _program(self, outputs: dict[ArrayPlace, Scalar], further: dict[Scalar, ArrayPlace]) -> UnrolledProgram:
         inputs = self._inputs | further
         program = ScalarProgram(self.graph, list(inputs), list(outputs.values()))
-        return WrittenOutProgram(program, list(inputs.values()), list(outputs))
+        return UnrolledProgram(program, list(inputs.values()), list(outputs))
 
     def _unroll(self, program: LoopProgram, further: Arrays | None = None, linear: str | None = None) -> Arrays:
         return unroll(program, self._arrays | (further or {}), self.graph, linear)
