@@ -104,7 +104,7 @@ def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
     return ArrayLoops(programs.scales.program, xp)
 
 
-# --- as one operation of JAX, of vectors of numbers (..., numbers): machine code of it is in native/run/scale_code.py
+# --- as one operation of JAX, of vectors of numbers (..., numbers): machine code of it is in native/run/state_functions.py
 
 
 def evaluate_scales(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:

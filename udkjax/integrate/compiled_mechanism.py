@@ -21,12 +21,12 @@ from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit, method_of
+from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
 from udkjax.native.primitive import unsupported
-from udkjax.native.pseudoinverses import dense_method
-from udkjax.native.run.formulations import FormulationCode, formulation_code
-from udkjax.native.runs import RunStates, Tableau
+from udkjax.native.run.formulations import MethodCode
+from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.identity_cache import cached_by_identity
@@ -153,10 +153,10 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
 
 def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = None) -> str:
     """Return why machine code cannot evaluate equations by a method and a formulation, whatever the scene is; empty if it can."""
-    if formulation is not None and formulation_code(formulation) is None:
-        return f"it does not know the formulation {formulation}"
-    if not eliminates(method) and dense_method(method) is None:
-        return f"it does not know the pseudoinverse {type(method).__name__}"
+    try:
+        MethodCode.of(method, formulation)
+    except UnsupportedError as unknown:
+        return f"it does not know {unknown}"
     if jax.default_backend() != "cpu":
         return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
@@ -182,18 +182,18 @@ def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, brea
     elements = (*mechanism.constraints.values(), *mechanism.forces.values())
     return RunStates(
         code=_programs(textbook),
-        method=Tableau(method_of(solver)),
+        method=method_of(solver),
         projected=projected,
         breaks=breakpoints is not None or any(map(has_pieces, elements)),
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
-        pseudoinverse=dense_method(textbook.method),
-        formulation=_formulation(equations),
+        **_method_code(equations)._asdict(),
     )
 
 
-def _formulation(equations: AbstractSystem) -> FormulationCode | None:
-    """Return the machine code of the formulation around equations."""
-    return formulation_code(equations.formulation) if isinstance(equations, FormulatedSystem) else None
+def _method_code(equations: AbstractSystem) -> MethodCode:
+    """Return the machine code of the method and the formulation of equations."""
+    formulation = equations.formulation if isinstance(equations, FormulatedSystem) else None
+    return MethodCode.of(textbook_of(equations).method, formulation)
 
 
 def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
@@ -201,7 +201,7 @@ def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
     if not equations.constrained or _reason_for_equations(equations):
         return None
     inner = textbook_of(equations)
-    operation = Accelerate(_programs(inner), dense_method(inner.method), _formulation(equations))
+    operation = Accelerate(_programs(inner), *_method_code(equations))
     return None if unsupported(operation.code) else operation
 
 

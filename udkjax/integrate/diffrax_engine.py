@@ -17,7 +17,7 @@ from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
 from udkjax.integrate.solvers.counting import NOT_COUNTED, CountingController, evaluations
-from udkjax.native.base.steps import DONE, GROW, SAFETY, SHRINK, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.base.steps import FACTORS, Status
 from udkjax.transforms.gradients import stop_gradients
 
 
@@ -54,8 +54,8 @@ def integrate_by_diffrax(
     ys = jnp.concatenate([given[None], others])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     lost = jnp.min(jnp.where(reached & ~(violated <= problem.drift_tol), np.arange(float(len(ts))), np.inf))
-    status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, STEP_LIMIT, STEP_TOO_SMALL)
-    status = jnp.where(run.result == diffrax.RESULTS.successful, DONE, status)
+    status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, Status.STEP_LIMIT, Status.STEP_TOO_SMALL)
+    status = jnp.where(run.result == diffrax.RESULTS.successful, Status.DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
     found = evaluations(run.controller_state)
     right_hand_sides = jnp.where(found == NOT_COUNTED, NOT_COUNTED, found + (problem.h is None))  # one chooses the first step
@@ -110,7 +110,7 @@ def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
     # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
     if is_explicit(problem.compiled.plan.solver):  # the same steps as by machine code
-        settings |= {"safety": SAFETY, "factormin": SHRINK, "factormax": GROW}
+        settings |= {"safety": FACTORS.safety, "factormin": FACTORS.shrink, "factormax": FACTORS.grow}
     tolerances: dict[str, Any] = {"rtol": problem.rtol, "atol": problem.atol * jnp.concatenate(problem.units())}
     if problem.compiled.breakpoints is None:
         return diffrax.PIDController(**tolerances, **settings)

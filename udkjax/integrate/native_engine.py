@@ -16,18 +16,24 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, OUTPUTS
-from udkjax.native.base.steps import DONE, FALLBACK_RANK_SHARE
-from udkjax.native.derivatives.record import PER_BREAKPOINT, STORED
+from udkjax.native.base.steps import Status
 from udkjax.native.operations import MarkRows
-from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
+from udkjax.native.packing import ActiveNumbers
 from udkjax.native.primitive import call_concrete, native_p
-from udkjax.native.run.formulations import formulation_tol
+from udkjax.native.run.formulations import formulation_settings
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, OneOf
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
+
+# Of the rank threshold: what fallback steps take for theirs. They begin on the constraint manifold, unless states are not
+# projected, and only those beside singular configurations take it. Rows that count as redundant there and are not leave what they
+# hold back in velocities, as large as the threshold, and rounding errors are as large as a unit over its square: both are least
+# at some third root of a unit. With three times more, linkages that turn back in singular configurations take up to a quarter
+# less steps, but Peaucellier's may cross with errors of 1e-5 in its energy, at any tolerance; with three times less they take up
+# to two fifths more.
+FALLBACK_RANK_SHARE = 0.2
 
 
 def packed(problem: Problem) -> list[np.ndarray]:
@@ -60,7 +66,7 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
     none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     found = native_p.bind(*run_inputs(problem, operation), *none, operation=operation, times=times)
-    raw = _output(found[: len(OUTPUTS)])
+    raw = _output(found[: RunStates.results])
     return raw, RecordedRun(found[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
 
 
@@ -77,9 +83,10 @@ def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
     return problem.compiled.samples.stand_in(of.textbook.mechanism), of.textbook.baumgarte, of.marks
 
 
-def _active_of(problem: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Return a mask of the active numbers."""
-    return problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
+def _active_numbers(problem: Any, active: Any) -> ActiveNumbers:
+    """Return the numbers of a run, of which some are active."""
+    mask = problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
+    return ActiveNumbers(_numbers_of(problem), mask)
 
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
@@ -89,7 +96,7 @@ def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, t
 
 def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
     """Return the second derivatives of positions, velocities and the end along two changes, each of what is active in it."""
-    operation = _operation(problem).with_second_tangents(active_numbers(_numbers_of(problem), _active_of(problem, active)))
+    operation = _operation(problem).with_second_tangents(_active_numbers(problem, active).mask)
     return _integrate_along(problem, changes, operation)[1]
 
 
@@ -98,7 +105,7 @@ def _integrate_along(
 ) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
     n, samples, directions = len(problem.q), [], []
     for active, change in changes:
-        tangents = number_tangents(_numbers_of(problem), _active_of(problem, active), _numbers_of(problem, change))
+        tangents = _active_numbers(problem, active).tangents(_numbers_of(problem, change))
         directions += [tangents, *(np.zeros(n) if dx is None else dx for dx in (change.q, change.v))]
         samples += [problem.compiled.samples.changes(change.textbook.mechanism)] if operation.sampled else []
     *found, dys, dend = native_p.bind(
@@ -118,11 +125,13 @@ def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) 
     states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
     given = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]
     found = native_p.bind(*run_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
-    numbersbar, qbar, vbar = found[len(OUTPUTS) : len(OUTPUTS) + 3]
+    numbersbar, qbar, vbar = found[RunStates.results : RunStates.results + 3]
     none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
-    mechanism, baumgarte, _ = cotangent_tree(numbersbar[0], _numbers_of(problem), _active_of(problem, active))
+    mechanism, baumgarte, _ = _active_numbers(problem, active).cotangents(numbersbar[0])
     if operation.sampled:
-        mechanism = problem.compiled.samples.with_cotangents(mechanism, active.textbook.mechanism, found[len(OUTPUTS) + 3][0])
+        mechanism = problem.compiled.samples.with_cotangents(
+            mechanism, active.textbook.mechanism, found[RunStates.results + 3][0]
+        )
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
     places = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
     return eqx.tree_at(places, none, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
@@ -134,11 +143,11 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
     assert run is not None  # checked by the caller
     if active is None:
         return run
-    which = active_numbers(_numbers_of(problem), _active_of(problem, active))
+    which = _active_numbers(problem, active).mask
     if not reverse:
         return run.with_tangents(which)
     breaks = problem.compiled.breakpoints
-    return run.with_cotangents(which, problem.points or STORED + PER_BREAKPOINT * (0 if breaks is None else len(breaks)))
+    return run.with_cotangents(which, 0 if breaks is None else len(breaks), problem.points)
 
 
 def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
@@ -183,8 +192,7 @@ def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPo
     number = xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
     settings = {"length": textbook.scales.length, "fallback_tol": fallback_tol, "method": number}
     if isinstance(equations, FormulatedSystem):
-        told = formulation_tol(equations.formulation), textbook.scales.mass
-        settings |= zip(FORMULATION_SETTINGS, told, strict=True)
+        settings |= formulation_settings(equations.formulation, textbook.scales.mass)
     numbers = jax.tree.leaves((mechanism, textbook.baumgarte))
     return SceneInputs(numbers, [drop_tol, safe_tol], textbook.scales.rows, settings)
 
@@ -220,8 +228,8 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
 
 def _output(found: Sequence[Any]) -> IntegratorOutput:
     q, v, _, info = [x[0] for x in found]
-    code, t, tried, accepted, evaluations, written, lost = [info[k] for k in range(len(INFO))]
+    code, t, tried, accepted, evaluations, written, lost = [info[k] for k in range(len(RunStates.info_names))]
     number = np.arange(len(q))
-    reached = (number <= written) & (number < len(q) - 1) | (code == DONE)
+    reached = (number <= written) & (number < len(q) - 1) | (code == Status.DONE)
     counts = [x.astype(int) for x in (tried, accepted, evaluations)]
-    return IntegratorOutput(q, v, reached, lost, code.astype(int), t, info[len(INFO) :], *counts)
+    return IntegratorOutput(q, v, reached, lost, code.astype(int), t, info[len(RunStates.info_names) :], *counts)

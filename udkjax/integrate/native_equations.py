@@ -25,8 +25,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_concrete, evaluation_of
 from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem
-from udkjax.native.base.layout import INPUTS
-from udkjax.native.operations import Accelerate, FindTangentPart, ProjectStates, StateOperation
+from udkjax.native.operations import Accelerate, StateOperation
 from udkjax.native.primitive import machine_code, native_p
 from udkjax.pinv import SVD, OneOf, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
@@ -52,13 +51,12 @@ class NativeEquations(WrappedSystem):
         return _project(self, t, q, v)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        return TangentPart(*jnp.split(self._find(FindTangentPart, t, q, v, [dq, dv]), 2))
+        return TangentPart(*jnp.split(self._find(self.operation.tangent_part, t, q, v, [dq, dv]), 2))
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         return self.equations.is_finite(t, q, v)
 
-    def _find(self, kind: type[StateOperation], t: Time, q: Vector, v: Vector, further: Sequence[Any] = ()) -> Array:
-        operation = kind(self.operation.code, self.operation.pseudoinverse, self.operation.formulation)
+    def _find(self, operation: StateOperation, t: Time, q: Vector, v: Vector, further: Sequence[Any] = ()) -> Array:
         scene = self.scene
         if self.equations.mechanism.samples:
             numbers = [self.equations.mechanism.at(t), self.equations.baumgarte]
@@ -114,7 +112,7 @@ class ConcreteRates:
         scene = scene_inputs(compiled.equations, compiled.textbook.mechanism, operation.code.policy, np)
         given = _pack(operation, scene, None, 0.0, np.zeros(n), np.zeros(n), np)
         self._call = machine_code(operation, 1, 1).prepare(given, operation.shapes(given, 2))
-        self._t, self._q, self._v = (self._call.inputs[INPUTS.index(name)][0] for name in ("ts", "q", "v"))
+        self._t, self._q, self._v = (self._call.inputs[operation.input_names.index(name)][0] for name in ("ts", "q", "v"))
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the derivative of y (2n,) at the time t (s)."""
@@ -133,7 +131,7 @@ def equations_for_diffrax(problem: Problem) -> AbstractSystem:
 
 @eqx.filter_custom_jvp
 def _accelerations(native: NativeEquations, t: Time, q: Vector, v: Vector) -> Vector:
-    return native._find(Accelerate, t, q, v)
+    return native._find(native.operation, t, q, v)
 
 
 @_accelerations.def_jvp
@@ -144,7 +142,7 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _project(native: NativeEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    found = jnp.split(native._find(ProjectStates, t, q, v), 2)
+    found = jnp.split(native._find(native.operation.projection, t, q, v), 2)
     return found[0], found[1]
 
 

@@ -5,12 +5,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.base.steps import DONE, LEAST_ATOL, LOOK_AHEAD, LOST, NOT_FINITE, STEP_LIMIT, STEP_TOO_SMALL
+from udkjax.native.base.steps import LOOK_AHEAD, Status
+
+# The least `atol`, in the scene's units. Nothing is known to less than rounding, and a coordinate that is zero has no other
+# tolerance.
+LEAST_ATOL = np.finfo(float).eps
 
 
 class FinishedRun(NamedTuple):
@@ -38,10 +43,10 @@ def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: 
 def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
     """Return the `Result` and the time (s) that belongs to it; the first lost output ends the motion."""
     raw = run.raw
-    code = xp.where(raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
-    code = xp.where(raw.status == NOT_FINITE, Result.not_finite, code)
-    code = xp.where(raw.status == LOST, Result.drift, code)
-    code = xp.where(raw.status == DONE, Result.successful, code)
+    code = xp.where(raw.status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    code = xp.where(raw.status == Status.NOT_FINITE, Result.not_finite, code)
+    code = xp.where(raw.status == Status.LOST, Result.drift, code)
+    code = xp.where(raw.status == Status.DONE, Result.successful, code)
     is_lost = xp.isfinite(raw.lost)
     code = xp.where(is_lost, xp.where(raw.lost == 0, Result.initial_state_open, Result.drift), code)
     code = xp.where(run.missed, Result.drift, code)
@@ -61,8 +66,8 @@ def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Arra
     def finite(_: Array) -> Array:
         return jnp.all(jax.lax.map(lambda later: equations.is_finite(later, q + (later - t) * v, v), times))
 
-    is_finite = jax.lax.cond(status != DONE, finite, lambda _: jnp.array(True), 0)
-    return jnp.where((status == STEP_TOO_SMALL) & ~is_finite, NOT_FINITE, status)
+    is_finite = jax.lax.cond(status != Status.DONE, finite, lambda _: jnp.array(True), 0)
+    return jnp.where((status == Status.STEP_TOO_SMALL) & ~is_finite, Status.NOT_FINITE, status)
 
 
 def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:

@@ -14,11 +14,11 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.native_engine import mark_rows
-from udkjax.integrate.outcome import increases, usable
+from udkjax.integrate.outcome import LEAST_ATOL, increases, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import is_explicit
-from udkjax.native.base.steps import LEAST_ATOL, SMALLEST_STEP
+from udkjax.native.base.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.programs.identity_cache import cached_by_identity

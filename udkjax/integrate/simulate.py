@@ -22,12 +22,11 @@ from udkjax.integrate.causes.find import explained
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.native_engine import integrate_concrete
-from udkjax.integrate.outcome import FinishedRun, counts, outcome
+from udkjax.integrate.outcome import LEAST_ATOL, FinishedRun, counts, outcome
 from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, begin, begin_concrete, prepare_run
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
-from udkjax.native.base.steps import LEAST_ATOL
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembly import AssemblyWarning, Closure, State, require_closed
 from udkjax.programs.deferred import deferred

@@ -18,14 +18,13 @@ from jaxtyping import ArrayLike
 
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.native.base.layout import FORMULATION_SETTINGS, OUTPUTS, SETTINGS, SHARE
+from udkjax.native.base.layout import FORMULATION_SETTINGS, INPUTS, OUTPUTS, SETTINGS, SHARE
 from udkjax.native.base.memory import Memory
 from udkjax.native.base.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.row_marks import RowMarks
-from udkjax.native.run.scale_code import ScaleCode
-from udkjax.native.run.state_functions import StateAccelerations, StateFunction, StateProjection, StateTangentPart
+from udkjax.native.run.state_functions import ScaleCode, StateAccelerations, StateFunction, StateProjection, StateTangentPart
 from udkjax.native.watching.conditions import Conditions
 from udkjax.native.watching.event_states import EventStates
 
@@ -36,6 +35,7 @@ class Operation(ABC):
 
     code: ScenePrograms
 
+    input_names: ClassVar[tuple[str, ...]] = INPUTS  # of the first inputs
     settings: ClassVar[tuple[str, ...]] = SETTINGS  # settings of this kind of operation
     in_lanes: ClassVar[bool] = True  # whether members run side by side
     results: ClassVar[int] = len(OUTPUTS)  # the first outputs, which have no directions
@@ -120,6 +120,20 @@ class StateOperation(Operation):
     @property
     def all_settings(self) -> tuple[str, ...]:
         return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
+
+    @property
+    def projection(self) -> "ProjectStates":
+        """The operation that returns states to the constraint manifold."""
+        return ProjectStates(self.code, self.pseudoinverse, self.formulation)
+
+    @property
+    def tangent_part(self) -> "FindTangentPart":
+        """The operation that finds the part of small changes of states within the constraint manifold."""
+        return FindTangentPart(self.code, self.pseudoinverse, self.formulation)
+
+    def of_events(self, conditions: Conditions, impacts: tuple[int, ...]) -> "EvaluateEvents":
+        """Return the operation that evaluates conditions, and the directions of the impulses of some of them, too."""
+        return EvaluateEvents(self.code, self.pseudoinverse, self.formulation, conditions, impacts)
 
     def module(self, width: int, beside: int, vector: int) -> Module:
         return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)

@@ -15,30 +15,37 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
 
-def active_numbers(numbers: PyTree[Array], active: PyTree[bool]) -> tuple[bool, ...]:
-    """Return a mask of the numbers of a tree, and of two thresholds behind them, that are active: they have derivatives."""
-    leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active)), strict=True)
-    return (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
+class ActiveNumbers:
+    """The numbers of a tree, of which some are active: they have derivatives.
 
+    Machine code takes them as one vector, with two thresholds at its end, which have none.
 
-def number_tangents(numbers: PyTree[Array], active: PyTree[bool], change: PyTree[Array]) -> Array:
-    """Return the tangents of all numbers of a tree, and of two thresholds, as one vector: zeros of those that are not active."""
-    leaves = zip(*(leaves_and_none(tree) for tree in (numbers, active, change)), strict=True)
-    moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
-    which = np.array(active_numbers(numbers, active))
-    # Two operations, however many pieces there are: each would take XLA as long as a hundred steps of a small scene.
-    return jnp.concatenate([*moving, np.zeros(1)])[np.where(which, np.cumsum(which) - 1, np.sum(which))]
+    Attributes:
+        mask: of all numbers and the two thresholds, those that are active.
+    """
 
+    def __init__(self, numbers: PyTree[Array], active: PyTree[bool]):
+        self._numbers, self._active = leaves_and_none(numbers), leaves_and_none(active)
+        self._tree = jax.tree.structure(numbers, is_leaf=lambda x: x is None)
+        leaves = zip(self._numbers, self._active, strict=True)
+        self.mask = (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
-def cotangent_tree(bars: Array, numbers: PyTree[Array], active: PyTree[bool]) -> PyTree[Array]:
-    """Return the tree of the cotangents of what is active, from those of all numbers, in order."""
-    leaves, tree = jax.tree.flatten(numbers, is_leaf=lambda x: x is None)
-    parts, place = [], 0
-    for x, m in zip(leaves, leaves_and_none(active), strict=True):
-        size = 0 if x is None else np.size(x)
-        parts.append(bars[place : place + size].reshape(np.shape(x)) if m is True else None)
-        place += size
-    return jax.tree.unflatten(tree, parts)
+    def tangents(self, change: PyTree[Array]) -> Array:
+        """Return a change of the tree as one vector, with zeros for numbers that are not active."""
+        leaves = zip(self._numbers, self._active, leaves_and_none(change), strict=True)
+        moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
+        which = np.array(self.mask)
+        # Two operations, however many pieces there are: each would take XLA as long as a hundred steps of a small scene.
+        return jnp.concatenate([*moving, np.zeros(1)])[np.where(which, np.cumsum(which) - 1, np.sum(which))]
+
+    def cotangents(self, bars: Array) -> PyTree[Array]:
+        """Return the tree of the cotangents of active numbers, from those of all numbers, in order."""
+        parts, place = [], 0
+        for x, m in zip(self._numbers, self._active, strict=True):
+            size = 0 if x is None else np.size(x)
+            parts.append(bars[place : place + size].reshape(np.shape(x)) if m is True else None)
+            place += size
+        return jax.tree.unflatten(self._tree, parts)
 
 
 def leaves_and_none(tree: PyTree) -> list[Any]:

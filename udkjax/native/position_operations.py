@@ -19,6 +19,18 @@ class Close(Operation):
     in_lanes: ClassVar[bool] = False
     results: ClassVar[int] = len(Closing.results)
 
+    def with_tangents(self, active: tuple[bool, ...]) -> "CloseTangents":
+        """Return the operation that finds the changes of the state, too, along directions of the active numbers."""
+        return CloseTangents(self.code, active)
+
+    def with_second_tangents(self, active: tuple[bool, ...]) -> "CloseSecondTangents":
+        """Return the operation that finds second derivatives of the state along pairs of directions of the active numbers."""
+        return CloseSecondTangents(self.code, active)
+
+    def with_cotangents(self, active: tuple[bool, ...]) -> "CloseCotangents":
+        """Return the operation that walks back to the active numbers and the guess."""
+        return CloseCotangents(self.code, active)
+
     def module(self, width: int, beside: int, vector: int) -> Module:
         return Closing(self.code, vector)
 

@@ -26,7 +26,7 @@ from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory
 from udkjax.native.base.program import UnsupportedError
-from udkjax.native.base.steps import STEP_LIMIT
+from udkjax.native.base.steps import Status
 from udkjax.native.operations import FindScales, Operation
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
@@ -117,7 +117,7 @@ class LoadedCode:
         start = time.perf_counter()
         found = self.prepare(inputs, shapes, self._quick)()
         self._seconds -= time.perf_counter() - start
-        if place is not None and np.any(is_limited & (found[OUTPUTS.index("info")][:, INFO.index("code")] == STEP_LIMIT)):
+        if place is not None and np.any(is_limited & (found[OUTPUTS.index("info")][:, INFO.index("code")] == Status.STEP_LIMIT)):
             self._seconds = 0.0
             return None
         return found
@@ -209,7 +209,7 @@ def machine_code(operation: Operation, width: int, beside: int) -> LoadedCode:
 
 
 def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
-    """Run an operation on numbers that are known, of one member: nothing is traced for it."""
+    """Run an operation on the concrete numbers of one member: nothing is traced for it."""
     return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 
 

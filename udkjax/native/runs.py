@@ -4,15 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-import numpy as np
-
 from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
 from udkjax.native.base.module import Module
 from udkjax.native.base.tableau import Method
+from udkjax.native.derivatives import record
 from udkjax.native.derivatives.backpropagation import Reverse
-from udkjax.native.derivatives.record import STORED, record_length
 from udkjax.native.derivatives.tangents import Forward, ForwardTwice
-from udkjax.native.operations import Operation
+from udkjax.native.operations import Accelerate, Operation
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.trajectory import Trajectory
@@ -20,30 +18,18 @@ from udkjax.native.watching.conditions import Conditions
 from udkjax.native.watching.watching import Watching
 
 
-class Tableau:
-    """A method, to be looked up by its numbers."""
-
-    def __init__(self, method: Method):
-        self.method = method
-        self._key = tuple(np.asarray(x).tobytes() for x in method)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Tableau) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
 @dataclass(frozen=True)
 class RunStates(Operation):
     """Integrate: q, v, the violation of Psi, and how the run ended."""
 
-    method: Tableau
+    method: Method
     projected: bool
     breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
     sampled: tuple[int, ...] = ()  # places of the numbers that have samples
     pseudoinverse: DenseMethod | None = None  # None: elimination
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
+
+    info_names: ClassVar[tuple[str, ...]] = INFO  # of the first numbers of the output "info"; then the last q and v
 
     @property
     def all_settings(self) -> tuple[str, ...]:
@@ -53,7 +39,7 @@ class RunStates(Operation):
         """Return the plan of the module's code."""
         return Plan(
             code=self.code,
-            method=self.method.method,
+            method=self.method,
             projected=self.projected,
             breaks=self.breaks,
             width=width,
@@ -64,6 +50,11 @@ class RunStates(Operation):
             formulation=self.formulation,
         )
 
+    @property
+    def accelerations(self) -> Accelerate:
+        """The operation that finds accelerations at single states by the same method."""
+        return Accelerate(self.code, self.pseudoinverse, self.formulation)
+
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
         """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
         return RunTangents(**self._for_derivatives, active=active)
@@ -72,8 +63,15 @@ class RunStates(Operation):
         """Return the operation that finds second derivatives along pairs of directions of what is active."""
         return RunSecondTangents(**self._for_derivatives, active=active)
 
-    def with_cotangents(self, active: tuple[bool, ...], points: int) -> "RunCotangents":
-        """Return the operation that walks back to the numbers that are active, by a record of so many points."""
+    def with_cotangents(self, active: tuple[bool, ...], breakpoints: int = 0, points: int | None = None) -> "RunCotangents":
+        """Return the operation that walks back to the active numbers by a record.
+
+        Args:
+            active: mask of the numbers of the scene.
+            breakpoints: number of times where the motion is not smooth.
+            points: capacity of the record of a run; None: enough for most.
+        """
+        points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
     def watching(self, conditions: Conditions) -> "RunWatched":
@@ -144,7 +142,7 @@ class RunCotangents(RunStates):
     """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
 
     active: tuple[bool, ...] = ()
-    points: int = STORED  # capacity of the record of a run
+    points: int = record.STORED  # capacity of the record of a run
     is_reverse: ClassVar[bool] = True
 
     def module(self, width: int, beside: int, vector: int) -> Module:
@@ -155,5 +153,5 @@ class RunCotangents(RunStates):
         bars: list[tuple[int, ...]] = [(self.code.number_count,), (n,), (n,)]
         if self.sampled:
             bars.append((0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
-        record = (record_length(n, self.points) if is_first else 0,)
-        return [*super().outputs(inputs, times), *bars, record]
+        stored = (record.record_length(n, self.points) if is_first else 0,)
+        return [*super().outputs(inputs, times), *bars, stored]

@@ -12,8 +12,8 @@ from jaxtyping import Array, ArrayLike
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.native.packing import active_numbers, cotangent_tree, number_tangents
-from udkjax.native.position_operations import Close, CloseCotangents, CloseSecondTangents, CloseTangents
+from udkjax.native.packing import ActiveNumbers
+from udkjax.native.position_operations import Close
 from udkjax.native.primitive import call_concrete, native_p, unsupported
 from udkjax.scene.mechanism import Mechanism
 
@@ -46,20 +46,20 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
     """Return the changes of q and v along a `change` of the active leaves of (mechanism, scales, t, q, v)."""
-    operation = CloseTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
+    operation = _close(guess[0]).with_tangents(ActiveNumbers(guess[0], active[0]).mask)
     return _close_along(guess, operation, (active, change))
 
 
 def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
     """Return the second derivatives of q and v along two changes, each with its active leaves."""
-    operation = CloseSecondTangents(_close(guess[0]).code, active_numbers(guess[0], active[0]))
+    operation = _close(guess[0]).with_second_tangents(ActiveNumbers(guess[0], active[0]).mask)
     return _close_along(guess, operation, *changes)
 
 
-def _close_along(guess: Any, operation: CloseTangents, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
+def _close_along(guess: Any, operation: Close, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
     mechanism, n, along = guess[0], len(guess[-1]), []
     for active, (numbers, dq, dv) in changes:
-        along.append(number_tangents(mechanism, active[0], numbers))
+        along.append(ActiveNumbers(mechanism, active[0]).tangents(numbers))
         along += [np.zeros(n) if dx is None else dx for dx in (dq, dv)]
     dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), operation=operation, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
@@ -68,10 +68,11 @@ def _close_along(guess: Any, operation: CloseTangents, *changes: tuple[Any, Any]
 def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
     """Return the cotangents of the active leaves from those of q and v."""
     mechanism = guess[0]
-    operation = CloseCotangents(_close(mechanism).code, active_numbers(mechanism, active[0]))
+    which = ActiveNumbers(mechanism, active[0])
+    operation = _close(mechanism).with_cotangents(which.mask)
     bars = jnp.concatenate([qbar, vbar])[None]
     numbers, *states = (x[0] for x in native_p.bind(*_inputs(*guess), bars, operation=operation, times=2)[-3:])
-    found = cotangent_tree(numbers, mechanism, active[0])
+    found = which.cotangents(numbers)
     return found, *(x if m is True else None for x, m in zip(states, active[-2:], strict=True))
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from udkjax.extras import EXTRAS
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native.base import code_cache, machine
+from udkjax.native.base.code_cache import cache_folder, cached_files
+from udkjax.native.base.machine import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import cores, processor
 
@@ -22,7 +23,7 @@ FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
     """Return versions, devices, precision, engine, cache and advice, by names that scripts can rely on."""
-    folder, sizes = code_cache.cache_folder(), [size for _, size, _ in code_cache.cached_files()]
+    folder, sizes = cache_folder(), [size for _, size, _ in cached_files()]
     engine, reason = engine_here(run)
     return {
         "versions": versions(),
@@ -35,7 +36,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
         "precision": f"{jnp.result_type(float)}",
         "engine": engine,
         "engine_reason": reason,
-        "lanes": machine.lanes(),
+        "lanes": lanes(),
         "cache": None if folder is None else str(folder),
         "cached_programs": len(sizes),
         "cached_bytes": sum(sizes),

@@ -22,7 +22,7 @@ from udkjax.integrate.events.crossings import (
     cubic_slope,
     cubic_value,
 )
-from udkjax.native.watching.conditions import FAR, MISS, RESOLVED
+from udkjax.native.watching.conditions import RESOLUTION
 
 INTERVALS = 32  # of a window
 # The nodes, of a window's length: not quite uniform, so that no oscillation is zero at all of them.
@@ -97,10 +97,10 @@ def detect(
 
     side = jnp.where(before != 0, before, after)
     low, high = (_coefficients(cubic, side, 8 / 3 * x) for x in (error, -error))  # 16 x^2 (1 - x)^2 is 8/3 of the middle one
-    resolved = error <= RESOLVED * (jnp.max(high, 0) - jnp.min(low, 0))
+    resolved = error <= RESOLUTION.resolved * (jnp.max(high, 0) - jnp.min(low, 0))
     hits = (after == -before) & (before != 0)
     single = (_sign_changes(low) == 1) & (_sign_changes(high) == 1) & resolved
-    away = (jnp.min(low, 0) >= -ZERO * scale) & (resolved | (jnp.min(low, 0) >= FAR * error - ZERO * scale))
+    away = (jnp.min(low, 0) >= -ZERO * scale) & (resolved | (jnp.min(low, 0) >= RESOLUTION.far * error - ZERO * scale))
     usable = good[1:, None] & watched
     coarse = (usable & ~unresolved & ~jnp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
     # Intervals too coarse in a short window, and only there, hold a jump or a kink: finer windows would not tell more.
@@ -154,8 +154,8 @@ def _errors(
     cubic: Cubic = (g[:-2:2], length * slope[:-2:2], g[2::2], length * slope[2::2])
     miss = jnp.abs(g[1:-1:2] - cubic_value(cubic, x))
     # The rate tells a kink from what is smooth, of which it misses less.
-    of_rate = jnp.abs(length * slope[1:-1:2] - cubic_slope(cubic, x)) * MISS
-    miss = jnp.where(has_rates, jnp.maximum(MISS * miss, of_rate), miss)
+    of_rate = jnp.abs(length * slope[1:-1:2] - cubic_slope(cubic, x)) * RESOLUTION.miss
+    miss = jnp.where(has_rates, jnp.maximum(RESOLUTION.miss * miss, of_rate), miss)
     beside = jnp.pad(miss, ((1, 1), (0, 0)))
     return jnp.repeat(jnp.maximum(jnp.maximum(beside[:-2], beside[2:]), miss), 2, axis=0)
 

@@ -18,10 +18,11 @@ from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.solution import Result
-from udkjax.native.base.layout import INFO
-from udkjax.native.base.steps import CROSSED, DONE, LOST, NOT_FINITE, STEP_LIMIT, UNRESOLVED
+from udkjax.native.base.steps import Status
+from udkjax.native.runs import RunStates
 
-STATUS, TIME, COUNTS, WRITTEN = 0, 1, slice(2, 5), 5  # of `INFO`
+STATUS, TIME, COUNTS, WRITTEN = 0, 1, slice(2, 5), 5  # of `RunStates.info_names`
+INFO = len(RunStates.info_names)
 
 
 class MachinePlan(NamedTuple):
@@ -150,7 +151,7 @@ class MachineSystem:
         found = self._phases[phase].run(some, times, runs.q[some], runs.v[some], self._watch(runs, phase, some))
         status, counts = found.info[:, STATUS], found.info[:, COUNTS].astype(int)
         rows = (np.arange(times.shape[1]) <= found.info[:, WRITTEN, None]) & (times <= found.t[:, None])
-        rows[:, -1] = status == DONE
+        rows[:, -1] = status == Status.DONE
         lost = rows & ~(found.violation <= tol)
         drifts = lost.any(1) | ~(found.worst <= tol[:, 0])
         kept = rows & (np.cumsum(lost, axis=1) == 0) if drifts.any() else rows
@@ -161,7 +162,7 @@ class MachineSystem:
         runs.totals[some, :3] += counts
         if self._is_projected[phase]:
             runs.totals[some, 3] += counts[:, 0] + 2 * (rows.sum(1) - 1)
-        known, watched = ((status == CROSSED) | (status == DONE)) & ~drifts, self._watched[phase]
+        known, watched = ((status == Status.CROSSED) | (status == Status.DONE)) & ~drifts, self._watched[phase]
         event = np.where(found.event >= 0, watched[found.event.astype(int)], NO_EVENT)
         runs.put(some, t=found.t, q=found.q_end, v=found.v_end, event=event, running=known)
         if known.all():
@@ -185,11 +186,11 @@ class MachineSystem:
     ):
         """Take over how the runs have ended that do not go on, and where."""
         status, (n, fails) = found.info[:, STATUS], (runs.q.shape[1], ~known)
-        self.unresolved[some] |= (status == UNRESOLVED) & ~drifts
-        code = np.where(status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
-        code = np.where(status == NOT_FINITE, Result.not_finite, code)
-        code = np.where((status == LOST) | drifts, Result.drift, code)
-        last = found.info[fails, TIME], found.info[fails, len(INFO) : len(INFO) + n], found.info[fails, len(INFO) + n :]
+        self.unresolved[some] |= (status == Status.UNRESOLVED) & ~drifts
+        code = np.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
+        code = np.where(status == Status.NOT_FINITE, Result.not_finite, code)
+        code = np.where((status == Status.LOST) | drifts, Result.drift, code)
+        last = found.info[fails, TIME], found.info[fails, INFO : INFO + n], found.info[fails, INFO + n :]
         runs.code[some[fails]] = code[fails]
         runs.t[some[fails]], runs.q[some[fails]], runs.v[some[fails]] = last
 

@@ -16,12 +16,12 @@ from udkjax.integrate.events.added_joints import places_of_joints
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.native_engine import run_inputs
 from udkjax.integrate.problem import Problem
-from udkjax.native.base.layout import INPUTS
-from udkjax.native.operations import EvaluateEvents, MarkRows, ProjectStates
+from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import call_members
 from udkjax.native.runs import RunWatched
-from udkjax.native.watching.conditions import HEAD, Conditions
+from udkjax.native.watching.conditions import Conditions
 
+INPUTS = RunWatched.input_names
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # of the inputs of a run: times and the initial state
 PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # of a phase, as arrays; then its samples, if there are some
 
@@ -33,7 +33,7 @@ class PhasePlan(NamedTuple):
     states: EvaluateEvents
     marking: MarkRows | None  # of independent rows, where they are not known beforehand
     projected: bool
-    project: ProjectStates | None  # to the joints that events add, where they do
+    project: StateOperation | None  # to the joints that events add, where they do
     joints: tuple[tuple[int, ...], ...]  # of each such joint: the places of its numbers, none where the phase does not have it
 
     @property
@@ -57,11 +57,11 @@ def phase_plan(
     run = compiled.plan.operation
     assert run is not None  # checked by the caller
     rows = tuple(row for row in held if row >= 0)
-    states = EvaluateEvents(run.code, run.pseudoinverse, run.formulation, conditions, tuple(impacts))
+    states = run.accelerations.of_events(conditions, tuple(impacts))
     marking = None
     if run.code.marks_rows:
         marking = MarkRows(scene_programs(compiled.textbook.mechanism.at(0.0)).with_all_rows)
-    project = ProjectStates(run.code, run.pseudoinverse, run.formulation) if added else None
+    project = run.accelerations.projection if added else None
     joints = places_of_joints(compiled.textbook.mechanism, added)
     return PhasePlan(run.watching(replace(conditions, rows=rows)), states, marking, compiled.plan.projected, project, joints)
 
@@ -86,7 +86,7 @@ class StretchEnd(NamedTuple):
     q: Float[np.ndarray, "b T n"]  # at the times that were asked for
     v: Float[np.ndarray, "b T n"]
     violation: Float[np.ndarray, "b T"]
-    info: Float[np.ndarray, "b K"]  # `INFO`, and the last state of the integrator
+    info: Float[np.ndarray, "b K"]  # `RunStates.info_names`, and the last state of the integrator
     event: Float[np.ndarray, "b"]  # of what is watched: which crosses; -1: none
     t: Float[np.ndarray, "b"]  # up to which nothing else happens
     worst: Float[np.ndarray, "b"]  # violation at a node
@@ -139,8 +139,8 @@ class PhaseCode:
         own = [_of(x, some) for x in (self._settings, self._rows, self._breaks, *self._samples)]
         watch[:, : conditions.number_count] = _of(self._event_numbers, some)
         qs, vs, violation, info, crossing = call_members(numbers, ts, q, v, *own, watch, operation=operation, times=ts.shape[1])
-        behind, n = HEAD + conditions.count, q.shape[1]
-        sides, q_end, v_end = crossing[:, HEAD:behind], crossing[:, behind : behind + n], crossing[:, behind + n :]
+        behind, n = Conditions.head + conditions.count, q.shape[1]
+        sides, q_end, v_end = crossing[:, Conditions.head : behind], crossing[:, behind : behind + n], crossing[:, behind + n :]
         return StretchEnd(qs, vs, violation, info, crossing[:, 0], crossing[:, 1], crossing[:, 2], sides, q_end, v_end)
 
     def at(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> StateValues:

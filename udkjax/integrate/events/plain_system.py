@@ -25,8 +25,8 @@ from udkjax.integrate.events.runs import Change, EventRun, MemberIndices, Member
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.base.steps import DONE, LOST, NOT_FINITE, STEP_LIMIT, UNIT
-from udkjax.native.watching.conditions import FINER, FINEST, PER_TIME, SHORT
+from udkjax.native.base.steps import SMALLEST_STEP, Status
+from udkjax.native.watching.conditions import RESOLUTION
 
 MOST_OUTPUTS = 32  # output times of a window
 
@@ -123,7 +123,7 @@ class PlainSystem:
         output = jnp.searchsorted(ts, t) + np.arange(min(MOST_OUTPUTS, T))
         due = ts[jnp.minimum(output, T - 1)]
         speed = jnp.maximum(hybrid.scales.rate, hybrid.scales.size(state.v))
-        full = jnp.where(speed > 0, INTERVALS / PER_TIME / jnp.where(speed > 0, speed, 1.0), ts[-1] - ts[0])
+        full = jnp.where(speed > 0, INTERVALS / RESOLUTION.per_time / jnp.where(speed > 0, speed, 1.0), ts[-1] - ts[0])
         zooms = window.event != NO_EVENT
         end = jnp.where(zooms, window.high, t + jnp.minimum(full, window.reach))
         end = jnp.minimum(end, jnp.minimum(due[-1], ts[-1]))
@@ -151,16 +151,19 @@ class PlainSystem:
             scale=jnp.append(runs.scale[0], jnp.zeros(E) + hybrid.force),
             located=window.event,
             watched=self.plan.watched(runs.phase, runs.carried, jnp)[0] & ~lands,
-            is_short=length * hybrid.rate <= SHORT,
+            is_short=length * hybrid.rate <= RESOLUTION.short,
             unresolved=jnp.isfinite(window.unresolved) | zooms,  # within an interval that was fine enough
         )
         place, width = found.place, nodes[found.behind] - nodes[found.place]
         root = nodes[place] + found.root * width
-        is_shortest = length <= jnp.maximum(FINEST / hybrid.rate, 100 * len(times) * hybrid.smallest)
+        is_shortest = length <= jnp.maximum(RESOLUTION.finest / hybrid.rate, 100 * len(times) * hybrid.smallest)
         undefined = found.is_coarse & is_shortest & found.undefined[:E]
         stays = found.is_found | found.is_coarse
         fails = (~jnp.all(good) & ~stays) | jnp.any(undefined)
-        has_landed, jumps = zooms & window.lands & ~stays & ~fails & (end == window.high), width <= 2 * UNIT * hybrid.smallest
+        has_landed, jumps = (
+            zooms & window.lands & ~stays & ~fails & (end == window.high),
+            width <= 2 / SMALLEST_STEP * hybrid.smallest,
+        )
         is_located = has_landed | (found.is_found & jumps)
 
         node = jnp.where(stays, jnp.where(found.is_coarse, found.last_sure, place), len(nodes) - 1)
@@ -171,7 +174,9 @@ class PlainSystem:
         rows = jnp.where((output < T) & (due < t_new), output, T)
         of_outputs = jnp.searchsorted(times, jnp.clip(due, t, end))
         code = jnp.where(jnp.any(undefined), Result.undefined_condition, _failure(raw))
-        reach = jnp.where(found.is_coarse, length / FINER, jnp.where(zooms | found.is_found, window.reach, 2 * window.reach))
+        reach = jnp.where(
+            found.is_coarse, length / RESOLUTION.finer, jnp.where(zooms | found.is_found, window.reach, 2 * window.reach)
+        )
         since = t_new - window.last
         is_unresolved = found.is_coarse & is_shortest & found.coarse & ~found.undefined
         projections = hybrid.projects * (raw.tried + 2 * len(times) - 2)
@@ -199,6 +204,6 @@ class PlainSystem:
 
 
 def _failure(raw: IntegratorOutput) -> Int[Array, ""]:
-    code = jnp.where(raw.status == STEP_LIMIT, Result.step_limit, Result.step_too_small)
-    code = jnp.where(raw.status == NOT_FINITE, Result.not_finite, code)
-    return jnp.where((raw.status == DONE) | (raw.status == LOST), Result.drift, code)
+    code = jnp.where(raw.status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    code = jnp.where(raw.status == Status.NOT_FINITE, Result.not_finite, code)
+    return jnp.where((raw.status == Status.DONE) | (raw.status == Status.LOST), Result.drift, code)

@@ -22,13 +22,12 @@ from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
-from udkjax.native.base.layout import INFO, INPUTS
 from udkjax.native.base.steps import SMALLEST_STEP
 from udkjax.native.operations import MarkRows, Operation
 from udkjax.native.position_operations import Close
-from udkjax.native.run.evaluation import Evaluation
+from udkjax.native.run.state_functions import Evaluation
+from udkjax.native.runs import RunStates
 from udkjax.native.wasm import compile_wasm, wasm_module
-from udkjax.native.wasm.object_code import LinkedModule
 from udkjax.positions.assembly import State
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
@@ -171,15 +170,14 @@ def floats(x: Any) -> str:
     return base64.b64encode(np.asarray(x, "<f8").tobytes()).decode()
 
 
-def _module(linked: LinkedModule, **further: Any) -> JsonObject:
-    code = base64.b64encode(zlib.compress(linked.code, 9)).decode()
-    return {"code": code, "bytes": len(linked.code), "data_end": linked.data_end, **further}
+def _module(code: bytes, data_end: int, **further: Any) -> JsonObject:
+    return {"code": base64.b64encode(zlib.compress(code, 9)).decode(), "bytes": len(code), "data_end": data_end, **further}
 
 
 def _operation(operation: Operation) -> JsonObject:
     linked, module = wasm_module(operation)
-    names = {"inputs": [*INPUTS, *module.inputs], "results": [*module.results, *module.outputs]}
-    return _module(linked, fields=list(module.call_fields), settings=list(operation.all_settings), **names)
+    names = {"inputs": [*Operation.input_names, *module.inputs], "results": [*module.results, *module.outputs]}
+    return _module(linked.code, linked.data_end, fields=list(module.call_fields), settings=list(operation.all_settings), **names)
 
 
 def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
@@ -212,15 +210,15 @@ def _run(problem: Problem, data: JsonObject, events: PortableEvents, rows: tuple
     """Return the module of runs; its inputs go into the data."""
     operation, inputs = problem.compiled.plan.operation, packed(problem)
     assert operation is not None  # such a page runs machine code
-    given = dict(zip(INPUTS, inputs, strict=False))
+    given = dict(zip(Operation.input_names, inputs, strict=False))
     data |= {
         "thresholds": given["numbers"][0, -2:].tolist(),
         "settings": dict(zip(operation.settings, given["settings"][0].tolist(), strict=True)),
         "smallest": SMALLEST_STEP,
-        "info": list(INFO),
+        "info": list(RunStates.info_names),
         "drift_tol": DRIFT_PROJECTED,
         "sampled": list(operation.sampled),
-        "samples": floats(inputs[len(INPUTS)][0]) if operation.sampled else "",
+        "samples": floats(inputs[len(Operation.input_names)][0]) if operation.sampled else "",
     }
     modules = {"run": _operation(events.watched_by(operation, rows))}
     if data["events"] is not None:
@@ -248,7 +246,7 @@ def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram
     ]
     data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
     linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
-    return _module(linked, places=evaluation.places, size=evaluation.size)
+    return _module(linked.code, linked.data_end, places=evaluation.places, size=evaluation.size)
 
 
 def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject]:

@@ -16,7 +16,7 @@ from udkjax.integrate.events.phases import HeldContact
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents
 from udkjax.native.runs import RunStates
-from udkjax.native.watching.conditions import HEAD
+from udkjax.native.watching.conditions import Conditions
 from udkjax.requirements import ArgumentError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
@@ -83,7 +83,7 @@ class PortableEvents:
             "ends_at_rest": [event.action.rest == "stop" for event in self._events],
             "slowest": float(analysis.scales.rate),
             "most": MOST_EVENTS,
-            "head": HEAD,
+            "head": Conditions.head,
             "tolerances": TOLERANCES,
         }
 
@@ -99,4 +99,4 @@ class PortableEvents:
         """Return the operation that finds conditions, their rates and slopes, and directions of impulses at states."""
         assert self._conditions is not None  # since there are events
         impacts = tuple(k for k, event in enumerate(self._events) if event.action.is_impact)
-        return EvaluateEvents(run.code, run.pseudoinverse, run.formulation, self._conditions, impacts)
+        return run.accelerations.of_events(self._conditions, impacts)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from udkjax.native.base.tableau import DOPRI8, Method, method
+from udkjax.native.base.tableau import DOPRI8, Method
 
 if TYPE_CHECKING:
     import diffrax
@@ -57,4 +57,4 @@ def method_of(solver: "diffrax.AbstractERK | None") -> Method:
     ends = bool(tableau.fsal and error[-1] != 0)
     if tableau.fsal and not ends:  # the last stage is there for interpolation, or for the next step
         c, stages, b, error = c[:-1], stages[:-1], b[:-1], error[:-1]
-    return method(c, stages, b, error, order, ends)
+    return Method.of(c, stages, b, error, order, ends)

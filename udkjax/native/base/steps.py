@@ -1,18 +1,25 @@
 """The numbers that steps are chosen by, for machine code and whatever steps as it does."""
 
-import numpy as np
+from typing import NamedTuple
 
-# The step controller: a step is SAFETY times as long as one whose error would be the tolerance, and between SHRINK and GROW times
-# as long as the one before (the usual bounds). With 0.9 every tenth step of an ordinary run is rejected, and most runs take 4 to
-# 15 % more at equal error. A step that is tried again for the sake of a pivot is as much shorter.
-SAFETY, SHRINK, GROW = 0.8, 0.2, 10.0
+
+class StepFactors(NamedTuple):
+    """The next step over the last one: `safety` times one whose error would be the tolerance, between `shrink` and `grow`.
+
+    These are the usual bounds. With a safety of 0.9 every tenth step of a typical run is rejected, and most runs take 4 to 15 %
+    more at equal error. A step that is tried again for the sake of a pivot is as much shorter.
+    """
+
+    safety: float = 0.8
+    shrink: float = 0.2
+    grow: float = 10.0
+
+
+FACTORS = StepFactors()
+
 # Of the step before a breakpoint: the first behind it. Its outputs have states on one side alone, and so larger errors: with
 # SAFETY in its place rates across the knots of a cam are off by 34 times the tolerance instead of ten.
 RESTART_FACTOR = 0.5
-
-# Of the scene's units: what `atol` is at least. Nothing is known to less than rounding, and a coordinate that is zero has no
-# other tolerance.
-LEAST_ATOL = np.finfo(float).eps
 
 # Steps near singular configurations. Distances are the smallest pivot of D D^T relative to its diagonal, as a root.
 RETRIES = 3  # of a step that meets a pivot which elimination must not trust, before the fallback takes it
@@ -48,9 +55,17 @@ POINTS = 4  # states that an interpolating polynomial goes through: with three, 
 SHORTEST_LAST = 0.25
 STRETCH = 12.0  # ratio of the last step to those before, at most: steps grow tenfold
 
-# The states of a run. `NOT_FINITE`: the step became too small because of a non-finite number. `LOST`: the run left the constraint
-# manifold. Runs that watch conditions also end as `CROSSED`, at a zero crossing, or `UNRESOLVED`, where a crossing is possible.
-RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, CROSSED, UNRESOLVED = range(8)
+
+class Status:
+    """The status of a run.
+
+    `NOT_FINITE`: its step became too small because of a number that is not finite. `LOST`: it left the constraint manifold. Of
+    runs that watch conditions: `CROSSED`: it is at the time at which one crosses zero. `UNRESOLVED`: one may.
+    """
+
+    RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, CROSSED, UNRESOLVED = range(8)
+
+
 # Each row of Psi over its scale, after a step whose end was projected, which leaves some 1e-12: a row so far open is one that no
 # position near it closes, as where a driver asks for more than a linkage reaches. Behind that there is no motion to follow.
 LOST_TOL = 1e-2
@@ -66,14 +81,6 @@ NORMAL_ERROR_WEIGHT = 1e-3
 # A pivot, relative to its row's diagonal entry of D D^T: below the first is rounding; rows of outputs whose pivots are below the
 # second, the root of a unit of rounding, stay as they were interpolated: rounding errors would turn their velocities.
 ROUNDING_PIVOT, OUTPUT_PIVOT_TOL = 1e-14, 1e-8
-
-# Of the rank threshold: what fallback steps take for theirs. They begin on the constraint manifold, unless states are not
-# projected, and only those beside singular configurations take it. Rows that count as redundant there and are not leave what they
-# hold back in velocities, as large as the threshold, and rounding errors are as large as a unit over its square: both are least
-# at some third root of a unit. With three times more, linkages that turn back in singular configurations take up to a quarter
-# less steps, but Peaucellier's may cross with errors of 1e-5 in its energy, at any tolerance; with three times less they take up
-# to two fifths more.
-FALLBACK_RANK_SHARE = 0.2
 
 OUTPUT_STEPS = 7  # of Newton's method to an output: where two branches of the manifold meet, it halves the distance in each
 NEWTON_STEPS = 3  # in a projection, at most: the last of which usually finds nothing to do

@@ -18,6 +18,29 @@ class Method(NamedTuple):
     order: float
     ends: bool  # whether the last stage is the next step's first
 
+    @classmethod
+    def of(
+        cls, c: np.ndarray, stages: Sequence[Any], b: np.ndarray, error: np.ndarray, order: float, ends: bool = False
+    ) -> "Method":
+        """Return the method of nodes c, rows of A below the first, weights b, those of the error, and its order."""
+        A = np.zeros((len(c), len(c)))
+        for i, coefficients in enumerate(stages):
+            A[i + 1, : i + 1] = coefficients
+        return cls(np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A, float(order), ends)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Method) and self._key == other._key
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[bytes, ...]:
+        return tuple(np.asarray(x).tobytes() for x in self)
+
     @property
     def stages(self) -> int:
         return len(self.error_v)
@@ -36,14 +59,6 @@ def row(text: str) -> np.ndarray:
     return np.array([float(Fraction(x)) for x in text.split()])
 
 
-def method(c: np.ndarray, stages: Sequence[Any], b: np.ndarray, error: np.ndarray, order: float, ends: bool = False) -> Method:
-    """From nodes c, rows of A below the first, weights b, those of the error, and its order; `ends` is that of `Method`."""
-    A = np.zeros((len(c), len(c)))
-    for i, coefficients in enumerate(stages):
-        A[i + 1, : i + 1] = coefficients
-    return Method(np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A, float(order), ends)
-
-
 # The pair of orders 8 and 7 with 13 stages: P. J. Prince, J. R. Dormand, High order embedded Runge-Kutta formulae, J. Comp. Appl.
 # Math. 7 (1981) 67-75; `diffrax.Dopri8` without the stage that serves its interpolation.
 _ORDER_8 = row(
@@ -54,7 +69,7 @@ _ORDER_7 = row(
     """13451932/455176623 0 0 0 0 -808719846/976000145 1757004468/5645159321 656045339/265891186 -3867574721/1518517206
     465885868/322736535 53011238/667516719 2/45 0"""
 )
-DOPRI8 = method(
+DOPRI8 = Method.of(
     row("0 1/18 1/12 1/8 5/16 3/8 59/400 93/200 5490023248/9719169821 13/20 1201146811/1299019798 1 1"),
     (
         row("1/18"),
@@ -90,4 +105,4 @@ DOPRI8 = method(
     order=8,
 )
 
-EULER = method(row("0"), (), row("1"), row("1"), order=1)
+EULER = Method.of(row("0"), (), row("1"), row("1"), order=1)

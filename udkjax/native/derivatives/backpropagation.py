@@ -19,7 +19,7 @@ from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.base.samples import ARGUMENTS, count_breakpoints, numbers_of_row
-from udkjax.native.base.steps import DONE, POINTS
+from udkjax.native.base.steps import POINTS, Status
 from udkjax.native.derivatives.record import Recorded
 from udkjax.native.run.dense_output import write_differences_back
 from udkjax.native.run.runge_kutta import stage_state
@@ -189,7 +189,7 @@ class Reverse(Recorded):
                     self.put_entry(f, name, i, 0.0)
         with self.each_lane(f, s.ready > 0.5) as k:
             self._add_state(f, k, self.member_address(f, "endbar", self.lane_entry(f, "member", k)), "bar point3")
-            with f.if_(self.lane_entry(f, "code", k).is_(float(DONE))):
+            with f.if_(self.lane_entry(f, "code", k).is_(float(Status.DONE))):
                 self._add_output(f, k, times - 1, "bar point3")
             for j in range(POINTS):
                 self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1 - j), f"point{j}")

@@ -9,25 +9,19 @@ from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.power import power
 from udkjax.native.base.steps import (
-    DONE,
     EXPECTED,
+    FACTORS,
     GAP,
-    GROW,
-    LOST,
     LOST_TOL,
     NEAREST_STAGE,
     POINTS,
     RESTART_FACTOR,
     RETRIES,
-    RUNNING,
-    SAFETY,
-    SHRINK,
-    STEP_LIMIT,
-    STEP_TOO_SMALL,
+    ROUNDING_GROWTH,
     SURE,
+    Status,
 )
 from udkjax.native.run.manifold import largest_violation, velocity_tolerance
-from udkjax.native.run.singular import is_clear, step_around, time_to_singularity
 
 
 def write_decide(module: Module):
@@ -49,7 +43,7 @@ def write_decide(module: Module):
     accept = stepping & (error < 1.0) & ~dodge & ~repeats
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
     factor, rate = _step_factor(module, f, s, accept, step)
-    h = where(stepping, step * where(dodge, f.const(SAFETY, DOUBLE, f.width), factor), s.h)
+    h = where(stepping, step * where(dodge, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)
     h = where(repeats, s.h, h)
     if module.falls_back:
         h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, left, step, h), h)
@@ -57,12 +51,12 @@ def write_decide(module: Module):
     with f.if_(f.any_of(begun)):
         s.behind = where(begun, first_step(module, f, s), s.behind)
     h = s.behind
-    code = where(stepping & (h < s.smallest), f.const(STEP_TOO_SMALL, DOUBLE, f.width), s.code)
-    code = where(code.is_(float(RUNNING)) & stepping & (tried >= s.max_steps), STEP_LIMIT, code)
-    code = where(stepping & bad & begin & ~accept, where(code.is_(float(RUNNING)), STEP_TOO_SMALL, code), code)
-    code = where(accept & (s.last > 0.5), DONE, code)
+    code = where(stepping & (h < s.smallest), f.const(Status.STEP_TOO_SMALL, DOUBLE, f.width), s.code)
+    code = where(code.is_(float(Status.RUNNING)) & stepping & (tried >= s.max_steps), Status.STEP_LIMIT, code)
+    code = where(stepping & bad & begin & ~accept, where(code.is_(float(Status.RUNNING)), Status.STEP_TOO_SMALL, code), code)
+    code = where(accept & (s.last > 0.5), Status.DONE, code)
     lost = _accept_step(module, f, s, accept)
-    code = where((lost > 0.5) & code.is_(float(RUNNING)), LOST, code)
+    code = where((lost > 0.5) & code.is_(float(Status.RUNNING)), Status.LOST, code)
     s.where(accept & stepped, rate=rate)
     if module.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
@@ -101,13 +95,13 @@ def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Valu
     """Return the next step over this one, and the error over the length to the power of the order."""
     where, order, error = f.select, module.method.order, s.error
     # Errors below the one that lets a step grow as far as it may count as that one: they may be rounding and say nothing.
-    size = where(f.is_finite(error), f.max(error, GROW ** -float(order)), 1e30)
+    size = where(f.is_finite(error), f.max(error, FACTORS.grow ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
     foreseen = size * (rate / s.rate)  # the error of a step as long, where errors grow as they did (Gustafsson 1994)
     steep = accept & (foreseen > 1.0)
-    factor = power(f, where(steep, foreseen, size), -1.0 / order) * SAFETY
-    factor = f.max(factor, where(accept & ~steep, f.const(1.0, DOUBLE, f.width), SHRINK))
-    return f.min(factor, where(accept, f.const(GROW, DOUBLE, f.width), SAFETY)), rate
+    factor = power(f, where(steep, foreseen, size), -1.0 / order) * FACTORS.safety
+    factor = f.max(factor, where(accept & ~steep, f.const(1.0, DOUBLE, f.width), FACTORS.shrink))
+    return f.min(factor, where(accept, f.const(FACTORS.grow, DOUBLE, f.width), FACTORS.safety)), rate
 
 
 def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
@@ -167,3 +161,25 @@ def first_step(module: Module, f: Function, s: Lane) -> Value:
     ordinary = f.is_finite(rate) & (rate > 0.0)
     chosen = f.select(ordinary, f.min(size / f.select(ordinary, rate, 1.0) * 0.01, span), span * 1e-4)
     return f.select(s.first > 0.0, f.min(s.first, span), chosen)
+
+
+def is_clear(module: Module, f: Function, s: Lane, distance: Value) -> Value:
+    """Return whether a step as long as the one that is tried may begin so far away from singular configurations."""
+    return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > s.h * s.omega * ROUNDING_GROWTH)
+
+
+def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
+    """Return the time that is left until a singular configuration: a root of the parabola through three distances."""
+    t2, t1, t0, d2, d1, d0 = s.point1_t, s.point2_t, s.point3_t, s.distance0, s.distance1, s.distance2
+    slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
+    curve = (slope - before) / (t0 - t2)
+    slope = slope + curve * (t0 - t1)
+    return -d0 / (slope - curve * (d0 / slope))
+
+
+def step_around(module: Module, f: Function, s: Lane, left: Value, step: Value, otherwise: Value) -> Value:
+    """In place of a step that failed, one that has the configuration ahead in the middle of a wide gap between its nodes."""
+    low, high = (float(x) for x in module.method.clearings)
+    share = left / step
+    found = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
+    return f.select((found > step * FACTORS.shrink) & (found < step * FACTORS.safety), found, otherwise)

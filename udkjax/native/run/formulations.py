@@ -10,13 +10,14 @@ all in the scene's own units, in which coordinates, rows and masses are of order
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.native.base.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS
 from udkjax.native.base.module import Module
+from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.weighted_rows import RowEntries
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
@@ -24,6 +25,7 @@ from udkjax.native.pseudoinverses.lu import LUCode
 from udkjax.native.pseudoinverses.one_of import OneOfCode
 from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.pinv import Auto, Elimination, Pseudoinverse
 
 TOL, MASS = FORMULATION_SETTINGS
 FORMULATE = "formulate"
@@ -244,9 +246,32 @@ def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
     return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one number
 
 
-def formulation_tol(formulation: Any) -> Any:
-    """Return the threshold of the rank of a formulation."""
-    if not isinstance(formulation, Augmented):
-        return formulation.rank_tol
-    given = None if formulation.method is None else formulation.method.rank_tol
-    return RANK_TOL**2 if given is None else given
+class MethodCode(NamedTuple):
+    """The machine code of a method and of a formulation."""
+
+    pseudoinverse: DenseMethod | None  # None: elimination
+    formulation: FormulationCode | None  # None: the Udwadia-Kalaba equation
+
+    @classmethod
+    def of(cls, method: Pseudoinverse, formulation: Formulation | None = None) -> "MethodCode":
+        """Return the machine code of a method and a formulation.
+
+        Raises:
+            UnsupportedError: there is none.
+        """
+        found = cls(dense_method(method), None if formulation is None else formulation_code(formulation))
+        if formulation is not None and found.formulation is None:
+            raise UnsupportedError(f"the formulation {formulation}")
+        if found.pseudoinverse is None and not isinstance(method, Auto | Elimination):
+            raise UnsupportedError(f"the pseudoinverse {type(method).__name__}")
+        return found
+
+
+def formulation_settings(formulation: Any, mass: Any) -> dict[str, Any]:
+    """Return the settings of a formulation by name: the threshold of its rank, and the scale of masses (kg)."""
+    if isinstance(formulation, Augmented):
+        tol = None if formulation.method is None else formulation.method.rank_tol
+        tol = RANK_TOL**2 if tol is None else tol
+    else:
+        tol = formulation.rank_tol
+    return dict(zip(FORMULATION_SETTINGS, (tol, mass), strict=True))

@@ -8,7 +8,7 @@ from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.samples import enter_first_row, write_enter
-from udkjax.native.base.steps import CROSSED, DONE, LOOK_AHEAD, NOT_FINITE, POINTS, STEP_LIMIT
+from udkjax.native.base.steps import LOOK_AHEAD, POINTS, Status
 from udkjax.native.run.manifold import largest_violation, project_output
 
 
@@ -89,7 +89,7 @@ def write_finish(module: Module):
     project_output(module, f, s, "due")
     with module.each_lane(f, s.due) as k:
         member = module.to_int(f, f.lane(s.member, k))
-        with f.if_(f.lane(s.code, k).is_(float(DONE))):
+        with f.if_(f.lane(s.code, k).is_(float(Status.DONE))):
             module.write_state(f, s, k, times - 1, "state q", "result v")
         q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
         with f.each(module.n) as i:
@@ -115,7 +115,12 @@ def write_finish(module: Module):
 
 def _find_cause(module: Module, f: Function, s: Lane):
     """Find out why steps fell to nothing: by a number that is not finite, at the end of the run or right ahead, or otherwise."""
-    stopped = s.due.is_(1.0) & s.code.is_not(float(DONE)) & s.code.is_not(float(STEP_LIMIT)) & (s.code < float(CROSSED))
+    stopped = (
+        s.due.is_(1.0)
+        & s.code.is_not(float(Status.DONE))
+        & s.code.is_not(float(Status.STEP_LIMIT))
+        & (s.code < float(Status.CROSSED))
+    )
     with f.if_(f.any_of(stopped)):
         for share in (0.0, LOOK_AHEAD):
             later = (s.end - s.start) * share
@@ -132,13 +137,13 @@ def _find_cause(module: Module, f: Function, s: Lane):
                 module.accelerate(f, "result a")
                 with f.each(module.n) as i:
                     total.value = f.fma(module.entry(f, "result a", i), 0.0, total.value)
-            s.where(stopped & total.value.is_not(0.0), code=NOT_FINITE)
+            s.where(stopped & total.value.is_not(0.0), code=Status.NOT_FINITE)
 
 
 def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
     """Clear the outputs of lane k that its run did not reach, and those behind the first lost one: they are no numbers."""
     times, nan = module.field(f, "times"), f.const(np.nan)
-    is_done = f.lane(s.code, k).is_(float(DONE))
+    is_done = f.lane(s.code, k).is_(float(Status.DONE))
     reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)
     kept = module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
     row = module.to_int(f, f.lane(s.member, k)) * times + kept

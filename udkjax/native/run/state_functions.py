@@ -3,14 +3,19 @@
 StateAccelerations    a of a state, by elimination or a dense method; by the fallback where pivots are not to be trusted
 StateProjection       q and v returned to the constraint manifold
 StateTangentPart      the part of small changes of q and v within the manifold
+Evaluation            accelerations with the forces of rows, and energies, for pages
+ScaleCode             the characteristic scales (equations/scale_program.py), of numbers alone
 """
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import Lane, Layout, Plan
+from udkjax.native.base.loops import LoopWriter
+from udkjax.native.base.memory import Memory
 from udkjax.native.base.steps import NEAREST_STAGE, ROUNDING_PIVOT
 from udkjax.native.base.tableau import EULER
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -139,3 +144,81 @@ class StateTangentPart(StateFunction):
             self.invoke(f, "fallback_tangent_part")
             for x in ("dq", "dv"):
                 self.copy(f, f"fallback {x}", f"result {x}", near)
+
+
+INPUTS = ("t", "q", "v")
+
+
+class Evaluation:
+    """The text of a module that evaluates a scene at single states, of loops whatever the size of the scene.
+
+    Its functions are called one by one, with addresses in one piece of memory:
+
+        numbers(parameters, numbers)      numbers of the scene that depend on parameters, into the vector of all numbers
+        prologue(numbers, work)           the constants of the scene, of its numbers
+        accelerations(work, work)         "a", and the solution "x0" of the linear system, of "t", "q" and "v"
+        energy(work, work)                "energy", kinetic and potential (J), of "q" and "v"
+
+    `places` are the places in `work` of the arrays of these names, in numbers; `work` begins with the constants.
+    """
+
+    exports = ("prologue", "accelerations", "energy")
+
+    def __init__(self, code: ScenePrograms, further: Sequence[Function] = ()):
+        n = code.coordinate_count
+        self._code, self._further = code, list(further)
+        layout = Layout(1, 1)
+        sizes = {"constants": len(code.constants), "t": 1, "q": n, "v": n, "a": n, "safe": 1, "energy": 2}
+        for name, count in (sizes | code.scratch).items():
+            layout.add(name, count)
+        self.places, self.size = layout.places, layout.size
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        loops = LoopWriter(1)
+        at = {name: ("work", place) for name, place in self.places.items()}
+        loops.write(self._code.prologue, "prologue", ("numbers", "work"), at | {"numbers": ("numbers", 0)})
+        for name in ("accelerations", "energy"):
+            loops.write(getattr(self._code, name), name, ("work", "out"), at)
+        functions = [*self._further, *loops.functions]
+        declared = sorted(set().union(*(f.declared for f in functions)))
+        return "\n".join([*declared, *loops.globals, *(f.text() for f in functions)])
+
+
+class ScaleCode(Memory):
+    """The text of a module whose `run` finds the scales of members: in loops whatever the size of the scene, once a run.
+
+    They are cold: optimized they take as long, and twice as long to compile.
+    """
+
+    settings = ()
+    results = ("scales",)
+
+    def __init__(self, code: ScenePrograms):
+        self._code, self.places = code, Layout(1, 1)
+        for name, size in (code.scratch | code.scales.sizes).items():
+            if name in code.scales.program.arrays:
+                self.places.add(name, size)
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        loops, size = LoopWriter(1, cold=True), self._code.scale_count
+        at = {name: ("work", place) for name, place in self.places.places.items()}
+        at |= {"numbers": ("numbers", 0), "scales": ("scales", 0)}
+        loops.write(self._code.scales.program, "find_scales", ("numbers", "work", "scales"), at)
+        f = Function("run", [(POINTER, "call")])
+        block, work = self.allocate(f, f.const(self.places.size, INT))
+        members, following = self.field(f, "members"), self.field(f, "next", POINTER)
+
+        def take():
+            return f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
+
+        member = f.variable(take(), INT)
+        with f.while_(lambda: member.value < members):
+            numbers, to = self.member_address(f, "numbers", member.value), self.result_address(f, "scales", member.value, size)
+            f.call("find_scales", numbers, work, to)
+            member.value = take()
+        f.line(f"call void @free(ptr {block.name})")
+        functions = [*loops.functions, f]
+        declared = sorted(set().union(*(x.declared for x in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
+        return "\n".join([*declared, *loops.globals, *(x.text() for x in functions)])

@@ -22,7 +22,7 @@ from udkjax.native.base.ir import DOUBLE, Function
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
 from udkjax.native.base.samples import write_next_breakpoint
-from udkjax.native.base.steps import RUNNING
+from udkjax.native.base.steps import Status
 from udkjax.native.run.breakpoints import aim
 from udkjax.native.run.controller import write_decide
 from udkjax.native.run.dense_equations import DenseEquations
@@ -102,7 +102,7 @@ class Trajectory(Module):
         f.call("decide", work)
         self.after_step(f, s)
         f.call("outputs", work, call)
-        ended = (s.active > 0.5) & s.code.is_not(float(RUNNING))
+        ended = (s.active > 0.5) & s.code.is_not(float(Status.RUNNING))
         with f.if_(f.any_of(ended)):
             s.due = f.select(ended, yes, 0.0)
             f.call("finish_members", work, call)

@@ -5,14 +5,10 @@ from itertools import pairwise
 from udkjax.native.base.ir import DOUBLE, Function, Value, Variable
 from udkjax.native.base.layout import Lane
 from udkjax.native.watching.conditions import (
-    FAR,
-    FINER,
-    FINEST,
     MIDDLE,
-    MISS,
     MOST_JUMPS,
     MOST_STUCK,
-    RESOLVED,
+    RESOLUTION,
     SECOND,
     SHORT_PAIR,
     SHORTEST_SPAN,
@@ -59,7 +55,7 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved:
     span = s.look - s.first_t
     length, jumps = span * s.omega, f.variable(0.0)
     may_jump = (length <= SHORT_PAIR) & (s.jumps < float(MOST_JUMPS)) & (s.stuck < float(MOST_STUCK))
-    is_finest = (length <= FINEST) | (span <= s.smallest * SHORTEST_SPAN)
+    is_finest = (length <= RESOLUTION.finest) | (span <= s.smallest * SHORTEST_SPAN)
     s.stops, s.seeks = zero, zero
     s.low, s.high = s.first_t, s.middle_t
     for k, states in enumerate((("middle q", "middle v"), ("state q", "result v"))):
@@ -93,8 +89,8 @@ def _refine(module: WatchMemory, f: Function, s: Lane, mask: Value, span: Value,
         if k == 1:
             module.move_conditions(f, mask, g1="g0", rate1="rate0")
             s.where(mask, first_t=s.middle_t)
-        span = span * (1 / FINER)
-        s.where(mask, share=s.share * (1 / FINER), which=float(SECOND), stuck=s.stuck + 1.0)
+        span = span * (1 / RESOLUTION.finer)
+        s.where(mask, share=s.share * (1 / RESOLUTION.finer), which=float(SECOND), stuck=s.stuck + 1.0)
         s.where(mask, node=f.fma(span, MIDDLE, s.first_t), behind_middle=s.first_t + span)
 
 
@@ -109,7 +105,7 @@ def _error(f: Function, g: list[Value], rate: list[Value], length: Value, x: Val
     square, cube = (b - a) * 3.0 - da * 2.0 - db, (a - b) * 2.0 + da + db
     value = a + x * (da + x * (square + x * cube))
     slope = da + x * (square * 2.0 + x * cube * 3.0)
-    of_value, of_rate = f.abs(g[1] - value), f.abs(rate[1] * length - slope) * MISS
+    of_value, of_rate = f.abs(g[1] - value), f.abs(rate[1] * length - slope) * RESOLUTION.miss
     return f.select(of_value > of_rate, of_value, of_rate)
 
 
@@ -130,8 +126,8 @@ def _classify_interval(
     second, fourth, middle, e = (a + one * 3.0) * 0.25, (two * 3.0 + b) * 0.25, (one + two) * 0.5, error * (8 / 3)
     low, high = f.min(f.min(a, b), f.min(second, fourth)), f.max(f.max(a, b), f.max(second, fourth))
     low, high = f.min(low, middle - e), f.max(high, middle + e)
-    resolved = error <= (high - low) * RESOLVED
-    away = (low >= -floor) & (resolved | (low >= error * FAR - floor))
+    resolved = error <= (high - low) * RESOLUTION.resolved
+    away = (low >= -floor) & (resolved | (low >= error * RESOLUTION.far - floor))
 
     def changes_once(x: Value) -> Value:
         signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]

@@ -2,22 +2,40 @@
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple
 
 from udkjax.expressions import ScalarProgram
 
-PER_TIME = 16  # intervals in the shortest time in which anything changes
-# Of what a condition changes in an interval: if the cubic's error may be more, the interval is too coarse. So an oscillation has
-# 7 intervals in a period at least, and no two of its zeros lie in one; smaller numbers take more windows for the same events.
-RESOLVED = 0.05
-# Of the error over two intervals: the error that counts for one. Of a cubic it is 1/16, by the fourth power of the length, where
-# the interval is fine; four times that is on the safe side where it is not yet. Where rates are differences, it counts whole.
-MISS = 1 / 4
-# Errors: where the interval is too coarse, a condition that is farther from zero has none in it all the same: a change large
-# enough to get there would be resolved.
-FAR = 1 / RESOLVED
-FINER = 8  # times as fine as an interval that is too coarse is the next one
-SHORT = 1e-6  # T: within a window of that length a condition has a jump or a kink, or varies all along
-SHORT_PAIR = SHORT / 16  # T: two of the 32 intervals of a window of that length
+
+class Resolution(NamedTuple):
+    """How finely conditions are looked at; T is the shortest time in which anything changes.
+
+    Attributes:
+        per_time: intervals in T.
+        resolved: fraction of the change of a condition in an interval that the cubic's error may be; beyond it the interval is
+            too coarse. An oscillation then has at least 7 intervals in a period, and no two of its zeros lie in one; a smaller
+            fraction takes more windows for the same events.
+        miss: fraction of the error over two intervals that counts for one. Of a cubic it is 1/16, by the fourth power of the
+            length, where the interval is fine; four times that is on the safe side where it is not yet. Where rates are
+            differences, the whole error counts.
+        far: multiple of the error; farther from zero a condition has no zero in an interval that is too coarse: a change large
+            enough to get there would be resolved.
+        finer: ratio of an interval that is too coarse to the next one.
+        short: T; within a window of that length a condition has a jump or a kink, or varies all along.
+        finest: T; changes within a window of that length are not resolved any more.
+    """
+
+    per_time: int = 16
+    resolved: float = 0.05
+    miss: float = 1 / 4
+    far: float = 1 / 0.05
+    finer: int = 8
+    short: float = 1e-6
+    finest: float = 1e-9
+
+
+RESOLUTION = Resolution()
+SHORT_PAIR = RESOLUTION.short / 16  # T: two of the 32 intervals of a window of that length
 FINEST = 1e-9  # T: changes within a window of that length are not resolved any more
 MOST_JUMPS = 3  # of conditions, before intervals are as long again as they were: of more, some are oscillations
 # Two intervals meet at this share of them, and are shorter than they may be by up to another, which turns by the golden ratio, so
@@ -32,7 +50,6 @@ WANTED, UNDER_WAY = 1, 2  # the states of a landing: from the point before the c
 SHORTEST_SPAN = 100  # times the smallest step: shorter ones are not distinguished
 VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is not resolved, or not a number
 FORCE_STEP = 1e-7  # T: over which the rate of a contact force is its difference
-HEAD = 3  # numbers about the end of a run before its sides: the event, or -1; the time; the largest violation at a node
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,9 @@ class Conditions:
     by_velocity: tuple[bool, ...] = field(compare=False)
     rows: tuple[int, ...] = ()
 
+    # Numbers about the end of a run before its sides: the event, or -1; the time; the largest violation at a node.
+    head: ClassVar[int] = 3
+
     @property
     def own_count(self) -> int:
         """The number of conditions that are programs."""
@@ -67,4 +87,4 @@ class Conditions:
 
     def output_count(self, n: int) -> int:
         """Return the count of numbers that a run of n coordinates returns about its end."""
-        return HEAD + self.count + 2 * n
+        return self.head + self.count + 2 * n

@@ -1,7 +1,7 @@
 """Crossings of zero of conditions that a run watches: located on the polynomial of outputs, and by a step that ends there."""
 
 from udkjax.native.base.ir import DOUBLE, Value
-from udkjax.native.base.steps import POINTS, RUNNING, UNIT
+from udkjax.native.base.steps import POINTS, UNIT, Status
 from udkjax.native.watching.conditions import LAST_CHANGE, LEAST_STEP, MOST_LANDINGS, UNDER_WAY, WANTED
 from udkjax.native.watching.watch_memory import WatchMemory
 
@@ -59,7 +59,7 @@ def write_approach(module: WatchMemory):
 def write_land(module: WatchMemory):
     """`land(work)`: what becomes of lanes whose step has ended at its target."""
     f, s = module.function("land")
-    arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(RUNNING))
+    arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(Status.RUNNING))
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
     setattr(s, "state t", s.point3_t)
     for source, to in (("point3 q", "state q"), ("point3 v", "result v"), ("point3 a", "node a")):

@@ -2,9 +2,9 @@
 
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.steps import CROSSED, UNIT, UNRESOLVED
+from udkjax.native.base.steps import UNIT, Status
 from udkjax.native.run.trajectory import Trajectory
-from udkjax.native.watching.conditions import HEAD, MIDDLE, PER_TIME, SECOND, TURN, VARIES, Conditions
+from udkjax.native.watching.conditions import MIDDLE, RESOLUTION, SECOND, TURN, VARIES, Conditions
 
 LANE_NUMBERS = {
     "node": "the next node (s); infinite where there is none",
@@ -81,9 +81,9 @@ class WatchMemory(Trajectory):
             to = self.result_address(f, "crossing", member, self.conditions.output_count(self.n))
             for j, x in enumerate((s.event, s.sure_t, s.worst)):
                 f.store(f.lane(x, k), to, j)
-            self.copy_lane(f, to, HEAD, "condition side", k, count=self.conditions.count)
+            self.copy_lane(f, to, Conditions.head, "condition side", k, count=self.conditions.count)
             for j, x in enumerate("qv"):
-                self.copy_lane(f, to, HEAD + self.conditions.count + j * self.n, f"sure {x}", k)
+                self.copy_lane(f, to, Conditions.head + self.conditions.count + j * self.n, f"sure {x}", k)
 
     # --- arrays of conditions, and states
 
@@ -107,7 +107,7 @@ class WatchMemory(Trajectory):
     def stop(self, f: Function, s: Lane):
         """End the runs of lanes that stop."""
         stops = s.stops > 0.5
-        s.where(stops, code=f.select(s.event >= 0.0, f.const(float(CROSSED), DOUBLE, f.width), float(UNRESOLVED)))
+        s.where(stops, code=f.select(s.event >= 0.0, f.const(float(Status.CROSSED), DOUBLE, f.width), float(Status.UNRESOLVED)))
         s.where(stops, until=f.min(s.until, s.sure_t), stops=0.0, landing=0.0)
 
     def begin_intervals(self, f: Function, s: Lane, mask: Value):
@@ -117,7 +117,7 @@ class WatchMemory(Trajectory):
         start, rest = s.look, s.end - s.look
         turn = s.turn + TURN
         turn = turn - f.intrinsic("floor", turn)
-        span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / PER_TIME) * s.share / f.max(fastest, s.slowest)
+        span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / RESOLUTION.per_time) * s.share / f.max(fastest, s.slowest)
         # No farther than the next step: whoever looks closer at them later needs the points that the first node lies between.
         span = f.min(span, s.h)
         span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))

@@ -12,7 +12,7 @@ still vary then have a jump or a kink. Where there is one after another, or no n
 from udkjax.native.base.ir import DOUBLE, INT, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.program import write
-from udkjax.native.base.steps import DONE, POINTS, RUNNING
+from udkjax.native.base.steps import POINTS, Status
 from udkjax.native.run.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import FIRST, FORCE_STEP, SECOND, THIRD, WANTED
@@ -121,7 +121,7 @@ class Watching(WatchMemory):
         s.where(s.landing > 0.5, until=-float("inf"))
 
         def due() -> Value:
-            goes_on = s.code.is_(float(RUNNING)) | s.code.is_(float(DONE))
+            goes_on = s.code.is_(float(Status.RUNNING)) | s.code.is_(float(Status.DONE))
             s.due = f.select((s.active > 0.5) & goes_on & (s.node <= s.until), one, 0.0)
             return f.any_of(s.due > 0.5)
 
@@ -146,4 +146,4 @@ class Watching(WatchMemory):
                 self.stop(f, s)
                 # Outputs before the crossing lie on the polynomial that is still known.
                 wanted = s.landing.is_(float(WANTED))
-                s.where(wanted, until=f.min(s.until, s.sure_t), code=float(RUNNING), node=float("inf"))
+                s.where(wanted, until=f.min(s.until, s.sure_t), code=float(Status.RUNNING), node=float("inf"))
