@@ -5,7 +5,7 @@ M^(-1/2) D^+ w, w random, which is orthogonal in the mass metric to what the mec
 the nearest one that is closed, is the same. A run is held against the exact motion from there. Of Psi'' = 0 alone remains
 
     chosen rows:            Psi = Psi_0 + t Psi_dot_0: an opening stays, a wrong rate opens the loops like t. (The row left out
-                            follows from the others by what depends on the position, and is wrong by a few times as much);
+                            follows from the others with factors that depend on the position; its error is a few times as large);
     truncated pseudoinverse: the drift of redundant constraints, a bead on a rotating wire, which grows by 1.77 /s, until
                             the twelfth singular value that it makes counts as one: then the run is lost;
     Baumgarte, alpha = beta: Psi = (Psi_0 + (Psi_dot_0 + alpha Psi_0) t) e^(-alpha t): closed after a few 1/alpha. But on the way

@@ -14,7 +14,7 @@ An Adams method changes its order and its steps irregularly, so that gains and l
 energy may wander for long before it drifts.
 
 Projection returns states to the constraint manifold, on which E is free: it does not conserve it. But without it the loops
-open, and the reactions do work on that, dE/dt = -lambda^T Psi_dot, which is more than what the steps themselves do wrong. What
+open, and the reactions do work on that, dE/dt = -lambda^T Psi_dot, which exceeds the errors of the steps themselves. What
 the energy of a short run shows may be something else again: results at output times come from the polynomial between the steps.
 With Dopri8, whose steps are long and of order 8, and whose polynomial is of order 5, and with Verner65, whose polynomial is of
 order 4, they are worse than the ends of the steps.
@@ -171,7 +171,7 @@ def reference_error() -> float:
 def budgets(solvers: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Take apart the energy of the linkage over 20 s at 1e-9: largest errors at step ends and at 401 outputs, sums of changes.
 
-    `by_steps` and `by_projections` are the sums of what the steps and what their projections change (Runge-Kutta only: a step
+    `by_steps` and `by_projections` are the sums of the changes by steps and by their projections (Runge-Kutta only: a step
     can be taken again without its history).
     """
     orbit, ts = orbits()["linkage"], np.linspace(0.0, BUDGET_END, 401)

@@ -1,4 +1,4 @@
-"""Whatever mechanism is drawn, the identities of mechanics hold, and whatever is typed, whoever errs is answered.
+"""The identities of mechanics hold for all random mechanisms, and every malformed input gets an answer.
 
 Claim: of random mechanisms, with loops, redundant copies, joints that others imply, all types of joints, drivers and forces, from
 a micrometre to a kilometre, the terms of the equations are those of an independent implementation (reference_equations.py), all
@@ -202,7 +202,7 @@ def page(data: xarray.Dataset) -> str:
         "",
         f"{sets['mechanisms']:,} mechanisms at states, by programs that NumPy runs, and {sets['large']} large ones by loops; "
         f"{sets['runs']} integrated by machine code, a part of them by diffrax and with derivatives; {sets['contacts']} thrown "
-        "onto a floor and other bodies. A case is drawn again by what stands beside its error: "
+        "onto a floor and other bodies. A case is drawn again by the call next to its error: "
         "`random_scene(seed, structure, numbers)` of experiments/parts/random_scenes.py. Margin: tolerance over worst error; `!` "
         "where it is under 50, `?` where it is over 10,000. Errors are relative, in the scene's own units; where the condition "
         f"number of the rows exceeds {state_properties.ORDINARY:g}, they are over what it makes of rounding.",

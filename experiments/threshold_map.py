@@ -1,6 +1,6 @@
 """Not stabilized, every pseudoinverse loses the redundant linkage; the rank threshold only decides when.
 
-Redundancy lets drift rho grow at 1.77 /s from rest at -45 degrees (wire_law.py), from what rounding and integration leave. Off
+Redundancy lets drift rho grow at 1.77 /s from rest at -45 degrees (wire_law.py), from the errors of rounding and integration. Off
 the manifold the twelfth singular value of D is no longer zero but about 0.57 rho. As long as that is below the rank threshold
 the rank is held at 11 and the drift grows, until it is as large as the mechanism itself: 1.77 /s from rounding take some 18 s,
 whatever the tolerance. As soon as it is above, all 12 rows are enforced; their twelfth direction is a direction of rounding,
@@ -161,7 +161,7 @@ def figure(data: xarray.Dataset) -> Figure:
         worst = data.error.sel(variant=name).max("threshold")
         last.loglog(data.tol, worst, "os"[number] + "-", color=COLOURS[number], mfc="none", lw=1, label=name)
     last.loglog(data.tol, data.tol, color="black", ls=":", lw=0.8, label="TOL")
-    last.set(title="What is not lost", xlabel="TOL", ylabel="error at 20 s (m, rad)")
+    last.set(title="Runs that are not lost", xlabel="TOL", ylabel="error at 20 s (m, rad)")
     last.legend(fontsize="small", frameon=False)
     figure.suptitle("Not stabilized, from rest at -45 degrees: when the run is lost; framed: threshold = TOL; –: not in 30 s")
     return figure

@@ -51,7 +51,7 @@ from experiments.parts.tuning import (
 from udkjax.show.style import COLOURS
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
-# alpha = beta, 1/s: those of gains.py around what is tuned. The first takes fewer right-hand sides than what is tuned: without it
+# alpha = beta, 1/s: those of gains.py around the tuned ones. The first takes fewer right-hand sides than these: without it
 # nothing in the grid would be as cheap, and nothing compared.
 GRID = (1.0, 1.5, 2.0, 2.5, 3.0, 5.0, 7.0, 10.0, 20.0)
 MORE = 1.02  # times the right-hand sides: not more, but for a step or two

@@ -15,6 +15,13 @@ import udkjax
 
 ROOT = Path(udkjax.__file__).parents[1]
 CLEAN = [  # folders with all below them, or files
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "README.md",
+    "benchmarks",
+    "docs",
+    "examples",
+    "experiments",
     "tests/expressions",
     "tests/pinv",
     "tests/programs",

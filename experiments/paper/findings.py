@@ -154,7 +154,7 @@ def nfunc_note(data) -> str:
     return (
         f"Where both runs are right to the end the paper’s NFUNC is {_span(ratios, '.0f')} times ours, a second of motion. "
         "We infer that a cumulative counter was added up over the output points (one every 0.01 s would give a factor of 1000), "
-        "and NSTEPS likewise."
+        "and so was NSTEPS."
     )
 
 

@@ -16,12 +16,12 @@ RULES = {
     "SVD": "D = U S V<sup>T</sup>; singular values at or below TOL count as zero",
     "Varga": "two QR factorizations by Householder reflections, the first with column pivoting; the rank is read from the "
     "diagonal of R: entries at or below TOL count as zero",
-    "Greville": "row by row; a row counts as dependent when the norm of what is left of it, orthogonal to the rows before, is at "
+    "Greville": "row by row; a row counts as dependent when the norm of its part orthogonal to the rows before is at "
     "or below TOL",
     "Householder": "least squares by QR with column pivoting, freed of its part in the null space; entries of the diagonal of R "
     "at or below TOL count as zero",
     "GramSchmidt": "modified Gram-Schmidt with column pivoting, each column made orthogonal twice, for D and again for R; the "
-    "rank is decided by the norm of what is left of a column: at or below TOL it counts as zero",
+    "rank is decided by the norm of the rest of a column: at or below TOL it counts as zero",
 }
 GROUPS = {
     "other integrators": "The paper’s runs by other integrators: no stabilization, threshold TOL",
