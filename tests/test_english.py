@@ -32,6 +32,8 @@ CLEAN = [  # folders with all below them, or files
     "udkjax/expressions",
     "udkjax/extras.py",
     "udkjax/lazy_names.py",
+    "udkjax/integrate/causes",
+    "udkjax/integrate/solvers",
     "udkjax/pinv",
     "udkjax/positions",
     "udkjax/printing.py",
@@ -39,6 +41,7 @@ CLEAN = [  # folders with all below them, or files
     "udkjax/progress.py",
     "udkjax/scene",
     "udkjax/statics",
+    "udkjax/synthesis",
     "udkjax/transforms",
 ]
 

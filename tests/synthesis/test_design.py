@@ -265,7 +265,7 @@ def test_places_that_are_one_do_not_shrink_the_mechanism_to_a_point():
 
 def test_mistakes_are_named():
     goal = udk.PathGoal("P", [[0, 0], [1, 1]])
-    with pytest.raises(udk.SceneError, match=r'"link\.crank\.mass" cannot change what the goal measures'):
+    with pytest.raises(udk.SceneError, match=r'no measure of the goal depends on "link\.crank\.mass"'):
         udk.design(FOUR_BAR, goal, free=["pin.A", "link.crank.mass"])
     with pytest.raises(udk.SceneError, match=r'no number named "pin\.Q"'):
         udk.design(FOUR_BAR, goal, free=["pin.Q"])
@@ -277,7 +277,7 @@ def test_mistakes_are_named():
         udk.design(FOUR_BAR, udk.PathGoal("Q", [[0, 0], [1, 1]]))
     with pytest.raises(ValueError, match="targets must have the shape"):
         udk.PathGoal("P", [0, 1, 2])
-    with pytest.raises(ValueError, match="as many as targets"):
+    with pytest.raises(ValueError, match="one value for each target"):
         udk.PathGoal("P", [[0, 0], [1, 1]], [0.0])
     with pytest.raises(ValueError, match="start must be"):
         udk.PathGoal("P", [[0, 0]], [0.0], start="fre")

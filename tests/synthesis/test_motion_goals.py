@@ -109,7 +109,7 @@ def test_mistakes_are_named():
         udk.DesignSearch(FOUR_BAR, [PATH, udk.LoadGoal("Q", most=1.0)])
     with pytest.raises(udk.SceneError, match="tolerance and is not free"):
         udk.DesignSearch(FOUR_BAR, [PATH, udk.ToleranceGoal("P", {"pin.A": 0.1}, most=1.0)], ["pin.B"])
-    with pytest.raises(udk.SceneError, match="over a whole turn, or over values"):
+    with pytest.raises(udk.SceneError, match="over a whole turn or over values"):
         udk.DesignSearch(FOUR_BAR, [PATH, udk.TorqueGoal(most=1.0)], rotation=False)
     with pytest.raises(ValueError, match="give most, least, or both"):
         udk.TorqueGoal()

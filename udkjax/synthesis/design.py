@@ -1,4 +1,4 @@
-"""Design by gradient: mechanisms of which a point, a link or an output moves as wanted."""
+"""Design by gradient: mechanisms with a point, link or output that moves as required."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,18 +18,18 @@ from udkjax.synthesis.goals import Goal
 from udkjax.synthesis.limits import LengthLimits, Range, box_of, read_bounds
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.polish import polish
-from udkjax.synthesis.search import SearchState, begin, improve, raise_walls
-from udkjax.synthesis.selection import POLISHING, select
+from udkjax.synthesis.search import SearchState, begin, improve, raise_weights
+from udkjax.synthesis.selection import POLISH_STEPS, select
 from udkjax.synthesis.starts import find_starts
 
-SAMPLES = 8  # random mechanisms for each start: the best of them are taken
-# Steps of a search, and the share of the trials that goes on afterwards: most have shown by then where they lead.
+SAMPLES = 8  # random mechanisms per start, of which the best is taken
+# Steps of each stage, and the fraction of trials that continue afterwards: the rest are hopeless by then.
 STAGES = ((15, 0.4), (30, 0.4), (100, 0.3))
-FEWEST = 16  # trials that go on, at least; as many are polished in the end
+FEWEST = 16  # trials that continue, at least; also the number of polished ones
 
 
 class DesignSearch:
-    """A design that is compiled once and searched as often as wanted, such as from several seeds.
+    """A design search that is compiled once and run repeatedly, for example from several seeds.
 
     Args:
         drawing: see `design`.
@@ -62,7 +62,7 @@ class DesignSearch:
         mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
         require_number("transmission", transmission, "not negative")
         if transmission >= np.pi / 2:
-            raise ValueError(f"transmission must be an angle below a right one (rad), not {transmission:g}")
+            raise ValueError(f"transmission must be an angle below pi / 2 (rad), not {transmission:g}")
         numbers = FreeNumbers(mechanism, _all_pins(mechanism) if free is None else free)
         driver = only_driver(mechanism) if driver is None else driver
         goal, terms = _split(goal)
@@ -77,13 +77,13 @@ class DesignSearch:
         )
 
     def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
-        """Search from so many random mechanisms; return the best that differ.
+        """Search from random mechanisms; return the best different ones.
 
         Args:
             starts: number of mechanisms to start from.
-            seed: of the random mechanisms; the same seed gives the same result.
-            results: most designs to return.
-            threads: number of threads; by default that of the cores.
+            seed: seed of the random mechanisms; the same seed gives the same result.
+            results: largest number of designs to return.
+            threads: number of threads; by default the number of cores.
         """
         for name, value in (("starts", starts), ("results", results)):
             require_count(name, value)
@@ -100,16 +100,16 @@ class DesignSearch:
 
 
 def search(problem: DesignProblem, state: SearchState, threads: int | None) -> SearchState:
-    """Go on with the best trials, stage by stage."""
+    """Improve the best trials, stage by stage."""
     shares = [share for _, share in STAGES]
     for share, (steps, _) in zip(shares, STAGES[1:], strict=False):
         count = max(FEWEST, int(share * len(state.merit)))
-        merit = np.where(state.found.is_there, state.merit, np.inf)
+        merit = np.where(state.found.exists, state.merit, np.inf)
         state = state.take(np.argsort(merit, kind="stable")[:count])
-        raise_walls(problem, state)
+        raise_weights(problem, state)
         state = improve(problem, state, steps, threads)
-    merit = np.where(state.found.is_there, state.merit, np.inf)
-    return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST]), POLISHING, threads)
+    merit = np.where(state.found.exists, state.merit, np.inf)
+    return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST]), POLISH_STEPS, threads)
 
 
 @checked
@@ -127,36 +127,35 @@ def design(
     seed: int = 0,
     results: int = 5,
 ) -> Designs:
-    """Find mechanisms of the structure of a drawing that meet a goal, by least squares from many starts at once.
+    """Find mechanisms with the structure of a drawing that meet a goal, by least squares from many starts.
 
-    Random mechanisms within the bounds are turned once; the best of them, moved and scaled to the goal as a whole where that is
-    free, are improved by Levenberg and Marquardt's method, all side by side in machine code, with exact derivatives by all free
-    numbers. Branches are kept, positions come in their order, limits hold. Every design has been moved by `kinematics`.
+    Random mechanisms within the bounds are turned once. The best of them, moved and scaled to the goal as a whole if their pins
+    are free, are improved by the Levenberg-Marquardt method, all in lanes of machine code, with exact derivatives by all free
+    numbers. Designs stay on one branch, pass positions in order, respect the limits, and are verified by `kinematics`.
 
     Args:
-        drawing: the structure: a drawing, or a mechanism with one degree of freedom once its drivers hold. Its pins say nothing
-            but how links are joined, where they are free.
-        goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`; or a list of it and of goals about the motion: `TorqueGoal`, `LoadGoal`,
+        drawing: the structure: a drawing, or a mechanism with one degree of freedom once its drivers hold. Free pins only tell
+            which links they join.
+        goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`; or a list of one of these and motion goals: `TorqueGoal`, `LoadGoal`,
             `EnergyGoal`, `FrequencyGoal`, `ToleranceGoal` and `MotionGoal`.
-        free: names of the numbers that are free, such as `pin.A` or `pin.C[0]`; by default all pins.
-        bounds: (low, high) by the names of free numbers; each end one number, or of the number's shape (m).
-        lengths: (least, most) distances (m) by two pins.
-        areas: area that a pin stays in, by its name: a circle (x, y, radius) or the corners (k, 2) of a convex
-            polygon (m).
-        transmission: the least angle (rad) between the transmission and none: of a four-bar, by how much the transmission angle
-            stays away from 0 and pi; over the whole turn if there is one.
-        rotation: whether the driver has to make a whole turn; by default where it is an angle.
+        free: names of the free numbers, such as `pin.A` or `pin.C[0]`; by default all pins.
+        bounds: (low, high) by the names of free numbers; each end a number, or an array of the number's shape (m).
+        lengths: (least, most) distances (m) by pairs of pins.
+        areas: the area of a pin by its name: a circle (x, y, radius) or the corners (k, 2) of a convex polygon (m).
+        transmission: the least distance (rad) of the transmission angle of a four-bar from 0 and pi, over the whole turn if there
+            is one; for other linkages its equivalent.
+        rotation: whether the driver has to make a whole turn; by default True if it is an angle.
         driver: a driver or coordinate, as for `kinematics`; by default the only driver.
         starts: number of mechanisms to start from.
-        seed: of these; the same seed gives the same result.
-        results: most designs to return.
+        seed: seed of these; the same seed gives the same result.
+        results: largest number of designs to return.
 
     Returns:
-        `Designs`, the best first; none where nothing was found within the limits.
+        `Designs`, the best first; empty if nothing was found within the limits.
 
     Raises:
-        SceneError: names, bounds or lengths are wrong, positions do not follow from the driver, or machine code has no
-            instruction for something in the mechanism.
+        SceneError: names, bounds or lengths are wrong, positions do not follow from the driver, or machine code cannot evaluate
+            an element of the mechanism.
         ValueError: another argument cannot be used.
     """
     found = DesignSearch(drawing, goal, free, bounds, lengths, areas, transmission, rotation, driver)
@@ -164,7 +163,7 @@ def design(
 
 
 def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[MotionTerm]]:
-    """Return the one goal that says where the motion goes, and those that measure the motion."""
+    """Return the positional goal and the motion goals."""
     found = [goals] if isinstance(goals, Goal) else list(goals)
     firsts, terms = [g for g in found if isinstance(g, Goal)], [g for g in found if isinstance(g, MotionTerm)]
     if len(firsts) != 1 or len(terms) != len(found) - 1:
@@ -174,12 +173,12 @@ def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[Motion
 
 def _all_pins(mechanism: Mechanism) -> list[str]:
     if mechanism.drawing is None:
-        raise SceneError(["free: name the numbers that are free; only of a drawing all pins are by default"], mechanism.name)
+        raise SceneError(["free: name the free numbers; only a drawing has a default, all pins"], mechanism.name)
     return [f"pin.{name}" for name in mechanism.drawing.groups["pin"]]
 
 
 def only_driver(mechanism: Mechanism) -> str:
-    """Return the name of the only driver; raise `SceneError` where there is none, or more."""
+    """Return the name of the only driver; raise `SceneError` unless there is exactly one."""
     names = mechanism.driver_names
     if len(names) != 1:
         choices = f"there are {', '.join(names)}" if names else "there is none in the scene"
@@ -188,7 +187,7 @@ def only_driver(mechanism: Mechanism) -> str:
 
 
 def _places(mechanism: Mechanism, goal: Goal) -> np.ndarray:
-    """Return the places that say where, and of what size, the mechanism may be."""
+    """Return the places that determine the location and size of the search."""
     if goal.has_place:
         fixed = [] if mechanism.drawing is None else [np.asarray(p.position) for p in mechanism.drawing.groups["pin"].values()]  # pyright: ignore
         size = np.ptp(goal.targets[:, :2], axis=0).max()

@@ -23,17 +23,17 @@ from udkjax.synthesis.motion_terms import CompiledTerm
 from udkjax.synthesis.trials import TrialResiduals, Trials, Turn
 from udkjax.wording import quote
 
-TURN_VALUES = 72  # of a turn from which searches start
-FINE_VALUES = 720  # of a turn that is to be made, in the end
-MARGIN_WEIGHT = 10.0  # of limits of transmission beside those of lengths: beyond them there is no mechanism
-CHECK_VALUES = 24  # of a turn at which transmission is looked at in a search; between them the worst is interpolated
+TURN_VALUES = 72  # per turn, to start searches
+FINE_VALUES = 720  # per turn, to verify a required turn
+MARGIN_WEIGHT = 10.0  # weight of limits of transmission relative to lengths: beyond them there is no mechanism
+CHECK_VALUES = 24  # per turn, for the transmission during a search; its minimum between them is interpolated
 
 
 class DesignProblem:
-    """A goal for a mechanism: what is unknown, and programs that evaluate trials.
+    """A goal for a mechanism: its unknowns, and programs that evaluate trials.
 
-    The unknowns x are the free numbers; the value from which values of the driver count, where that is free; and further ones of
-    the goal. Limits are those of lengths, of the transmission at all positions, and over the whole turn where there is one.
+    The unknowns x are the free numbers; the start of the driver's values, if it is free; and further ones of the goal. Limits are
+    on lengths and on the transmission, at all positions or over the whole turn if there is one.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class DesignProblem:
         self.driven, self.least = drive(mechanism, driver), max(transmission, LEAST_TRANSMISSION)
         self.rotation = self.driven.is_angle if rotation is None else rotation
         if self.rotation and not self.driven.is_angle:
-            raise SceneError(["rotation: the driver is no angle, and makes no turn"], mechanism.name)
+            raise SceneError(["rotation: the driver is not an angle and cannot turn; leave rotation out"], mechanism.name)
         self.shifted = goal.start == "free" and goal.values is not None
         self.unknowns = free.count + self.shifted + goal.extras
         self.coordinates = 3 * len(mechanism.body_names)
@@ -75,7 +75,7 @@ class DesignProblem:
         if terms and not self.rotation:
             if goal.values is None:
                 problem = (
-                    "goal: a motion is measured over a whole turn, or over values: give the first goal values, or say rotation"
+                    "goal: a motion is measured over a whole turn or over values: give the first goal values, or set rotation"
                 )
                 raise SceneError([problem], self.mechanism.name)
             span = float(goal.values[0]), float(goal.values[-1])
@@ -114,17 +114,17 @@ class DesignProblem:
         return self._made(slice(0, 0), True)
 
     def _require_effects(self):
-        """Raise `SceneError` where a free number cannot change what is measured, such as a mass."""
+        """Raise `SceneError` if a free number, such as a mass, does not affect any measure."""
         rows = [self._fit.measure.outputs[place.by_parameters] for place in self._fit.places[:-1]]
         rows += [term.entries for term in self.terms]
         idle = [name for k, name in enumerate(self.free.entries()) if all(row[k].is_zero for row in rows)]
         if idle:
             listed = ", ".join(map(quote, idle))
-            raise SceneError([f"free: {listed} cannot change what the goal measures: leave it out"], self.mechanism.name)
+            raise SceneError([f"free: no measure of the goal depends on {listed}: leave it out"], self.mechanism.name)
 
     @cached_property
     def _points(self) -> ScalarProgram:
-        """The program of the measures, then of the places of all pins, or without a drawing of q and the unknowns."""
+        """The program of the measures and the places of all pins; without a drawing, of the measures, q and the free numbers."""
         names = [] if self.mechanism.drawing is None else list(self.mechanism.drawing.groups["pin"])  # pyright: ignore
 
         def points(x: Array, q: Array) -> Array:
@@ -145,18 +145,18 @@ class DesignProblem:
     # --- single mechanisms
 
     def drawn(self, mechanism: Mechanism) -> float:
-        """Return the value of the driver at which a mechanism is drawn."""
+        """Return the value of the driver in the drawn position."""
         return float(drive(mechanism, self.driver).value(mechanism.q0))
 
     @property
     def has_outlines(self) -> bool:
-        """True if a link has an outline in world coordinates, which does not follow its pins."""
+        """True if a link has an outline or centre in world coordinates, which does not follow its pins."""
         drawing = self.mechanism.drawing
         links = {} if drawing is None else drawing.groups["link"]
         return any(link.outline is not None or link.centre is not None for link in links.values())  # pyright: ignore
 
     def signature(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return numbers that are the same of trials that are one mechanism, however drawn: points of links at a position."""
+        """Return the points of links in a position: equal for trials that are the same mechanism, however drawn."""
         return self._at(x, q[None])[0, self._measured :]
 
     def residuals(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -173,7 +173,7 @@ class DesignProblem:
         return np.stack(self._points.by_numpy(given), 1)
 
     def turns(self, x: np.ndarray) -> bool:
-        """Return whether the driver of a trial makes a whole turn, in fine steps."""
+        """Return True if the driver of a trial makes a whole turn, in fine steps."""
         return self.driven.is_angle and bool(self.turn(x[None], FINE_VALUES).reached.all())
 
     def transmission_at(self, x: np.ndarray, s: np.ndarray, q: np.ndarray) -> float:
@@ -184,7 +184,7 @@ class DesignProblem:
     # --- values of the driver
 
     def value_drawn(self, x: np.ndarray) -> np.ndarray:
-        """Return the values (M,) at which trials are drawn."""
+        """Return the driver's values (M,) in the drawn positions of trials."""
         return np.asarray(self._fit.drawn_value.by_numpy(list(x.T))[0])
 
     def turn(self, x: np.ndarray, values: int = TURN_VALUES, threads: int | None = None) -> Turn:
@@ -195,12 +195,12 @@ class DesignProblem:
 
     @property
     def is_closed(self) -> bool:
-        """True if the last target is the first one again."""
+        """True if the last target equals the first."""
         return len(self.data) > 1 and bool(np.all(self.data[0] == self.data[-1]))
 
     @property
     def period(self) -> float:
-        """The range of values that a search looks at: a turn, or of a length its scale."""
+        """The range of values of a search: a turn, or the scale of a length."""
         return FULL_TURN if self.driven.is_angle else self.scale
 
     @property
@@ -209,7 +209,7 @@ class DesignProblem:
         return LONGEST_STEP * float(self.driven.unit)
 
     def march(self, x: np.ndarray, s: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Go from the drawn position to values (M, J) in order; return positions (M, J, n) and whether all were reached (M,)."""
+        """Return the positions (M, J, n) at values (M, J), in order from the drawn position, and whether all exist (M,)."""
         found = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
         return found.q, np.isfinite(found.end).all(1)
 
@@ -217,7 +217,7 @@ class DesignProblem:
 
     @property
     def can_move(self) -> str:
-        """Moves of the mechanism as a whole that may bring it to its targets: "anything", "no turn", or "nothing"."""
+        """Allowed motions of the whole mechanism to its targets: "anything", "no turn" or "nothing"."""
         drawing = self.mechanism.drawing
         names = [] if drawing is None else [f"pin.{name}" for name in drawing.groups["pin"]]  # pyright: ignore
         if not self.goal.has_place or not names or not set(names) <= {*self.free.names}:
@@ -226,7 +226,7 @@ class DesignProblem:
         return "no turn" if counted_from_world or not self.driven.is_angle else "anything"
 
     def moved(self, x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return trials whose pins p have become a p + b, in complex numbers; within the bounds."""
+        """Return trials with pins a p + b in place of p, as complex numbers, clipped to the bounds."""
         x = x.copy()
         if self.can_move != "nothing":
             for name, start in zip(self.free.names, self.free.starts, strict=False):
@@ -236,7 +236,7 @@ class DesignProblem:
         return np.clip(x, self.low, self.high)
 
     def turned_by(self, a: np.ndarray) -> np.ndarray:
-        """Return by how much values of the driver change where the mechanism is turned: angles in the world do."""
+        """Return the changes of the driver's values as the mechanism turns: those of angles relative to the ground."""
         of_ground = self.driven.is_angle and "ground" in self.driven.mechanism.drivers[self.driven.name].bodies
         return np.angle(a) if of_ground and not self.goal.line and self.can_move == "anything" else np.zeros(len(a))
 
@@ -251,10 +251,10 @@ class DesignProblem:
     ) -> TrialResiduals:
         """Evaluate residuals and limits of trials, each position closed from that of the trial.
 
-        `worth` tells by residuals and limits of lengths of which trials the turn is worth looking at; the others are not there.
+        `worth` selects trials by residuals and limits of lengths before their turns are computed; the others do not exist.
 
-        The rows of limits are those of lengths, and then of transmission tau, margin (M,) - tau^2: where branches meet it is the
-        square that changes evenly with the lengths.
+        The rows of limits are those of lengths, then margin (M,) - tau^2 with the transmission tau: at a meeting of branches its
+        square varies linearly with the lengths.
         """
         x, (members, J) = trials.x, trials.s.shape
         found = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
@@ -262,40 +262,40 @@ class DesignProblem:
         table = found.out.reshape(members, J, G + 1, 2 + self.unknowns)
         r, by_value, by_unknowns = table[:, :, :G, 0], table[:, :, :G, 1], table[:, :, :G, 2:]
         limits, slopes = self.lengths(x)
-        is_there, tau = np.isfinite(found.end).all(1), table[:, :, G, 0]
+        exists, tau = np.isfinite(found.end).all(1), table[:, :, G, 0]
         if self.rotation:
-            which = is_there if worth is None else is_there & worth(r, limits)
+            which = exists if worth is None else exists & worth(r, limits)
             turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknowns))
             more[which], more_slopes[which], turns[which] = self._turn_limit(x[which], margin[which], threads)
             limits, slopes = np.concatenate([limits, more], 1), np.concatenate([slopes, more_slopes], 1)
-            is_there &= turns
+            exists &= turns
         else:
             unit = MARGIN_WEIGHT * self.scale
             limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
-            by_x = table[:, :, G, 2:]  # values that are unknowns are held: moving them is another residual's matter
+            by_x = table[:, :, G, 2:]  # unknown values are held: other residuals determine them
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
-        terms, by_terms = self._terms_of(x, is_there, threads)
-        return TrialResiduals(found.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, is_there)
+        terms, by_terms = self._terms_of(x, exists, threads)
+        return TrialResiduals(found.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, exists)
 
-    def _terms_of(self, x: np.ndarray, is_there: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals of motion goals and their derivatives; trials without a motion are no longer there."""
+    def _terms_of(self, x: np.ndarray, exists: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals of motion goals and their derivatives; trials without a motion no longer exist."""
         count = sum(term.goal.samples for term in self.terms)
         r, by_unknowns, place = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
         for term in self.terms:
-            which, columns = np.flatnonzero(is_there), slice(place, place + term.goal.samples)
-            r[which, columns], by_unknowns[which, columns], is_there[which] = term(x[which], threads)
+            which, columns = np.flatnonzero(exists), slice(place, place + term.goal.samples)
+            r[which, columns], by_unknowns[which, columns], exists[which] = term(x[which], threads)
             place = columns.stop
         return r, by_unknowns
 
     def residuals_at(self, trials: Trials, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return residuals (M, J, G) alone, rows of lengths, and whether all positions exist (M,)."""
+        """Return residuals (M, J, G), rows of lengths, and whether all positions exist (M,), without derivatives."""
         found = self._residual_code(trials.x, trials.s, self._unit, self.data, trials.q, threads=threads)
         return found.out[..., :-1], self.lengths(trials.x)[0], np.isfinite(found.end).all(1)
 
     def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return by how much the least transmission of a turn falls short, its derivative, and whether it turns.
+        """Return the limit row of the least transmission of a turn, its derivative, and whether the turn is complete.
 
-        Near its least value tau^2 is a parabola: through three values of the turn, and then by its slope.
+        Near its minimum tau^2 is a parabola: through three values of the turn, then corrected by its slope.
         """
         turn = self.turn(x, CHECK_VALUES, threads)
         turns, all_of_them = turn.reached.all(1), np.arange(len(x))

@@ -15,22 +15,22 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.synthesis.design_problem import DesignProblem
 
-AGREEMENT = 1e-6  # relative difference, and of the squared scale, between the loss of a search and that of the motion
+AGREEMENT = 1e-6  # of the loss of a search with that of the motion, relative to the loss and to the squared scale
 
 
 class FoundDesign(PrintsTable):
-    """A mechanism that was found, drawn at the first position of the goal where its pins are free.
+    """A design that meets the goal, drawn at the first position of the goal if its pins are free.
 
     Attributes:
-        loss: the sum of the squares of the residuals (m^2; of a function rad^2 or m^2), of its motion.
+        loss: the sum of the squares of the residuals of its motion (m^2; for a function rad^2 or m^2).
         mechanism: the mechanism, to be run, animated or saved.
-        values: of the driver at the positions of the goal (J,) (rad, m).
-        residuals: (J, G), of its motion, which `kinematics` follows over these values.
-        measures: of each goal about the motion, at its samples.
-        transmission: the least over the positions, from 0 to 1; of a four-bar the sine of the transmission angle.
+        values: values of the driver at the positions of the goal (J,) (rad, m).
+        residuals: residuals (J, G) of the motion that `kinematics` follows over these values.
+        measures: measures of each motion goal at its samples.
+        transmission: the least over the positions, from 0 to 1; for a four-bar the sine of the transmission angle.
         turns: whether the driver makes a whole turn.
-        parameters: the numbers that were free, by name.
-        driver: its driver.
+        parameters: the free numbers by name.
+        driver: the driver.
     """
 
     loss: float
@@ -44,23 +44,23 @@ class FoundDesign(PrintsTable):
     driver: Drive = eqx.field(static=True)
 
     def motion(self, count: int = 361) -> Kinematics:
-        """Return a motion of it, by `kinematics`: a whole turn from the first position, or from there to the last one.
+        """Return a motion by `kinematics`: a whole turn from the first position, or from the first to the last one.
 
         Args:
-            count: of values.
+            count: number of values.
         """
         last = self.values[0] + FULL_TURN if self.turns else self.values[-1]
         return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
 
     @property
     def pins(self) -> dict[str, Float[Array, "2"]]:
-        """The places of the pins of the drawing by name (m), none where there is no drawing."""
+        """The places of the drawing's pins by name (m); empty without a drawing."""
         drawn = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
         return {name: getattr(pin, "position") for name, pin in drawn.items()}  # noqa: B009  # of a drawing, whose class is above
 
     @property
     def drawing(self) -> AbstractDrawing | None:
-        """The drawing, where the design began with one."""
+        """The drawing, if the design started from one."""
         return self.mechanism.drawing
 
     def _table(self) -> PrintedTable:
@@ -76,9 +76,9 @@ class Designs(PrintsTable):
 
     Attributes:
         found: the designs.
-        losses: of all trials within the limits, sorted; the more often the best was found, the less is left to find.
-        starts: number of mechanisms that the search began from.
-        reason: why nothing was found, and the cure; empty where something was.
+        losses: losses of all trials within the limits, sorted; the more often the best occurs, the less likely is a better one.
+        starts: number of mechanisms that the search started from.
+        reason: why nothing was found, and the cure; empty if something was found.
     """
 
     found: tuple[FoundDesign, ...]
@@ -105,7 +105,7 @@ class Designs(PrintsTable):
 
 
 def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
-    """Return a trial as a design whose loss is that of its motion; None where its motion does not bear it out."""
+    """Return a trial as a design verified by its motion; None if the motion does not confirm the loss."""
     turns = problem.turns(x)
     if problem.rotation and not turns:
         return None
@@ -133,13 +133,13 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
 
 
 def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:
-    """Return positions (J, bodies, 3) of a motion from the drawn position over values; None where it does not get there."""
+    """Return positions (J, bodies, 3) of a motion from the drawn position over values; None if it does not reach them."""
     motion = kinematics(mechanism, driver, values)
     return np.asarray(motion.q) if np.all(motion.reached) else None
 
 
 def redrawn(problem: DesignProblem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:
-    """Return the mechanism drawn in a position, where all of its moving pins are free; else as it is."""
+    """Return the mechanism drawn in a position if all of its moving pins are free; otherwise unchanged."""
     drawing = mechanism.drawing
     if drawing is None:
         return mechanism

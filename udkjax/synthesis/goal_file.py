@@ -1,4 +1,4 @@
-"""A design in a file: the mechanism, what is wanted of it, and what must hold, in units of the file."""
+"""A design in a file: the mechanism, its goals and its limits, in units of the file."""
 
 import inspect
 import os
@@ -32,9 +32,9 @@ TOP = (
     "transmission",
     "rotation",
 )
-SEARCHED = ("free", "motion")  # settings that only a search respects
+SEARCHED = ("free", "motion")  # settings of a search only
 LENGTH = ("pins", "least", "most")
-# The keys of each kind of goal, and the SI units of those that have some; "value" is that of what drives.
+# The keys of each kind of goal, and their SI units; "value" is the unit of the driver.
 GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
     "path": (PathGoal, {"point": "", "targets": "m", "values": "value", "start": "", "line": "", "at": "m"}),
     "poses": (
@@ -46,7 +46,7 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
         {"output": "", "values": "value", "targets": "output", "start": "", "output_start": "", "line": ""},
     ),
 }
-# The kinds of goals about the motion, each with the unit of its measure, or that of what drives; and their further keys.
+# The kinds of motion goals, each with the unit of its measure; "effort" is that of the driver. Then their further keys.
 MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "torque": (TorqueGoal, "effort"),
     "load": (LoadGoal, "N"),
@@ -59,13 +59,13 @@ OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances")}
 
 
 def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
-    """Return the search that a file describes; with `complete = true` that of all solutions.
+    """Return the search that a file describes; with `complete = true` the search for all solutions.
 
     Args:
         path: the file; the mechanism's file is named relative to it.
 
     Raises:
-        SceneError: the file is wrong; the error lists what is.
+        SceneError: the file has mistakes; the error lists them all.
         OSError: a file cannot be read.
     """
     name = os.fspath(path)
@@ -95,7 +95,7 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     assert goal is not None and isinstance(transmission, float | int)
     if complete:
         if not isinstance(goal, PathGoal | PoseGoal):
-            raise SceneError(['goal.kind must be "path" or "poses" where complete = true'], name)
+            raise SceneError(['goal.kind must be "path" or "poses" with complete = true'], name)
         limits = {"bounds": bounds, "lengths": lengths, "areas": areas, "transmission": transmission}
         return CompleteSearch(mechanism, goal, table.get("driver"), {**limits, "rotation": table.get("rotation", False)})
     choices = {key: table[key] for key in ("free", "driver", "rotation") if key in table}
@@ -162,7 +162,7 @@ def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problem
 
 
 def _missing(where: str, make: Callable[..., Any], given: TomlTable) -> list[str]:
-    """Return the mistakes of keys that a goal needs and that are not given."""
+    """Return a mistake for each required key that is missing."""
     needed = [key for key, value in inspect.signature(make).parameters.items() if value.default is value.empty]
     return [f"{where}.{key}: missing" for key in needed if key not in given]
 

@@ -1,7 +1,7 @@
-"""Goals of a design: what is wanted of the motion, at some positions along it.
+"""Goals of a design: targets of the motion at some positions along it.
 
-A goal measures a position by a few numbers (`measure`, in JAX), and says by how much these differ from what is wanted there
-(`residual`). The loss of a design is the sum of the squares of all residuals.
+A goal measures a position by a few numbers (`measure`, in JAX), and compares these with the target (`residual`). The loss of a
+design is the sum of the squares of all residuals.
 """
 
 from abc import abstractmethod
@@ -32,7 +32,7 @@ def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
         found = found[:, None] if columns == 1 and found.ndim == 1 else found
         if found.ndim != 2 or found.shape[1] != columns or not len(found):
             shape = "(J,)" if columns == 1 else f"(J, {columns})"
-            raise ValueError(f"{name} must have the shape {shape}, one row for each position; it is {np.shape(value)}")
+            raise ValueError(f"{name} must have the shape {shape}, one row for each position, not {np.shape(value)}")
         return found
 
     return convert
@@ -44,16 +44,16 @@ def _values(value: Numbers | None) -> np.ndarray | None:
     require_finite("values", value)
     found = np.asarray(value, float)
     if found.ndim != 1:
-        raise ValueError(f"values must be those of the driver at each position, (J,); the shape is {found.shape}")
+        raise ValueError(f"values must be one value of the driver for each position, shape (J,), not {found.shape}")
     return found
 
 
 class Goal(PrintsTable):
-    """A wish about a motion; `targets` has a row for each position.
+    """A goal for a motion; `targets` has a row for each position.
 
-    Where `values` are given, each position has its value of the driver (rad, m); otherwise positions come in their order, at
-    values that are found. `start` "free": values count from one that is found; `line`: they count from the direction from one
-    pin to another, such as the ground link.
+    With `values`, each position has its value of the driver (rad, m); otherwise positions are passed in order, at values found by
+    the search. With `start` "free" the search finds the value that `values` count from; with `line` they count from the direction
+    from one pin to another, such as the ground link.
     """
 
     if TYPE_CHECKING:  # fields of each goal, in an order of its own
@@ -69,27 +69,29 @@ class Goal(PrintsTable):
 
     def __check_init__(self):
         if self.values is not None and len(self.values) != len(self.targets):
-            raise ValueError(f"values must be as many as targets: there are {len(self.values)} and {len(self.targets)}")
+            raise ValueError(
+                f"give one value for each target: there are {len(self.values)} values and {len(self.targets)} targets"
+            )
         if self.start not in ("given", "free"):
             raise ValueError(f'start must be "given" or "free", not {quote(str(self.start))}')
         if self.values is None and (self.start != "given" or self.line):
-            raise ValueError("start and line say what values count from: give values, too")
+            raise ValueError("start and line tell where values count from: give values, too")
         if self.line and len(self.line) != 2:
             raise ValueError("line must name two pins, from one to the other")
 
     @property
     def extras(self) -> int:
-        """The number of further unknowns, after the one that values count from."""
+        """The number of further unknowns, in addition to the start of values."""
         return 0
 
     @property
     def has_place(self) -> bool:
-        """True if the first two measures are a place, x and y, which follows the mechanism when that is moved and scaled."""
+        """True if the first two measures are a place, x and y, which moves and scales with the mechanism."""
         return False
 
     @abstractmethod
     def check(self, mechanism: Mechanism) -> None:
-        """Raise `SceneError` where the mechanism has not what is measured."""
+        """Raise `SceneError` if the mechanism lacks the measured element."""
 
     @abstractmethod
     def measure(self, mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> Float[Array, "G"]:
@@ -97,10 +99,10 @@ class Goal(PrintsTable):
 
     @abstractmethod
     def residual(self, measured: NumericArray, target: NumericArray, extras: NumericArray, xp: ModuleType) -> list[NumericArray]:
-        """Return by how much measures (..., G) differ from a target, as a list of G arrays."""
+        """Return the differences of measures (..., G) from a target, as a list of G arrays."""
 
     def origin(self, mechanism: Mechanism) -> Array:
-        """Return the value of the driver from which `values` count."""
+        """Return the value of the driver that `values` count from."""
         if not self.line:
             return jnp.zeros(())
         pins = mechanism.drawing.pins  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
@@ -108,7 +110,7 @@ class Goal(PrintsTable):
         return jnp.arctan2(way[1], way[0])
 
     def check_line(self, mechanism: Mechanism) -> None:
-        """Raise `SceneError` where `line` names what is no pin of the drawing."""
+        """Raise `SceneError` if `line` names a missing pin."""
         known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
         problems = [f"line: no pin named {quote(name)}{suggestion(name, known)}" for name in self.line if name not in known]
         if problems:
@@ -120,7 +122,7 @@ class Goal(PrintsTable):
 
 
 def place_of(mechanism: Mechanism, of: str, point: Numbers | None, q: Float[Array, "bodies 3"]) -> list[Array]:
-    """Return x and y (m) of a point in a position: of a pin, or of a body at a point of its own frame."""
+    """Return x and y (m) of a pin in a position, or of a body's point in its own frame."""
     body, local = locate(mechanism, of, point)
     if body == GROUND:
         return [jnp.asarray(local[0]), jnp.asarray(local[1])]
@@ -130,7 +132,7 @@ def place_of(mechanism: Mechanism, of: str, point: Numbers | None, q: Float[Arra
 
 
 def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
-    """Raise `SceneError` where there is no such pin or body."""
+    """Raise `SceneError` if there is no such pin or body."""
     try:
         locate(mechanism, of, point)
     except ValueError as problem:
@@ -138,13 +140,13 @@ def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
 
 
 class PathGoal(Goal):
-    """A point goes through places, in their order.
+    """A point passes through places in their order.
 
     Args:
         point: the name of a pin, or of a body together with `at`.
-        targets: the places (J, 2) in m; of a closed curve the last one may be the first one again.
-        values: of the driver at each place (rad, m); by default they are found.
-        start: "free": values count from one that is found.
+        targets: the places (J, 2) in m; on a closed curve the last may equal the first.
+        values: values of the driver at each place (rad, m); by default found by the search.
+        start: "given": values count from zero; "free": from a value found by the search.
         line: two pins: values count from the direction of the line from one to the other.
         at: the point in the body's own frame (m).
     """
@@ -171,18 +173,18 @@ class PathGoal(Goal):
 
 
 class PoseGoal(Goal):
-    """A link goes through poses: a point of it through places, and the link through angles, which count from one that is found.
+    """A link passes through poses: one of its points through places, the link through angles.
 
-    The residual of an angle is 2 `arm` sin(difference / 2), in m.
+    Angles count from one found by the search; their residual is 2 `arm` sin(difference / 2), in m.
 
     Args:
         body: the link.
         targets: x, y (m) and angle (rad) of each pose (J, 3).
-        arm: the length (m) by which angles are weighted; by default the extent of the places.
-        pin: a pin of the link that goes through the places; by default the link's origin, its centre of mass.
+        arm: the length (m) that weights angles; by default the extent of the places.
+        pin: the pin of the link that passes through the places; by default the link's origin, its centre of mass.
         values: values of the driver, as in a `PathGoal`.
-        start: start, as in a `PathGoal`.
-        line: line, as in a `PathGoal`.
+        start: as in a `PathGoal`.
+        line: as in a `PathGoal`.
     """
 
     body: str = eqx.field(static=True)
@@ -219,15 +221,15 @@ class PoseGoal(Goal):
 
 
 class FunctionGoal(Goal):
-    """A coordinate follows the driver: output values at input values, each counted from a start of its own where that is free.
+    """A coordinate is a function of the driver: output values at input values, each counted from its own start.
 
     Args:
-        output: the coordinate, such as `body.rocker.angle`, as `kinematics` names it.
-        values: of the driver (rad, m).
-        targets: of the output at each (rad, m).
-        start: "free": the driver's values count from one that is found.
-        output_start: "free": the output's, too.
-        line: line, as in a `PathGoal`.
+        output: the coordinate, such as `body.rocker.angle`, named as for `kinematics`.
+        values: values of the driver (rad, m).
+        targets: the output at each value (rad, m).
+        start: "free": the driver's values count from one found by the search.
+        output_start: "free": likewise for the output.
+        line: as in a `PathGoal`.
     """
 
     output: str | Coordinate = eqx.field(static=True)
@@ -239,7 +241,7 @@ class FunctionGoal(Goal):
 
     def __check_init__(self):
         if self.values is None:
-            raise ValueError("values must be those of the driver at which the output has its targets")
+            raise ValueError("give values: those of the driver at which the output has its targets")
         if self.output_start not in ("given", "free"):
             raise ValueError(f'output_start must be "given" or "free", not {quote(str(self.output_start))}')
 
@@ -258,7 +260,7 @@ class FunctionGoal(Goal):
 
 
 def goal_scale(goal: Goal, mechanism: Mechanism) -> float:
-    """Return the length (m) that residuals are judged by: the extent of the places; of a function one radian or metre."""
+    """Return the scale of the residuals: the extent of the places (m); for a function one radian or metre."""
     if not goal.has_place:
         return 1.0
     extent = float(np.max(np.ptp(goal.targets[:, :2], axis=0)))

@@ -15,16 +15,16 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote, suggestion
 
 Range = tuple[float, float]
-# Distance of a position from where branches meet, over a turn that has to be complete, whatever transmission is required:
-# sine of the transmission angle of a four-bar. Closer, machine parts with clearances do not know their branch.
+# Least distance from a meeting of branches over a required turn, even if no transmission is required: for a four-bar, the sine of
+# the transmission angle. Closer to it, real parts with clearances may change their branch.
 LEAST_TRANSMISSION = 3e-3
-DEFAULT_REACH = 2.0  # times the extent of targets and drawing: how far pins are searched, where there are no bounds
-DEFAULT_FACTOR = 4.0  # other numbers: from this fraction of their values to this multiple
+DEFAULT_REACH = 2.0  # range of the search for unbounded pins, relative to the extent of targets and drawing
+DEFAULT_FACTOR = 4.0  # range of other numbers: value / factor to value * factor
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """The ends of the ranges of free numbers (P,): `low` and `high` are kept, `first` and `last` are where searches start."""
+    """The ranges of free numbers (P,): `low` and `high` are limits; searches start between `first` and `last`."""
 
     low: np.ndarray
     high: np.ndarray
@@ -35,14 +35,14 @@ class Bounds:
 def read_bounds(
     free: FreeNumbers, given: Mapping[str, object], places: np.ndarray, name: str, reach: float = DEFAULT_REACH
 ) -> Bounds:
-    """Return the bounds of all free numbers; raise `SceneError` where one is not a range.
+    """Return the bounds of all free numbers; raise `SceneError` if one is not a range.
 
     Args:
         free: the numbers.
         given: (low, high) by the name of a free number; each end is a number, or has its shape.
-        places: (k, 2) where the design is about (m).
-        name: of the mechanism, for errors.
-        reach: of the search for pins without bounds, in extents of the places.
+        places: places (k, 2) around which to search (m).
+        name: name of the mechanism, for errors.
+        reach: range of the search for unbounded pins, in extents of the places.
     """
     low, high = np.full(free.count, -np.inf), np.full(free.count, np.inf)
     centre, extent = 0.5 * (places.min(0) + places.max(0)), max(float(np.max(np.ptp(places, axis=0))), 1e-12)
@@ -62,10 +62,10 @@ def read_bounds(
             except (TypeError, ValueError):
                 problems.append(f"bounds.{key}: must be a pair (low, high), each a number or of the shape {shape}")
                 continue
-            if not np.all(one <= two):  # also of what is not a number
+            if not np.all(one <= two):  # also for NaN
                 problems.append(f"bounds.{key}: low must not exceed high")
             low[a:b], high[a:b] = one, two
-            apart = (one > last[a:b]) | (two < first[a:b])  # from where a search would start otherwise
+            apart = (one > last[a:b]) | (two < first[a:b])  # outside of the default range
             first[a:b], last[a:b] = (
                 np.where(apart, np.maximum(one, two - extent), np.maximum(one, first[a:b])),
                 np.where(apart, np.minimum(two, one + extent), np.minimum(two, last[a:b])),
@@ -76,15 +76,15 @@ def read_bounds(
 
 
 class LengthLimits:
-    """Distances between pins of a drawing, and areas of pins: rows c(x) (K,) in m that must not exceed zero, with derivatives.
+    """Limits on distances between pins and areas of pins: rows c(x) <= 0 (K,) in m, with derivatives.
 
     Args:
         free: the free numbers x.
-        lengths: (least, most) in m by two pins.
+        lengths: (least, most) in m by pairs of pins.
         areas: areas by pin: a circle (x, y, radius) or the corners (k, 2) of a convex polygon, in m.
 
     Raises:
-        SceneError: there is no drawing, no such pin, no such range, or no such area.
+        SceneError: there is no drawing or pin, or a range or an area is invalid.
     """
 
     def __init__(self, free: FreeNumbers, lengths: Mapping[tuple[str, str], Range], areas: Mapping[str, object] | None = None):
@@ -105,7 +105,7 @@ class LengthLimits:
         self.names = [*ends, *(f"the area of {pin}" for pin, *_ in sides)]
         self._way, self._end = np.array([way for _, way, _ in rows]), np.array([end for *_, end in rows])
 
-        def between(x: Array) -> Array:  # affine: pins are free numbers, or stay where they are
+        def between(x: Array) -> Array:  # affine: pins are free numbers or constant
             pins = free.moved(x).drawing.pins  # pyright: ignore
             ways = [pins[b] if a is None else pins[b] - pins[a] for (a, b), *_ in rows]
             return jnp.stack([*ways, *(pins[pin] for pin, *_ in sides)])
@@ -120,7 +120,7 @@ class LengthLimits:
         self._level = np.einsum("kc,kc->k", normals, offset[ends]) - distances
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return c (M, K) and dc/dx (M, K, P) of vectors (M, P), of which the first entries are the free numbers."""
+        """Return c (M, K) and dc/dx (M, K, P) for vectors (M, P) that begin with the free numbers."""
         between = np.tensordot(x[:, : self._free], self._slopes, (1, 2)) + self._offset  # (M, K, 2)
         length = np.sqrt(np.sum(between**2, axis=2))
         slopes, first = np.zeros((len(x), self.count, x.shape[1])), length.shape[1]
@@ -132,7 +132,7 @@ class LengthLimits:
 
 
 def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str]) -> np.ndarray:
-    """Return an area of a pin: a circle (3,), or the corners (k, 2) of a convex polygon; tell where it is neither."""
+    """Return an area of a pin: a circle (3,) or the corners (k, 2) of a convex polygon; note anything else as a problem."""
     known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
     try:
         found = np.asarray(area, float)
@@ -143,9 +143,7 @@ def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str])
     if pin not in known:
         problems.append(f"areas: no pin named {quote(pin)}{suggestion(pin, known)}")
     if not np.all(np.isfinite(found)) or not (is_circle or is_polygon):
-        problems.append(
-            f"areas.{pin}: must be a circle (x, y, radius), or the corners of a convex polygon, one after another (m)"
-        )
+        problems.append(f"areas.{pin}: must be a circle (x, y, radius), or the corners of a convex polygon in order (m)")
         return np.zeros(3)
     return found
 
@@ -156,10 +154,10 @@ def box_of(area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_convex(corners: np.ndarray) -> bool:
-    """Return whether points (k, 2) are the corners of a convex polygon, one after another."""
+    """Return True if points (k, 2) are the corners of a convex polygon in order."""
     try:
         around = ConvexHull(corners).vertices
-    except (QhullError, ValueError):  # on a line, or no numbers
+    except (QhullError, ValueError):  # collinear, or NaN
         return False
     steps = {*(np.diff(around, append=around[:1]) % len(corners)).tolist()}
     return len(around) == len(corners) and steps in ({1}, {len(corners) - 1})
@@ -177,5 +175,5 @@ def _read_range(mechanism: Mechanism, pins: Sequence[str], ends: Range) -> tuple
     except (TypeError, ValueError):
         return tuple(pins), 0.0, np.inf, [*problems, f"{where}: must be a pair (least, most) in m"]
     if not 0 <= low <= high:
-        problems.append(f"{where}: must be zero or more, the least before the most, not {low:g} and {high:g}")
+        problems.append(f"{where}: must be (least, most) with 0 <= least <= most, not {low:g} and {high:g}")
     return tuple(pins), low, high, problems

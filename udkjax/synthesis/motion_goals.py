@@ -1,9 +1,9 @@
-"""Goals beside the path: torques, loads of joints, energies, frequencies and tolerances that must not exceed what is given.
+"""Motion goals: limits on torques, loads of joints, energies, frequencies and tolerances, in addition to a positional goal.
 
-Each measures positions of a motion in which the driver goes at a constant rate: over the whole turn where there is one, else over
-the range of the values of the first goal. A measure m above its `most` adds the residual weight scale (m / most - 1), one below
-its `least` weight scale (1 - m / least), with the scale of the first goal over the root of the number of samples; one in between
-adds nothing.
+Each measures positions of a motion with a constant rate of the driver: over the whole turn if there is one, otherwise over the
+range of the values of the positional goal. A measure m above its `most` adds the residual weight scale (m / most - 1), one below
+its `least` weight scale (1 - m / least), with the scale of the positional goal over the root of the number of samples; one in
+between adds nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,16 +30,16 @@ class MotionPoint(NamedTuple):
     """A position of a motion, as motion goals measure it.
 
     Attributes:
-        mechanism: with the numbers of the trial.
+        mechanism: the mechanism with the numbers of the trial.
         q: positions (bodies, 3) (m, rad).
         v: velocities (bodies, 3) (m/s, rad/s).
         a: accelerations (bodies, 3).
         rate: dq/ds by the value of the driver (bodies, 3).
         bend: d^2q/ds^2 (bodies, 3).
-        loads: loads that `loads` of a goal asked for (k, m).
-        numbers: the numbers that are free.
+        loads: the loads (k, m) requested by `MotionTerm.loads`.
+        numbers: the free numbers.
         x: their values in the trial (P,).
-        psi: Psi (m,) of x (P,), at this position.
+        psi: the function x (P,) -> Psi (m,) at this position.
     """
 
     mechanism: Mechanism
@@ -55,7 +55,7 @@ class MotionPoint(NamedTuple):
 
     @property
     def missing(self) -> Float[Array, "n"]:
-        """M a - F: what joints and drivers exert (N, N m)."""
+        """M a - F: the loads of joints and drivers (N, N m)."""
         force = loads.force(self.mechanism, 0.0, self.q, self.v)
         return loads.mass(self.mechanism) * self.a.ravel() - force
 
@@ -65,14 +65,14 @@ def _float(x: Any) -> Any:
 
 
 class MotionTerm(PrintsTable):
-    """A goal about a motion; see the module.
+    """A goal for a motion; see the module.
 
     Args:
-        most: the measure's upper end, above zero.
-        least: its lower end, above zero.
-        speed: the rate of the driver (rad/s, m/s); by default that of its motion at the time 0.
-        weight: weight of a measure at twice its end: as much as a place missed by so many scales of the first goal.
-        samples: positions that are measured.
+        most: upper limit of the measure, positive.
+        least: lower limit of the measure, positive.
+        speed: the rate of the driver (rad/s, m/s); by default that of its motion at time 0.
+        weight: twice the limit costs as much as missing a place by `weight` scales of the positional goal.
+        samples: number of measured positions.
     """
 
     most: float | None = eqx.field(static=True, converter=_float, default=None, kw_only=True)
@@ -83,7 +83,7 @@ class MotionTerm(PrintsTable):
 
     def __check_init__(self):
         if self.most is None and self.least is None:
-            raise ValueError("give most, least, or both: what the measure must not leave")
+            raise ValueError("give most, least, or both: the limits of the measure")
         for name in ("most", "least", "weight"):
             if getattr(self, name) is not None:
                 require_number(name, getattr(self, name), "positive")
@@ -92,10 +92,10 @@ class MotionTerm(PrintsTable):
         require_count("samples", self.samples)
 
     def check(self, mechanism: Mechanism, driven: Driven, free: Sequence[str]) -> None:
-        """Raise `SceneError` where the mechanism has not what is measured."""
+        """Raise `SceneError` if the mechanism lacks the measured element."""
 
     def loads(self, at: MotionPoint) -> Float[Array, "k n"]:
-        """Return b of as many systems Psi_q^T y = b as the measure needs; their solutions y are `at.loads`."""
+        """Return the right-hand sides b of systems Psi_q^T y = b needed by the measure; their solutions y are `at.loads`."""
         return jnp.zeros((0, at.q.size))
 
     def measure(self, at: MotionPoint) -> Float[Array, ""]:
@@ -119,7 +119,7 @@ class MotionTerm(PrintsTable):
 
 
 class MotionGoal(MotionTerm):
-    """Any function of a motion stays between `least` and `most`.
+    """A function of a motion stays between `least` and `most`.
 
     Args:
         function: returns the measure of a `MotionPoint`, written with jax.numpy.
@@ -134,7 +134,7 @@ class MotionGoal(MotionTerm):
 class TorqueGoal(MotionTerm):
     """The size of the driver's effort, its torque (N m) or force (N), stays below `most`.
 
-    It is the power of inertia, weight, springs and friction over the speed. Arguments are those of a `MotionGoal`.
+    The effort is the power of inertia, weight, springs and friction over the speed. Arguments: those of a `MotionTerm`.
     """
 
     def measure(self, at):
@@ -142,10 +142,10 @@ class TorqueGoal(MotionTerm):
 
 
 class LoadGoal(MotionTerm):
-    """The force (N) in a joint stays below `most`; of a mechanism without redundant joints.
+    """The force (N) in a joint stays below `most`; the mechanism must have no redundant joints.
 
     Args:
-        joint: its name, of a drawing that of its pin. The further arguments are those of a `MotionGoal`.
+        joint: the name of the joint, in a drawing that of its pin. Further arguments: those of a `MotionTerm`.
     """
 
     joint: str = eqx.field(static=True)
@@ -155,7 +155,7 @@ class LoadGoal(MotionTerm):
             listed = f"no joint named {quote(self.joint)}{suggestion(self.joint, mechanism.joints)}"
             raise SceneError([f"goal: {listed}"], mechanism.name)
         if driven.analysis.redundant_rows != ():
-            problem = "goal: joints are redundant, so that forces in them do not follow from the motion: measure another load"
+            problem = "goal: joints are redundant, so that their forces do not follow from the motion: measure another load"
             raise SceneError([problem], mechanism.name)
 
     def loads(self, at):
@@ -168,16 +168,16 @@ class LoadGoal(MotionTerm):
 
 
 class EnergyGoal(MotionTerm):
-    """The kinetic energy (J) stays below `most`, or above `least`. Arguments are those of a `MotionGoal`."""
+    """The kinetic energy (J) stays below `most`, or above `least`. Arguments: those of a `MotionTerm`."""
 
     def measure(self, at):
         return loads.kinetic_energy(at.mechanism, at.v)
 
 
 class FrequencyGoal(MotionTerm):
-    """The frequency (Hz) of the motion that is left when the driver lets go: above `least`, below `most`; negative: unstable.
+    """The frequency (Hz) of the mechanism without its driver stays above `least`, below `most`; negative: unstable.
 
-    With u = dq/ds, the mass is u^T M u and the stiffness -d(u^T F)/ds. Arguments are those of a `MotionGoal`.
+    With u = dq/ds, the mass is u^T M u and the stiffness -d(u^T F)/ds. Arguments: those of a `MotionTerm`.
     """
 
     def measure(self, at):
@@ -192,12 +192,12 @@ class FrequencyGoal(MotionTerm):
 
 
 class ToleranceGoal(MotionTerm):
-    """The error of a point where numbers have errors t_k: sqrt(sum_k (t_k dp/dx_k)^2) (m) stays below `most`.
+    """The error of a point by errors t_k of numbers, sqrt(sum_k (t_k dp/dx_k)^2) (m), stays below `most`.
 
     Args:
         point: point, as for a `PathGoal`.
-        tolerances: of free numbers by their names, in their units; each entry of a pin has it by itself. The further arguments
-            are those of a `MotionGoal`.
+        tolerances: tolerances of free numbers by name, in their units, for each entry of a pin independently. Further arguments:
+            those of a `MotionTerm`.
     """
 
     point: str = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""Motion goals, compiled: their residuals and exact derivatives for batches of trials."""
+"""Compiled motion goals: residuals and exact derivatives for batches of trials."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -27,7 +27,7 @@ class TermResiduals(NamedTuple):
 
     r: np.ndarray
     by_unknowns: np.ndarray
-    is_there: np.ndarray
+    exists: np.ndarray
 
 
 class CompiledTerm:
@@ -36,15 +36,15 @@ class CompiledTerm:
     Args:
         goal: the goal.
         mechanism: the mechanism.
-        free: the numbers that are free.
-        driver: its driver, and the mechanism `driven` by it.
+        free: the free numbers.
+        driver: the driver.
+        driven: the mechanism driven by it.
         unit: units of the coordinates (n,).
-        scale: of the residuals.
-        span: the values of the driver between which it is measured, as the first goal has them; None: a whole turn.
-        unknowns: number of unknowns, of which one more than the free ones is the value that values count from, if they are
-            `shifted`.
-        origin: the value from which values count.
-        shifted: see there.
+        scale: scale of the residuals.
+        span: first and last value of the driver, as in the positional goal; None: a whole turn.
+        unknowns: number of unknowns.
+        origin: the value that values count from.
+        shifted: whether the unknown after the free numbers is added to that value.
     """
 
     def __init__(
@@ -120,17 +120,17 @@ class CompiledTerm:
         count = self.goal.samples
         if self._span is not None:
             return np.tile(np.linspace(*self._span, count), (len(x), 1))
-        # Fixed values, so that they do not change with the drawing; the first is the next one to it.
+        # Values of a fixed grid, independent of the drawing; the first is the next one after the drawn value.
         step, drawn = FULL_TURN / count, np.asarray(self._drawn.by_numpy(list(x.T))[0])
         return step * (np.ceil(drawn / step)[:, None] + np.arange(count))
 
     def measure_motion(self, mechanism: Mechanism, x: np.ndarray, origin: float) -> np.ndarray | None:
-        """Return the measures (K,) of a mechanism's motion by `kinematics`; None where it does not get there.
+        """Return the measures (K,) of a mechanism's motion by `kinematics`; None if it does not reach them.
 
         Args:
             mechanism: the mechanism.
             x: its free numbers and further unknowns (P,).
-            origin: the value of the driver from which values of the span count.
+            origin: the value of the driver that values of the span count from.
         """
         s = self._values(x[None])[0]
         motion = kinematics(mechanism, self._driver, s if self._span is None else s + origin)
@@ -155,5 +155,5 @@ def _speed(mechanism: Mechanism, driver: str) -> float:
     motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
     rate = 0.0 if motion is None else float(jax.jvp(motion, (0.0,), (1.0,))[1])
     if not rate:
-        raise SceneError(["goal: give speed, the rate of the driver: its motion has none at the time 0"], mechanism.name)
+        raise SceneError(["goal: give speed, the rate of the driver: its motion is at rest at time 0"], mechanism.name)
     return rate

@@ -1,7 +1,7 @@
-"""Newton's method for the best trials of a search: where residuals remain, steps that neglect their curvature creep.
+"""Newton's method for the best trials of a search: Gauss-Newton steps converge slowly if residuals remain.
 
-The merit is that of search.py, of all unknowns z = (x, s) in units of their scales. Its gradient is exact; its Hessian is made of
-differences of gradients, all of which are trials of one batch. Steps go downhill along every eigenvector,
+The merit is that of search.py, over all unknowns z = (x, s) in units of their scales. Its gradient is exact; its Hessian is taken
+by differences of gradients, evaluated in one batch. Steps go downhill along every eigenvector,
 
     dz = -V (|Lambda| + mu)^(-1) V^T g.
 """
@@ -9,19 +9,19 @@ differences of gradients, all of which are trials of one batch. Steps go downhil
 import numpy as np
 
 from udkjax.synthesis.design_problem import DesignProblem
-from udkjax.synthesis.search import ROUNDING, SearchState, goes_on, harden, merit_of
+from udkjax.synthesis.search import ROUNDING, SearchState, harden, merit_of, must_continue
 from udkjax.synthesis.steps import ACTIVE_SETS
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
-DIFFERENCE = 1e-7  # of the unknowns' scales: small enough for mechanisms that just turn; rounding leaves 1e-8 of a Hessian
-FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, of the largest eigenvalue
-CONVERGED = 1e-13  # relative fall of the merit that a step promises
+DIFFERENCE = 1e-7  # relative to the scales: small enough for mechanisms that barely turn; rounding leaves 1e-8 of a Hessian
+FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, relative to the largest eigenvalue
+CONVERGED = 1e-13  # predicted relative decrease of the merit
 
 
 def polish(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
-    """Improve all trials of a state by so many Newton steps at most."""
+    """Improve all trials of a state by at most `steps` Newton steps."""
     members, sign = len(state.merit), np.sign(state.found.transmission[:, 0])
-    shift, done = np.full(members, FIRST_SHIFT), ~state.found.is_there
+    shift, done = np.full(members, FIRST_SHIFT), ~state.found.exists
     for _ in range(steps):
         active = np.flatnonzero(~done)
         if not len(active):
@@ -55,7 +55,7 @@ def _newton_step(
         now = found.limits + u + np.einsum("mkp,mp->mk", slopes, dz) > 0
         if np.array_equal(now, pressed):
             break
-        # The merit's curvature and slope along a limit come and go with its pressure.
+        # The limit contributes curvature and slope only while it is active.
         change = 2.0 * weight[:, None] ** 2 * (now.astype(float) - pressed)
         H = H + slopes.transpose(0, 2, 1) @ (change[..., None] * slopes)
         g = g + np.einsum("mkp,mk->mp", slopes, change * (found.limits + u))
@@ -65,7 +65,7 @@ def _newton_step(
     new = _split(problem, z + dz * units, trials)
     trial = problem.evaluate(new, state.margin[active], threads)
     ordered = np.all(np.diff(new.s, axis=1) * np.sign(trials.s[:, -1:] - trials.s[:, :1]) > 0, axis=1) | (not problem.local)
-    exists = usable & ordered & trial.is_there & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
+    exists = usable & ordered & trial.exists & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
     merit = np.where(exists, merit_of(trial, u, weight), np.inf)
     better = merit < state.merit[active]
     taken, kept = active[better], active[~better]
@@ -75,14 +75,14 @@ def _newton_step(
     shift[taken] = np.maximum(0.1 * shift[taken], LEAST_SHIFT)
     shift[kept] = shift[kept] * 10.0
     ended = active[small | (shift[active] > MOST_SHIFT)]
-    wrong = goes_on(problem, state, ended)
+    wrong = must_continue(problem, state, ended)
     harden(problem, state, ended[wrong])
     shift[ended[wrong]] = FIRST_SHIFT
     done[ended[~wrong]] = True
 
 
 def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Return the step of each trial, along which unknowns at their bounds that would leave them stay."""
+    """Return the step of each trial; unknowns that would leave their bounds are held."""
     held = np.zeros(g.shape, bool)
     of_x = g[:, : problem.unknowns]
     held[:, : problem.unknowns] = ((trials.x <= problem.low) & (of_x > 0)) | ((trials.x >= problem.high) & (of_x < 0))
@@ -133,6 +133,6 @@ def _hessian(
     u, weight, margin, pressed = (np.repeat(a, 2 * N, 0) for a in limits)
     found = problem.evaluate(split, margin, threads)
     g = _gradient(problem, found, u, weight, pressed) * units
-    g = np.where(found.is_there[:, None], g, np.nan).reshape(members, 2, N, N)
+    g = np.where(found.exists[:, None], g, np.nan).reshape(members, 2, N, N)
     H = (g[:, 0] - g[:, 1]) / (2.0 * DIFFERENCE)
     return 0.5 * (H + H.transpose(0, 2, 1))

@@ -1,8 +1,8 @@
-"""Searches: trials improved side by side, with limits that harden.
+"""Levenberg-Marquardt searches of many trials in lanes, with limits of increasing weight.
 
-Limits c(x) <= 0 are kept by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u) whenever
-a trial has settled. Where valleys are narrow and bend, steps bend with them: beside a step v, the second derivative of the
-residuals along it, by one more evaluation, gives the acceleration of the geodesic (Transtrum and Sethna 2012, arXiv:1201.5885).
+Limits c(x) <= 0 are enforced by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u)
+whenever a trial has converged. In narrow curved valleys steps follow the geodesic: its acceleration comes from the second
+derivative of the residuals along a step v, by one more evaluation (Transtrum and Sethna 2012, arXiv:1201.5885).
 """
 
 from dataclasses import dataclass, fields
@@ -15,24 +15,24 @@ from udkjax.synthesis.steps import StepEquations, in_order
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
-RELAX, TIGHTEN = 0.2, 4.0  # of the damping, after a step that is taken and one that is not
-# Weights w of limits beside residuals. A search begins with soft walls, along which it finds its way, and hardens them each time
-# it has settled: the violation falls by the square of the weight.
+RELAX, TIGHTEN = 0.2, 4.0  # factors of the damping after an accepted and a rejected step
+# Weights w of limits relative to residuals. A search begins with a small weight and raises it each time it has converged: the
+# violation falls with the square of the weight.
 FIRST_WEIGHT, HARDEN, MOST_WEIGHT = 0.5, 6.0, 100.0
-HIGH = 20.0  # of weights, for each scale of the root of the loss: walls that are low beside the loss hold nothing back
-# Squares of transmissions: where limits begin, and by what they shrink to what is asked for, whenever a trial has settled.
+HIGH = 20.0  # weights per root of the loss, relative to the scale: limits with smaller weights have no effect
+# Squared transmissions: the first margin, and the factor by which it shrinks to the requested one whenever a trial has converged.
 FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
-KEPT_TO = 1e-8  # scales: final excess over a limit, before the last polish
-SETTLED = 1e-9  # relative fall of the loss below which a trial has settled
-PRESSED = 1e-5  # barrier of a design beyond a limit, or pressing on it, which is to harden
-ROUNDING = 1e-26  # of the squared scale: a loss below is zero to rounding
-AHEAD = 0.1  # of a step: where residuals are evaluated for their second derivative along it
-MOST_BEND = 0.75  # of a step: twice the acceleration, at most
+LIMIT_TOL = 1e-8  # scales: accepted excess over a limit, before the last polish
+SETTLED = 1e-9  # relative decrease of the loss below which a trial has converged
+PRESSED = 1e-5  # relative decrease of the loss below which exceeded limits get a larger weight
+ROUNDING = 1e-26  # relative to the squared scale: a smaller loss is rounding
+AHEAD = 0.1  # fraction of a step at which residuals are evaluated for their second derivative along it
+MOST_BEND = 0.75  # largest 2 |acceleration| / |step|
 
 
 @dataclass
 class SearchState:
-    """Trials on their way: with all that is known where they are."""
+    """Active trials with their residuals, multipliers, weights, margins and dampings."""
 
     trials: Trials
     found: TrialResiduals
@@ -47,29 +47,29 @@ class SearchState:
     kept_loss: np.ndarray
 
     def take(self, which: np.ndarray) -> "SearchState":
-        """Return some of them."""
+        """Return some of the trials."""
         every = ((field.name, getattr(self, field.name)) for field in fields(self))
         taken: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in every}
         return SearchState(**taken)
 
     def accept(self, problem: DesignProblem, which: np.ndarray, trials: Trials, found: TrialResiduals, merit: np.ndarray):
-        """Take new places of some trials, and remember the best one of each that is within all limits."""
+        """Replace some trials by accepted ones, and store the best of each within all limits."""
         for a, b in zip((*self.trials, *self.found), (*trials[:2], found.q, *found), strict=True):
             a[which] = b
         self.merit[which] = merit
         self.keep(problem, which)
 
     def keep(self, problem: DesignProblem, which: np.ndarray):
-        """Remember trials that are within all limits, where they are better than what is remembered."""
+        """Store trials within all limits if they are better than the stored ones."""
         found = self.found.take(which)
-        loss = np.where(found.is_there & (self.excess(problem, which) <= 0), loss_of(found), np.inf)
+        loss = np.where(found.exists & (self.excess(problem, which) <= 0), loss_of(found), np.inf)
         better = loss < self.kept_loss[which]
         for a, b in zip(self.kept, self.trials, strict=True):
             a[which[better]] = b[which[better]]
         self.kept_loss[which[better]] = loss[better]
 
     def excess(self, problem: DesignProblem, which: np.ndarray) -> np.ndarray:
-        """Return by how much some trials exceed the limits that are asked for in the end, at most (m)."""
+        """Return the largest excess of some trials over the requested limits (m)."""
         limits, more = self.found.limits[which], self.margin[which] - self.least[which] ** 2
         limits[:, problem.lengths.count :] -= MARGIN_WEIGHT * problem.scale * more[:, None]
         return np.max(limits, axis=1, initial=-np.inf)
@@ -81,7 +81,7 @@ def loss_of(found: TrialResiduals) -> np.ndarray:
 
 
 def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
-    """Improve trials by so many steps at most; return where they got, those that have no positions with an infinite merit."""
+    """Improve trials by at most `steps` steps; trials without positions have an infinite merit."""
     sign = np.sign(state.found.transmission[:, 0])
     for _ in range(steps):
         active = np.flatnonzero(~state.settled)
@@ -92,7 +92,7 @@ def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int
 
 
 def begin(problem: DesignProblem, trials: Trials, threads: int | None, least: float = 0.0) -> SearchState:
-    """Return the state in which the search from some trials begins, for a transmission that is not below `least`."""
+    """Return the first state of the search from some trials, for a transmission of at least `least`."""
     members = len(trials.x)
     leasts = np.full(members, max(problem.least, least))
     margin = np.maximum(leasts**2, FIRST_MARGIN)
@@ -100,15 +100,15 @@ def begin(problem: DesignProblem, trials: Trials, threads: int | None, least: fl
     multipliers = np.zeros_like(found.limits)
     weight, damping, merit = np.full(members, FIRST_WEIGHT), np.full(members, FIRST_DAMPING), np.full(members, np.inf)
     kept = Trials(*(a.copy() for a in trials))
-    rest = (multipliers, weight, margin, leasts, damping, merit, ~found.is_there, kept, np.full(members, np.inf))
+    rest = (multipliers, weight, margin, leasts, damping, merit, ~found.exists, kept, np.full(members, np.inf))
     state = SearchState(trials, found, *rest)
     state.keep(problem, np.arange(members))
-    state.merit[found.is_there] = merit_of(found, multipliers, weight)[found.is_there]
+    state.merit[found.exists] = merit_of(found, multipliers, weight)[found.exists]
     return state
 
 
 def merit_of(found: TrialResiduals, multipliers: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the loss with what limits add to it (M,)."""
+    """Return the loss plus the penalty of limits (M,)."""
     return loss_of(found) + _pressure(found.limits, multipliers, weight)
 
 
@@ -127,14 +127,14 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
         return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < before
 
     trial = problem.evaluate(new, state.margin[active], threads, worth)
-    exists = trial.is_there & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
+    exists = trial.exists & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
     merits = np.where(exists, merit_of(trial, u, weight), np.inf)
     better, fall = merits < before, before - merits
     taken, kept = active[better], active[~better]
     state.accept(problem, taken, new.take(better), trial.take(better), merits[better])
     slow = fall[better] < PRESSED * before[better]
     settled = fall[better] < SETTLED * before[better]
-    settled[slow] |= goes_on(problem, state, taken[slow])
+    settled[slow] |= must_continue(problem, state, taken[slow])
     state.damping[taken] = np.maximum(RELAX * state.damping[taken], LEAST_DAMPING)
     state.damping[kept] *= TIGHTEN
     done = np.concatenate(
@@ -148,7 +148,7 @@ def _stepped(problem: DesignProblem, trials: Trials, dx: np.ndarray, ds: np.ndar
 
 
 def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps with half of their acceleration, where that is short beside them."""
+    """Return steps plus half of their acceleration, unless that is long relative to the step."""
     dx, ds = equations.find()
     ds = in_order(problem, ds, equations.trials.s)
     trials, found = equations.trials, equations.found
@@ -166,23 +166,23 @@ def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | 
 
 
 def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
-    """Trials that go no farther have settled, unless a limit is still exceeded or pressed on in vain: multipliers change then."""
-    restarted = done[goes_on(problem, state, done)]
+    """Mark converged trials; those with exceeded limits continue with new multipliers."""
+    restarted = done[must_continue(problem, state, done)]
     state.settled[done] = True
     harden(problem, state, restarted)
     state.damping[restarted] = np.minimum(state.damping[restarted], FIRST_DAMPING)
 
 
-def goes_on(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
-    """Return of trials that go no farther whether they should, once limits have changed."""
+def must_continue(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
+    """Return a mask of the converged trials that must continue, with changed limits."""
     limits, u = state.found.limits[which], state.multipliers[which]
-    wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > KEPT_TO * problem.scale
+    wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > LIMIT_TOL * problem.scale
     rows = slice(problem.lengths.count, None)  # of transmission
     return wrong | (state.margin[which] > state.least[which] ** 2) & np.any(limits[:, rows] + u[:, rows] > 0, axis=1)
 
 
 def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
-    """Update the multipliers of some trials, harden their limits, and bring their margins nearer to what is asked for."""
+    """Update the multipliers of some trials, raise their weights, and shrink their margins to the requested ones."""
     most = MOST_WEIGHT * _height(problem, state, which)
     limits, u, weight = state.found.limits[which], state.multipliers[which], state.weight[which]
     state.multipliers[which], state.settled[which] = np.maximum(0.0, limits + u), False
@@ -193,19 +193,19 @@ def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
     _reweigh(problem, state, which, np.maximum(weight, np.minimum(HARDEN * weight, most)))
 
 
-def raise_walls(problem: DesignProblem, state: SearchState):
-    """Raise limits to the height of what is left of the losses."""
+def raise_weights(problem: DesignProblem, state: SearchState):
+    """Raise the weights of limits to match the remaining losses."""
     every = np.arange(len(state.merit))
     _reweigh(problem, state, every, np.maximum(state.weight, FIRST_WEIGHT * _height(problem, state, every)))
 
 
 def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
-    """Return the unit of the weights of some trials."""
+    """Return the unit of the weights of some trials, by their losses."""
     return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(state.found.take(which))))
 
 
 def _reweigh(problem: DesignProblem, state: SearchState, which: np.ndarray, weight: np.ndarray):
-    """Change weights of some trials, by which limits press on as hard as before."""
+    """Change the weights of some trials, with the same forces of their limits as before."""
     state.multipliers[which] *= (state.weight[which] / weight)[:, None] ** 2
     state.weight[which] = weight
     merit = merit_of(state.found.take(which), state.multipliers[which], weight)

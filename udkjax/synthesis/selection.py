@@ -1,7 +1,7 @@
-"""The end of a search: trials within all limits, verified by their motion, of which those are taken that differ.
+"""The end of a search: the best different trials within all limits, verified by their motion.
 
-Where a mechanism comes near to where its branches meet, `kinematics` may refuse to follow it. Such trials go on with more
-transmission, step by step, as long as they promise more than what has been verified.
+`kinematics` may refuse to follow a mechanism close to a meeting of its branches. Such trials are improved further with more
+transmission, step by step, as long as they promise less loss than the best verified design.
 """
 
 from typing import NamedTuple
@@ -11,14 +11,14 @@ import numpy as np
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import FoundDesign, verified
 from udkjax.synthesis.polish import polish
-from udkjax.synthesis.search import KEPT_TO, SearchState, begin, improve, loss_of
+from udkjax.synthesis.search import LIMIT_TOL, SearchState, begin, improve, loss_of
 from udkjax.synthesis.trials import Trials
 
-POLISHING = 40  # Newton steps, of which some five are usual at each hardness of the limits
-ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are one
-RETREATS = (0.01, 0.03, 0.1)  # least transmissions (sines) for which refused trials go on, in turn
-RETREAT = 40  # steps of each
-REFUSALS = 3  # before all go on: following a motion takes longer than improving sixteen trials
+POLISH_STEPS = 40  # Newton steps; about five are usual at each weight of the limits
+ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are the same
+STRICTER_MARGINS = (0.01, 0.03, 0.1)  # least transmissions (sines) with which refused trials are improved again, in turn
+MARGIN_STEPS = 40  # steps with each of them
+REFUSALS = 3  # before all are improved again: verifying a motion takes longer than improving sixteen trials
 
 
 class _Candidates(NamedTuple):
@@ -29,7 +29,7 @@ class _Candidates(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """Designs, the losses of all trials within the limits, and why there are no designs where there are none."""
+    """Designs, the losses of all trials within the limits, and the reason if there is no design."""
 
     found: list[FoundDesign]
     losses: np.ndarray
@@ -37,29 +37,31 @@ class Selection(NamedTuple):
 
 
 def select(problem: DesignProblem, state: SearchState, results: int, threads: int | None) -> Selection:
-    """Return the best designs that differ, of a state in which a search ends."""
+    """Return the best different designs from the final state of a search."""
     candidates = first = _within_limits(problem, state)
     losses = candidates.loss
     if not len(losses):
-        return Selection([], losses, _what_is_exceeded(problem, state))
+        return Selection([], losses, _exceeded_limit(problem, state))
     found: list[tuple[FoundDesign, np.ndarray]] = []
-    for least in (*RETREATS, None):
+    for least in (*STRICTER_MARGINS, None):
         open_ones = _verify(problem, candidates, results, found, len(candidates.loss) if least is None else REFUSALS)
         if least is None or not len(open_ones):
             break
         state = begin(problem, candidates.trials.take(open_ones), threads, least)
-        candidates = _within_limits(problem, polish(problem, improve(problem, state, RETREAT, threads), POLISHING, threads))
-    if found and len(found) < results:  # beside the best one
+        candidates = _within_limits(
+            problem, polish(problem, improve(problem, state, MARGIN_STEPS, threads), POLISH_STEPS, threads)
+        )
+    if found and len(found) < results:  # in addition to the best one
         rest = np.flatnonzero(losses > found[0][0].loss)
         _verify(problem, _Candidates(first.trials.take(rest), losses[rest]), results, found, REFUSALS)
-    reason = "the motions of the trials within the limits, when followed again, leave their branches or come to dead points"
+    reason = "the motions of all trials within the limits leave their branches or reach dead points"
     return Selection([design for design, _ in found], losses, "" if found else f"{reason}: ask for more transmission")
 
 
 def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:
     every, loss = np.arange(len(state.merit)), loss_of(state.found)
-    good = state.found.is_there & (state.excess(problem, every) <= 100 * KEPT_TO * problem.scale)
-    # A trial that ends beyond a limit was within it somewhere on its way.
+    good = state.found.exists & (state.excess(problem, every) <= 100 * LIMIT_TOL * problem.scale)
+    # A trial that ends beyond a limit may have been within it earlier.
     kept = np.isfinite(state.kept_loss) & (~good | (state.kept_loss < loss))
     trials = Trials(*(np.concatenate([a[good], b[kept]]) for a, b in zip(state.trials, state.kept, strict=True)))
     losses = np.concatenate([loss[good], state.kept_loss[kept]])
@@ -70,9 +72,9 @@ def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:
 def _verify(
     problem: DesignProblem, candidates: _Candidates, results: int, found: list[tuple[FoundDesign, np.ndarray]], most: int
 ) -> np.ndarray:
-    """Add verified designs that differ to those found, and sort; return which candidates promise more than the best of them.
+    """Add verified different designs to those found, sorted; return the candidates with less loss than the best of them.
 
-    After so many refusals, at most, no more candidates are looked at.
+    The search stops after `most` refusals.
     """
     refused: list[np.ndarray] = []
     for k, loss in enumerate(candidates.loss):
@@ -94,13 +96,13 @@ def _verify(
     return np.flatnonzero(candidates.loss < best * (1.0 - ALIKE)) if refused else np.zeros(0, int)
 
 
-def _what_is_exceeded(problem: DesignProblem, state: SearchState) -> str:
-    """Return the limit that excludes the trial nearest to all of them."""
-    present = np.flatnonzero(state.found.is_there)
+def _exceeded_limit(problem: DesignProblem, state: SearchState) -> str:
+    """Describe the limit that excludes the trial closest to all limits."""
+    present = np.flatnonzero(state.found.exists)
     if not len(present):
-        return "no trial has all positions of the goal in one motion: widen the bounds, or give more starts"
+        return "no trial passes all positions of the goal in one motion: widen the bounds, or raise starts"
     nearest = present[np.argmin(state.excess(problem, present))]
     names = problem.lengths.names
     worst = int(np.argmax(state.found.limits[nearest]))
     what = names[worst] if worst < len(names) else "the least transmission"
-    return f"no trial comes within all limits; the nearest one exceeds {what}: widen the limits, or give more starts"
+    return f"no trial is within all limits; the closest one exceeds {what}: widen the limits, or raise starts"

@@ -1,8 +1,8 @@
 """Starts of searches: random mechanisms, turned once, moved and scaled to their targets, with values assigned in order.
 
-Of each the curve of a whole turn is known, and so is what it would be if the mechanism were moved, turned and scaled: a place p
-becomes a p + b, in complex numbers. The best a and b for an assignment of values to targets are a linear least-squares problem;
-the best assignment in order, for given a and b, one of dynamic programming.
+The curve of a whole turn gives that of the moved, turned and scaled mechanism: a place p becomes a p + b, in complex numbers. The
+best a and b for an assignment of values to targets solve a linear least-squares problem; the best assignment in order, for given
+a and b, follows by dynamic programming.
 """
 
 from typing import NamedTuple
@@ -12,22 +12,22 @@ import numpy as np
 from udkjax.synthesis.design_problem import TURN_VALUES, DesignProblem
 from udkjax.synthesis.trials import Trials, Turn
 
-PHASES = 12  # first values that are tried, around a turn
-SPANS = (1.0, 0.6, 0.3)  # of a turn, from the first value to the last, that are tried for open curves
-LEAST_SCALE = 0.03  # of the curve beside its targets: a curve that fits best as a point does not fit at all
-ROUNDS = 2  # of moving to the targets and assigning anew
-CLEAR = 0.02  # transmission over the whole turn, at least: those that come closer to where branches meet end there soon
+PHASES = 12  # first values tried around a turn
+SPANS = (1.0, 0.6, 0.3)  # fractions of a turn from the first value to the last, tried for open curves
+LEAST_SCALE = 0.03  # of the curve relative to its targets: a curve that fits best as a point does not fit at all
+ROUNDS = 2  # of moving to the targets and assigning values
+CLEAR = 0.02  # least transmission over the whole turn: mechanisms closer to a meeting of branches soon reach it
 
 
 class _Fitted(NamedTuple):
-    """Assignments: places among the values of a turn (M, J) that may go beyond it, and what remains (M,)."""
+    """Assignments: indices of values of a turn (M, J), possibly beyond it, and remaining sums of squares (M,)."""
 
     places: np.ndarray
     cost: np.ndarray
 
 
 def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random.Generator, threads: int | None = None) -> Trials:
-    """Return the `count` best of some random mechanisms, as trials; fewer where fewer have all positions."""
+    """Return the `count` best of some random mechanisms as trials, or fewer if fewer have all positions."""
     x = np.zeros((samples, problem.unknowns))
     x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
     turn = problem.turn(x, TURN_VALUES, threads)
@@ -38,14 +38,14 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
         return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
     trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
     s, moved = trials
-    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # lengths that scaling has made too long
+    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # of lengths exceeded by scaling
     q, there = problem.march(moved, s, threads)
     best = np.argsort(np.where(there & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
     best = best[there[best]]
     return Trials(moved[best], s[best], q[best])
 
 
-# --- values that are unknown
+# --- unknown values
 
 
 def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
@@ -62,7 +62,7 @@ def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np
 
 
 def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool) -> _Fitted:
-    """Assign values evenly over spans of a turn, either way round, from the phase that fits best."""
+    """Assign values evenly over spans of a turn, in either direction, from the phase that fits best."""
     J, K = len(target), curve.shape[1]
     spans = (1.0,) if closed else SPANS
     best = _Fitted(np.zeros((len(curve), J), int), np.full(len(curve), np.inf))
@@ -78,7 +78,7 @@ def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool)
 
 
 def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a, b (M,) of the best a z + b, and the sum of squares that remains; `moves` says what may be done."""
+    """Return a, b (M,) of the best a z + b with the allowed `moves`, and the remaining sum of squares."""
     ones = np.ones(len(z), complex)
     if moves == "nothing":
         return ones, 0 * ones, np.sum(np.abs(z - target) ** 2, 1)
@@ -93,7 +93,7 @@ def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np
 
 
 def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fitted:
-    """Return the best assignment whose values come in order, the way round that they did, from the same first value on."""
+    """Return the best assignment in order, with the same direction and first value as before."""
     M, K = curve.shape
     J, rows = len(target), np.arange(M)
     way = np.where(before[:, -1] >= before[:, 0], 1, -1)
@@ -101,7 +101,7 @@ def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fit
     cost = np.abs(np.take_along_axis(curve, along, 1)[..., None] - target) ** 2  # (M, L, J)
     L = cost.shape[1]
     total, back = cost[..., 0].copy(), np.zeros((M, J, L), int)
-    total[:, K // 4 + 1 :] = np.inf  # the first one stays about where it was
+    total[:, K // 4 + 1 :] = np.inf  # the first one stays nearby
     for j in range(1, J):
         least = np.minimum.accumulate(total, 1)
         where = np.maximum.accumulate(np.where(total == least, np.arange(L), 0), 1)
@@ -115,7 +115,7 @@ def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fit
     return _Fitted(before[:, :1] + way[:, None] * (places - K // 8), total.min(1))
 
 
-# --- values that are given
+# --- given values
 
 
 def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
@@ -145,7 +145,7 @@ def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.
     moved = problem.moved(x, a, b)
     if problem.shifted:
         moved[:, problem.free.count] = shift + problem.turned_by(a)
-    # The drawn position is at most half a period away from the first value.
+    # At most half a period between the drawn position and the first value.
     s = np.broadcast_to(values, (len(x), len(values))).copy()
     if not problem.shifted:
         drawn = problem.value_drawn(moved)

@@ -1,12 +1,12 @@
-"""Steps of Levenberg and Marquardt's method for many trials at once, with values of the driver as unknowns of their own.
+"""Levenberg-Marquardt steps of many trials, with the driver's values as further unknowns.
 
-With residuals r(x, s), a position's value s_j moves its own residuals alone. So it is eliminated: with a_j = dr_j/ds_j,
+The value s_j of a position affects only its own residuals r_j(x, s_j). It is therefore eliminated: with a_j = dr_j/ds_j,
 
     (A - W^T H^-1 W) dx = -(b - W^T H^-1 g),    ds_j = -(g_j + w_j dx) / h_j,
     A = sum_j J_j^T J_j,  w_j = a_j^T J_j,  g_j = a_j^T r_j,  h_j = a_j^T a_j,
 
-each diagonal increased by a damping. Limits add rows w max(0, c + u). Bounds are kept by active sets: unknowns that would leave
-them stay.
+with a damping added to each diagonal. Limits add rows w max(0, c + u). Bounds are enforced by active sets: unknowns that would
+leave them are held.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ import numpy as np
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
-LONGEST_MOVE = 0.5  # scales: of an unknown in one step
-ACTIVE_SETS = 5  # rounds in which a step finds out which limits it will press on
-GAP_SHARE = 0.45  # of the gap to the next value that a value may move by in one step: so that their order stays
-REGULAR = float(np.finfo(float).eps)  # of the largest diagonal entry: keeps matrices regular where nothing else does
+LONGEST_MOVE = 0.5  # largest change of an unknown in one step, in scales
+ACTIVE_SETS = 5  # iterations of a step for its active limits
+GAP_SHARE = 0.45  # largest move of a value in one step, relative to the gap to the next value: keeps their order
+REGULAR = float(np.finfo(float).eps)  # regularization, relative to the largest diagonal entry
 
 
 class StepEquations:
-    """The linear least-squares problem of the steps of some trials; `find` solves it, `correct` again for other residuals."""
+    """The linear least-squares problem of a step of some trials: `find` solves it, `correct` solves it for other residuals."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class StepEquations:
             self.A = self.A - (self.w / self.h[..., None]).transpose(0, 2, 1) @ self.w
 
     def find(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes dx (M, P), ds (M, J) that are not too long, and leave values in their order."""
+        """Return changes dx (M, P), ds (M, J), limited in length; values stay in order."""
         b, g = self._right_hand_side(self.found.r)
         b = b + (self.found.terms[:, None] @ self.found.terms_by_unknowns)[:, 0]
         members, P = b.shape
@@ -79,7 +79,7 @@ class StepEquations:
         return dx, self._values(dx, g)
 
     def correct(self, r: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes dx, ds that take away residuals r (M, J, G) and what limits (M, K) there are beside them."""
+        """Return changes dx, ds that remove residuals r (M, J, G) and limits (M, K)."""
         b, g = self._right_hand_side(r)
         force = self.weight[:, None] ** 2 * self.pressed * limits
         gradient = b + (force[:, None] @ self.found.limits_by_unknowns)[:, 0]
@@ -105,7 +105,7 @@ class StepEquations:
 
 
 def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return matrices by which unknowns that are held stay."""
+    """Return matrices with the rows and columns of held unknowns replaced by those of the unit matrix."""
     if not held.any():
         return matrix
     matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, matrix)
@@ -114,7 +114,7 @@ def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def in_order(problem: DesignProblem, ds: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Shorten changes of values so that their order stays, around the whole period; of a closed curve its ends may meet."""
+    """Shorten changes of values to keep their cyclic order over the period; the ends of a closed curve may meet."""
     if not problem.local:
         return ds
     gap = np.abs(np.diff(s, axis=1))

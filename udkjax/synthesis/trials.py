@@ -1,4 +1,4 @@
-"""Trials of a design side by side, what is evaluated of them, and their turns."""
+"""Batches of trials of a design, their residuals, and their turns."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Trials(NamedTuple):
-    """M trials: unknowns x (M, P), values s (M, J) and positions q (M, J, n) of the driver at each position of the goal."""
+    """M trials: unknowns x (M, P), and at each position of the goal the driver's value s (M, J) and the position q (M, J, n)."""
 
     x: np.ndarray
     s: np.ndarray
@@ -30,7 +30,7 @@ class TrialResiduals(NamedTuple):
         transmission: (M, J), with the sign of the branch.
         limits: rows (M, K) that must not exceed zero, in the unit of residuals.
         limits_by_unknowns: their derivatives by x (M, K, P).
-        is_there: whether all positions exist (M,).
+        exists: whether all positions of a trial exist (M,).
     """
 
     q: np.ndarray
@@ -42,7 +42,7 @@ class TrialResiduals(NamedTuple):
     transmission: np.ndarray
     limits: np.ndarray
     limits_by_unknowns: np.ndarray
-    is_there: np.ndarray
+    exists: np.ndarray
 
     def take(self, which: np.ndarray) -> "TrialResiduals":
         """Return some of them."""
@@ -50,7 +50,7 @@ class TrialResiduals(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and how many were reached."""
+    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and which were reached."""
 
     s: np.ndarray
     measures: np.ndarray

@@ -1,1 +1,1 @@
-"""Why a run failed: what happened where, found after a single run by NumPy on the scene's programs."""
+"""Causes of failed runs: place, time and reason, found after a single run by NumPy on the scene's programs."""

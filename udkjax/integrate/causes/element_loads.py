@@ -1,4 +1,4 @@
-"""Loads of single force elements at a state: one that is not a number, grows without bound, jumps, or is stiff."""
+"""Loads of single force elements at states, to find one that is NaN, grows without bound, jumps, or is stiff."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,11 +19,11 @@ TimedState = tuple[float, np.ndarray, np.ndarray]  # t (s), q and v (n,)
 
 
 class ElementLoads(NamedTuple):
-    """Of each force element at each state: its load, and the fastest rates (1/s) of its dampers and springs."""
+    """Loads of the force elements at states, and the fastest rates (1/s) of their damping and stiffness."""
 
     names: tuple[str, ...]
-    size: np.ndarray  # (states, elements): of the acceleration that it gives its bodies, in L / s^2 and rad / s^2
-    jump: np.ndarray  # (states, elements): the largest change of it from the first state, in the same units
+    size: np.ndarray  # (states, elements): largest acceleration of its bodies, in L / s^2 and rad / s^2
+    jump: np.ndarray  # (states, elements): its largest change from the first state, in the same units
     damping: np.ndarray  # (states, elements), 1/s
     stiffness: np.ndarray  # (states, elements), 1/s
 

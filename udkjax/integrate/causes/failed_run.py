@@ -1,4 +1,4 @@
-"""A run that failed, as its cause is looked for."""
+"""Data of a failed run, from which its cause is found."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,23 +15,23 @@ from udkjax.scene.mechanism import Mechanism
 
 @dataclass(frozen=True, eq=False)
 class FailedRun:
-    """A single run, of a mechanism of known numbers, that failed."""
+    """A failed single run of a mechanism of concrete numbers."""
 
     mechanism: Mechanism
     analysis: Analysis
     result: Result
     time: float  # s
     ts: np.ndarray  # (T,)
-    q: np.ndarray  # (T, n); not a number where it was not reached
+    q: np.ndarray  # (T, n); NaN at times that were not reached
     v: np.ndarray
-    end: tuple[float, np.ndarray, np.ndarray] | None  # the last state of the integrator, where it is known
+    end: tuple[float, np.ndarray, np.ndarray] | None  # the last state of the integrator, if available
     steps: int
     rtol: float
     atol: float
     drift_tol: float
     is_projected: bool
-    is_explicit: bool  # the solver
-    drops_rows: bool  # the method leaves out the rows that the analysis found redundant
+    is_explicit: bool  # whether the solver is explicit
+    drops_rows: bool  # whether the method leaves out the rows that the analysis found redundant
     formulation: str
 
     @cached_property
@@ -46,9 +46,9 @@ class FailedRun:
 
     @cached_property
     def states(self) -> list[tuple[float, np.ndarray, np.ndarray]]:
-        """The states (t, q, v) that count, the last one first: of the integrator, then the outputs before the failure."""
-        known = np.isfinite(self.q).all(1) & np.isfinite(self.v).all(1)
-        good = [k for k in range(len(self.ts)) if known[k] and (self.result != Result.drift or self.ts[k] < self.time)]
+        """The usable states (t, q, v), latest first: that of the integrator, then the outputs before the failure."""
+        finite = np.isfinite(self.q).all(1) & np.isfinite(self.v).all(1)
+        good = [k for k in range(len(self.ts)) if finite[k] and (self.result != Result.drift or self.ts[k] < self.time)]
         listed = [(float(self.ts[k]), self.q[k], self.v[k]) for k in reversed(good)]
         if self.end is None or self.result == Result.drift or not all(np.all(np.isfinite(x)) for x in self.end):
             return listed

@@ -1,4 +1,4 @@
-"""Find why a run failed, and say it with the place, the time and the cure."""
+"""Find the cause of a failed run, and describe it with the place, the time and the cure."""
 
 from collections.abc import Hashable
 from dataclasses import replace
@@ -15,22 +15,22 @@ from udkjax.integrate.solvers import is_explicit
 from udkjax.positions.open_rows import MOST_NAMED, explain_open, name_not_finite
 from udkjax.scene.mechanism import Mechanism
 
-BESIDE = 1e-9  # of the span: between two instants so close only what jumps changes much
-# Of the span: where the integrator, which tries steps ten times as long as those before, may have met what is not finite.
+NEARBY = 1e-9  # fraction of the span: between two instants this close only a jump changes a load much
+# Fractions of the span that are searched for non-finite numbers: the integrator tries steps up to ten times as long as the last.
 AHEAD = (0.0, *np.geomspace(1e-6, 0.1, 80))
-JUMP = 1e-3  # of a load: its change over `BESIDE`, if it jumps; a smooth one by a millionth of that
-GROWN = 1e6  # times as large as before: a load that grows without bound
-NEAR_REACH = 1e-2  # of the span: how far from its end a run may be by a dead point
+JUMP = 1e-3  # least relative change of a load over `NEARBY` at a jump; a smooth one changes by a millionth of that
+GROWN = 1e6  # ratio to its earlier value of a load that grows without bound
+NEAR_REACH = 1e-2  # fraction of the span by which a run may end before a dead point
 STIFF = 0.1  # rate times step: explicit methods of any order lose stability between 1 and 10
-SINGULAR = 1e-4  # of the largest singular value of D with rows of length one
+SINGULAR = 1e-4  # relative to the largest singular value of D with rows of length one
 RATES = ("vx", "vy", "omega")
 
 
 class FoundCause:
-    """The cause of a failed run, which is looked for when it is asked for.
+    """The cause of a failed run, found on demand.
 
-    All compare as equal: a solution that holds one has the structure of every other. So it tells the cause only of a solution
-    with the code and the time that it was made for.
+    All instances compare equal, so that all solutions have the same tree structure. The cause is therefore returned only for the
+    code and time of its own run.
     """
 
     def __init__(self, run: FailedRun | None, text: str | None = None):
@@ -38,7 +38,7 @@ class FoundCause:
         self._key = None if run is None else (int(run.result), run.time)
 
     def text(self, code: int, time: float) -> str | None:
-        """Return the cause of a run that ended with this code at this time (s); None of another run."""
+        """Return the cause of a run that ended with this code at this time (s); None for another run."""
         if (code, time) != self._key:
             return None
         if self._text is None and self._run is not None:
@@ -59,7 +59,7 @@ class FoundCause:
 
 
 def find_cause(run: FailedRun) -> str | None:
-    """Return the cause of a failed run; None where no more is found than its result says."""
+    """Return the cause of a failed run; None if nothing beyond its result is found."""
     wrong = " and ".join(
         text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATES)) if text
     )
@@ -140,7 +140,7 @@ def _explain_many_steps(run: FailedRun) -> str | None:
 
 
 def _not_finite_ahead(run: FailedRun) -> str:
-    """Name the elements whose numbers are not finite at the end of the run or a little later."""
+    """Name the elements with non-finite numbers at the end of the run or shortly after."""
     t, q, v = run.states[0]
     span = float(run.ts[-1] - run.ts[0])
     states = [(t + share * span, q + share * span * v, v) for share in AHEAD]
@@ -152,18 +152,18 @@ def _not_finite_ahead(run: FailedRun) -> str:
         named = [f'{"driver" if name in run.mechanism.drivers else "joint"} "{name}"' for name in sorted(owners)]
         named += [f'force "{name}"' for name, size in zip(loads.names, loads.size[k], strict=True) if not np.isfinite(size)]
         if named:
-            return f"{', '.join(named)} gives what is not a number from about {at:.6g} s on: look at its law there"
+            return f"{', '.join(named)} is not finite from about {at:.6g} s on: check its law at that time"
     return ""
 
 
 def _violent_load(run: FailedRun) -> str:
-    """Name the force element that jumps at the end of the run, or that has grown without bound."""
+    """Name the force element that jumps at the end of the run, or has grown without bound."""
     t, q, v = run.states[0]
     span, speed = float(run.ts[-1] - run.ts[0]), float(run.analysis.scales.size(v, np))
     scales = run.analysis.scales
     unit = np.tile([float(scales.length), float(scales.length), 1.0], len(q) // 3)
     turn = 1e-6 * max(speed, float(scales.rate)) * unit
-    back, ahead = ((t + way * BESIDE * span, q + way * BESIDE * span * v, v) for way in (-1, 1))
+    back, ahead = ((t + way * NEARBY * span, q + way * NEARBY * span * v, v) for way in (-1, 1))
     loads = _loads(run, [back, (t, q, v), ahead, (t, q, v - turn), (t, q, v + turn), *run.states[1:][::-1][:2]])
     size, names = np.nan_to_num(loads.size, nan=0.0, posinf=1e300), loads.names
     before, now = size[5:].max(0, initial=0.0), size[1]
@@ -172,7 +172,7 @@ def _violent_load(run: FailedRun) -> str:
         if now[k] > GROWN * max(before[k], slow):
             return f'force "{name}" grows without bound: here it is {now[k] / max(before[k], slow):.1g} times what it was'
     largest = size.max(0)
-    # Once from behind to ahead, once from slower to faster.
+    # Once over time, once over velocity.
     time_jump = np.abs(loads.jump[2])
     speed_jump = np.abs(_loads(run, [(t, q, v - turn), (t, q, v + turn)]).jump[1])
     for k, name in enumerate(names):
@@ -204,13 +204,13 @@ def _stiff(run: FailedRun) -> str:
 
 
 def _reach_at_end(run: FailedRun) -> str:
-    """Describe the demands of drivers, if the run ended where the mechanism cannot follow."""
+    """Describe the demands of drivers if the run ended where the mechanism cannot follow."""
     t, span = run.states[0][0], float(run.ts[-1] - run.ts[0])
     return explain_reach(run, min(float(run.ts[-1]), t + NEAR_REACH * span)) if t < run.ts[-1] else ""
 
 
 def _near_singular(run: FailedRun) -> str:
-    """Say that the run ended beside a singular configuration, with the joints that take part."""
+    """Describe the singular configuration near which the run ended, with its joints."""
     t, q, _ = run.states[0]
     rank = run.analysis.rank
     if rank is None or not rank:
@@ -238,15 +238,15 @@ def _loads(run: FailedRun, states: list) -> ElementLoads:
 def explained(
     solution: Solution, mechanism: Mechanism, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
 ) -> Solution:
-    """Return a failed solution of a single run that can say why it failed.
+    """Return a failed solution of a single run, with its cause found on demand.
 
     Args:
-        solution: the solution, of known numbers.
-        mechanism: the mechanism that moved.
+        solution: the solution, of concrete numbers.
+        mechanism: the mechanism.
         analysis: its `Analysis`.
-        drift_tol: the run's tolerance of drift.
+        drift_tol: the `drift_tol` of the run.
         solver: the run's solver; None: the default.
-        end: the last state (t, (q, v)) of the integrator, if it is known.
+        end: the last state (t, (q, v)) of the integrator, if available.
     """
     assert analysis is not None  # a mechanism has one
     q, v = (np.asarray(x).reshape(len(solution.ts), -1) for x in (solution.q, solution.v))
@@ -269,7 +269,7 @@ def explained(
         atol=float(solution.atol),
         drift_tol=float(drift_tol),
         is_projected=chosen["stabilization"] == "Projection",
-        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # the corrector of Adams is not solved, but applied once
+        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # the corrector of Adams is applied once, not solved
         drops_rows=chosen["method"] in ("Auto", "Elimination"),
         formulation=chosen["formulation"],
     )

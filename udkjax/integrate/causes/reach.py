@@ -1,8 +1,8 @@
-"""The reach of drivers: the value from which on constraints cannot be closed any more, and the cause.
+"""The reach of drivers: the value beyond which constraints cannot be closed, and the cause.
 
-The position is followed in small steps of time from the last good state until a step cannot be closed, and the time between is
-halved. Rows that then ask for what no displacement gives are in the left null space of D: of a dead point they are new there; of
-drivers that contradict each other, or the joints, they depend on each other in every position.
+The position is followed in small steps of time from the last good state until one cannot be closed; that step is then bisected.
+Rows with impossible demands are in the left null space of D. At a dead point they are dependent only there; rows of drivers that
+contradict each other, or the joints, are dependent in every position.
 """
 
 from typing import NamedTuple
@@ -17,25 +17,24 @@ from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
 REACH_STEPS = 32  # from the last good state to the time of the failure
-REACH_HALVINGS = 34  # of the step in which it fails: to 2e-12 of the way to that time
-# Of the largest singular value of D: those below belong to the dead point; the position is known to 1e-5 or so.
-DEAD_POINT_TOL = 1e-2
-INVOLVED_SHARE = 1e-3  # of the largest row of a combination: a row below has no part in it
+REACH_HALVINGS = 34  # of the failing step: to 2e-12 of the time to the failure
+DEAD_POINT_TOL = 1e-2  # relative to the largest singular value of D: smaller ones belong to the dead point, found to 1e-5 or so
+INVOLVED_SHARE = 1e-3  # relative to the largest row of a combination: smaller rows are not involved
 IN_LINE = 1e-3  # rad
-STATES_TRIED = 4  # states from which one looks
-SAME_BRANCH = 1.0  # rad, characteristic lengths: a position farther from the one before is on another branch
+STATES_TRIED = 4  # states to start from
+SAME_BRANCH = 1.0  # rad, characteristic lengths: larger changes lead to another branch
 
 
 class Reach(NamedTuple):
-    """The last position that closes, and the rows that ask for more."""
+    """The last position that closes, and the constraints with impossible demands."""
 
     t: float  # s
     q: np.ndarray  # (n,)
-    owners: frozenset[str]  # constraints whose rows cannot go on together
+    owners: frozenset[str]  # constraints whose rows contradict each other
 
 
 def explain_reach(run: FailedRun, until: float) -> str:
-    """Describe the demands of drivers, up to a time (s), that the mechanism cannot meet; an empty text where it can."""
+    """Describe the demands of drivers, up to a time (s), that the mechanism cannot meet; empty if it can."""
     mechanism = run.mechanism
     if not mechanism.drivers:
         return ""
@@ -59,7 +58,7 @@ def explain_reach(run: FailedRun, until: float) -> str:
 
 
 def _find_reach(run: FailedRun, until: float) -> Reach | None:
-    """Return the time and position where the constraints stop closing; None where they close all the way or nowhere."""
+    """Return the time and position where the constraints stop closing; None if they close everywhere or nowhere."""
     rows, size = run.rows, run.rows.scales.size
     first = next((p for p in (rows.close(t, q) for t, q, _ in run.states[:STATES_TRIED] if t < until) if p is not None), None)
     if first is None:
@@ -83,7 +82,7 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
         before, (t, q) = (t, q), (float(at), closure)
     if high is None:
         return None
-    before = None  # beside a dead point the way behind leads astray
+    before = None  # extrapolation misleads near a dead point
     for _ in range(REACH_HALVINGS):
         middle = 0.5 * (t + high)
         closure = close(middle) if t < middle < high else None
@@ -95,7 +94,7 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
 
 
 def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozenset[str]:
-    """Return the constraints that ask, after a time, for what no displacement gives: the part of their demand outside of D."""
+    """Return the constraints with impossible demands after a time: with demands outside of the range of D."""
     rows = run.rows
     psi, length, D = rows.at(t, q)
     u, sigma, _ = np.linalg.svd(dense(D))
@@ -108,13 +107,13 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
 
 
 def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
-    """Return whether the rows of drivers depend on the others in an ordinary position, too."""
+    """Return True if the rows of drivers depend on the others in a generic configuration, too."""
     q = generic_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
     return q is not None and owners_of_row(kinematic_rows(mechanism), 0.0, q, names[-1]) is not None
 
 
 def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
-    """Describe a dead point: the pins of links that lie in line, or the joints that hold together."""
+    """Describe a dead point: links with pins in line, or the joints involved."""
     index = {name: k for k, name in enumerate(mechanism.body_names)}
     frames = found.q.reshape(-1, 3)
     driven = {GROUND, *(body for name in drivers for body in mechanism.drivers[name].bodies)}

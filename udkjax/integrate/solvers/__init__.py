@@ -1,6 +1,6 @@
-"""Solvers of diffrax: its own, and those that are written here, by name and with the tableaus of the explicit ones.
+"""Solvers by name, of diffrax and of this package, and the tableaus of the explicit ones.
 
-diffrax is imported where one is asked for: that takes as long as all of JAX.
+diffrax is imported on demand, since its import takes as long as that of JAX.
 """
 
 from importlib import import_module
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import diffrax
 
 Solver: TypeAlias = "diffrax.AbstractSolver"
-OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, and their modules
+OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # solvers of this folder and their modules
 
 
 def own_solver(name: str) -> "type[diffrax.AbstractSolver]":
-    """Return the class of a solver that is written here. Raises KeyError where there is none of this name."""
+    """Return the class of a solver of this package; raise KeyError for any other name."""
     return getattr(import_module(f"udkjax.integrate.solvers.{OWN[name]}"), name)
 
 
@@ -32,12 +32,12 @@ def solver_named(name: str) -> "diffrax.AbstractSolver":
 
     solver = own_solver(name) if name in OWN else getattr(diffrax, name, None)
     if not (isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver)):
-        raise ValueError(f"{name!r} is no solver: it is none of {', '.join(OWN)}, nor a solver of diffrax such as 'Dopri8'")
+        raise ValueError(f"{name!r} is not a solver: take one of {', '.join(OWN)}, or a solver of diffrax such as 'Dopri8'")
     return solver()
 
 
 def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
-    """Return whether a solver is an explicit Runge-Kutta method with one tableau; None is the default, which is."""
+    """Return True if a solver is an explicit Runge-Kutta method with one tableau, as is the default, None."""
     if solver is None:
         return True
     import diffrax
@@ -46,7 +46,7 @@ def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
 
 
 def method_of(solver: "diffrax.AbstractERK | None") -> Method:
-    """Read the tableau of a solver; None is the default."""
+    """Return the tableau of a solver; None is the default."""
     if solver is None:
         return DOPRI8
     import diffrax
@@ -55,6 +55,6 @@ def method_of(solver: "diffrax.AbstractERK | None") -> Method:
     order: Any = solver.error_order(diffrax.ODETerm(lambda t, y, args: y))
     c, stages, b, error = np.append(0.0, tableau.c), tableau.a_lower, np.asarray(tableau.b_sol), np.asarray(tableau.b_error)
     ends = bool(tableau.fsal and error[-1] != 0)
-    if tableau.fsal and not ends:  # the last stage is there for interpolation, or for the next step
+    if tableau.fsal and not ends:  # the last stage serves interpolation or the next step
         c, stages, b, error = c[:-1], stages[:-1], b[:-1], error[:-1]
     return Method.of(c, stages, b, error, order, ends)

@@ -1,8 +1,8 @@
 """Adams methods of variable order and step.
 
-Order and step are chosen as in STEP by Shampine and Gordon: while a run starts, the order rises and the step doubles at every
-step. Then the order falls as soon as a lower one promises no larger error, and rises after k + 1 steps of one size, when the next
-difference is known.
+Order and step are chosen as in STEP by Shampine and Gordon: at the start of a run the order rises and the step doubles in every
+step. Later the order falls as soon as a lower one promises no larger error, and rises after k + 1 equal steps, when the next
+difference is available.
 """
 
 from collections.abc import Callable
@@ -32,24 +32,23 @@ from udkjax.integrate.solvers.multistep import (
 )
 from udkjax.transforms.gradients import stop_gradients
 
-# Of the iteration, as in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names are behind them.
+# Iteration, as in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names.
 ITERATIONS = 3  # MAXCOR
-ITERATION_SHARE = 0.1  # CORTES: of the tolerance, that may be left to an iteration that stops
-RATE_MEMORY = 0.3  # CRDOWN: of the rate of convergence; a single fast iteration does not count for all
-# Of the choice of order and step, as in STEP (Shampine, Gordon 1975, chapter 10): the step doubles at most, and order one, of
-# whose estimates less is known, is left or taken only where that halves the error.
+ITERATION_SHARE = 0.1  # CORTES: largest remaining error of the iteration, relative to the tolerance
+RATE_MEMORY = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since a single fast one proves little
+# Choice of order and step, as in STEP (Shampine, Gordon 1975, chapter 10): the step doubles at most, and order one, with less
+# reliable estimates, is left or taken only if that halves the error.
 LARGEST = 2.0
 HALF = 0.5
-# Not of a published code. With these an error made of many steps is a few times the tolerance, and takes no more right-hand sides
-# than STEP or VODE (tests/integrate/test_adams.py).
-SHARE = 0.25  # of the tolerance: the error that the next step is chosen for; STEP, whose steps only halve or double, has 0.5
-RUNGS = 4.0  # a step changes by powers of 2^(1/4): the factor does not follow the rounding errors in an estimate
-SMALLEST = 0.25  # factor of a step; STEP halves once or twice
-NEGLIGIBLE = 1e-4  # relative to the tolerance: estimates below are of rounding errors, and say nothing about the order
-EVEN = 1e-2  # relative: two steps that differ by less count as of one size
-# Of rounding.
-SAME_STATE = 1e-14  # relative: a compiler may compute the same state twice, and not quite the same
-TINY = 1e-300  # in the place of zero, where an error divides
+# Own constants: the error of many steps is a few times the tolerance, with no more right-hand sides than STEP or VODE
+# (tests/integrate/test_adams.py).
+SHARE = 0.25  # target error of the next step, relative to the tolerance; STEP, whose steps only halve or double, has 0.5
+RUNGS = 4.0  # a step changes by powers of 2^(1/4), so that it does not follow rounding errors of an estimate
+SMALLEST = 0.25  # smallest factor of a step; STEP halves once or twice
+NEGLIGIBLE = 1e-4  # relative to the tolerance: smaller estimates are rounding errors
+EVEN = 1e-2  # relative: steps that differ by less are equal
+SAME_STATE = 1e-14  # relative: compiled code may compute the same state twice with different rounding
+TINY = 1e-300  # replaces an error of zero in a quotient
 
 
 # --- the choice of order and step
@@ -59,7 +58,7 @@ Size = Callable[[Float[Array, "rows n"]], Float[Array, "rows"]]
 
 
 class ErrorEstimates(eqx.Module):
-    """Estimated local errors of orders k - 2 to k + 1, relative to the tolerance, were all steps of one size."""
+    """Estimated local errors of orders k - 2 to k + 1 with equal steps, relative to the tolerance."""
 
     k_minus_2: Float[Array, ""]
     k_minus_1: Float[Array, ""]
@@ -71,9 +70,9 @@ class OrderControl(eqx.Module):
     """The state of the choice of order and step."""
 
     order: Int[Array, ""]  # of the next step
-    step: Float[Array, ""]  # the next step that is planned
-    equal_steps: Int[Array, ""]  # the number of steps of equal size up to here
-    starting: Bool[Array, ""]  # order and step rise with every step
+    step: Float[Array, ""]  # the planned next step
+    equal_steps: Int[Array, ""]  # number of latest steps of equal size
+    starting: Bool[Array, ""]  # whether order and step rise with every step
 
 
 def first_order_control(h: Float[Array, ""]) -> OrderControl:
@@ -91,32 +90,32 @@ def choose_order(
         h: the step.
         points: the number of values in the history.
         errors: the estimates of the step.
-        least: the lowest order that may be taken.
-        most: the highest one.
+        least: the lowest order allowed.
+        most: the highest order allowed.
 
     Returns:
-        The state after it, and the factor by which the step grows.
+        The state after the step, and the growth factor of the step.
     """
     k, e = control.order, errors
     equal_steps = jnp.where(jnp.abs(h - control.step) < EVEN * h, control.equal_steps + 1, 1)
     falling = jnp.where(k > 2, jnp.maximum(e.k_minus_1, e.k_minus_2) <= e.k, (k == 2) & (e.k_minus_1 <= HALF * e.k))
     falling = falling & (e.k > NEGLIGIBLE)
-    shrunk = (h < (1 - EVEN) * control.step) & (points > 2)  # it was rejected; the first step is only a guess
+    shrunk = (h < (1 - EVEN) * control.step) & (points > 2)  # rejected before; the first step is only a guess
     starting = control.starting & ~shrunk & ~falling & (k < most)
 
-    judged = (equal_steps > k) & (points >= k + 2)
-    down = falling | (judged & (k > 1) & (e.k_minus_1 <= jnp.minimum(e.k, e.k_plus_1)))
-    up = judged & ~down & (e.k_plus_1 < jnp.where(k > 1, 1.0, HALF) * e.k)
+    reliable = (equal_steps > k) & (points >= k + 2)
+    down = falling | (reliable & (k > 1) & (e.k_minus_1 <= jnp.minimum(e.k, e.k_plus_1)))
+    up = reliable & ~down & (e.k_plus_1 < jnp.where(k > 1, 1.0, HALF) * e.k)
     up = (up | starting | (k < least)) & (k < most) & (k < points)
     down = down & ~up & (k > least)
     order = k + up - down
-    error = jnp.where(down, e.k_minus_1, jnp.where(up & judged, e.k_plus_1, e.k))
+    error = jnp.where(down, e.k_minus_1, jnp.where(up & reliable, e.k_plus_1, e.k))
     growth = jnp.where(starting, LARGEST, jnp.maximum(step_factor(error, order), 1.0))
     return OrderControl(order, h * growth, equal_steps, starting), growth
 
 
 def step_factor(error: Float[Array, ""], order: Int[Array, ""]) -> Float[Array, ""]:
-    """Return the factor of a step with this error, of a method of this order."""
+    """Return the factor of a step with this error by a method of this order."""
     factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
     return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
 
@@ -129,35 +128,35 @@ class History(eqx.Module):
 
     ages: Float[Array, "N"]  # t_n - t_{n-j}, j = 0, 1, ...
     phi: Float[Array, "N y"]
-    y: Vector  # to which phi belongs
-    exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value that the corrector has used
-    points: Int[Array, ""]  # number of known points, and of rows of phi that count
+    y: Vector  # the state of phi
+    exact: Bool[Array, ""]  # whether phi_1 is f(t_n, y), not a value of the corrector
+    points: Int[Array, ""]  # number of points, and of valid rows of phi
     control: OrderControl
-    rate: Float[Array, ""]  # at which the iteration converged
+    rate: Float[Array, ""]  # rate of convergence of the iteration
     evaluations: Int[Array, ""]
 
 
 class Adams(Multistep):
-    """Adams-Bashforth-Moulton methods of orders 1 to 12: the order and the step vary.
+    """Adams-Bashforth-Moulton methods of orders 1 to 12 with variable order and step.
 
-    The integral of the polynomial through the k newest values of f predicts the next state, that of the polynomial through one
-    value more corrects it (so that the result is of order k + 1). With `corrector="pece"` the value is f at the predicted state,
-    and f at the corrected state goes into the history: two calls of f a step, one where the error is too large. With
-    `corrector="iteration"` f is called again until the state has converged: mostly one or two calls, but at larger steps it is
-    less stable. Order and step follow from the estimated errors of orders k - 2 to k + 1.
+    The integral of the polynomial through the k newest values of f predicts the next state; that of the polynomial through one
+    more value corrects it (the result has order k + 1). With `corrector="pece"` that value is f at the predicted state, and f at
+    the corrected state enters the history: two calls of f per step, one in a rejected step. With `corrector="iteration"` f is
+    called until the state converges: mostly one or two calls, but less stable at larger steps. Order and step follow from the
+    estimated errors of orders k - 2 to k + 1.
 
-    Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances; for a given sequence
-    of steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`.
+    Use it as any diffrax solver, with a `PIDController` of default factors, which has the tolerances; for a given sequence of
+    steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`.
 
     Source: L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975 (the code STEP), with
-    formulas for steps that all differ, and a step that follows the error more closely. The iteration is stopped as in VODE.
+    formulas for unequal steps, and a step that follows the error more closely. The iteration stops as in VODE.
 
     Args:
         corrector: "pece" or "iteration".
-        min_order: the lowest order, from 1 on.
+        min_order: the lowest order, at least 1.
         max_order: the highest order, up to 12.
-        root_finder: tolerances for steps of given sizes; by default those of the step controller.
-        root_find_max_steps: iterations of a corrector, at most.
+        root_finder: tolerances for given steps; by default those of the step controller.
+        root_find_max_steps: largest number of iterations of the corrector.
     """
 
     corrector: Literal["pece", "iteration"] = eqx.field(default="pece", static=True)
@@ -171,7 +170,7 @@ class Adams(Multistep):
     def __check_init__(self):
         check_orders(self.min_order, self.max_order, HIGHEST)
         if self.corrector not in ("pece", "iteration"):
-            raise ValueError(f'corrector is "pece" or "iteration", not {self.corrector!r}')
+            raise ValueError(f'corrector must be "pece" or "iteration", not {self.corrector!r}')
 
     def order(self, terms):
         return self.max_order
@@ -185,7 +184,7 @@ class Adams(Multistep):
         y, unravel = ravel_pytree(y0)
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         f, h = _field(terms, args, unravel), t1 - t0
-        h = jnp.where(h > 0, h, solver_state.control.step)  # of a member of a batch that has come to its end
+        h = jnp.where(h > 0, h, solver_state.control.step)  # for finished members of a batch
         state, displaced = self._update_newest(f, t0, h, y, solver_state, made_jump)
         k, rule, row = state.control.order, step_coefficients(h, state.ages), jnp.arange(1, self.max_order + 3)[:, None]
         star = jnp.where(row <= state.points, rule.beta[:, None] * state.phi, 0.0)
@@ -254,7 +253,7 @@ class Adams(Multistep):
     def _correct(
         self, f: Callable[[Vector], Vector], y: Vector, slope: Vector, rule: StepCoefficients, size: Size, state: History
     ) -> tuple[Vector, Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:
-        """Return d, by which f exceeds its extrapolated value `slope`, whether it was found, the calls of f, and the rate."""
+        """Return the excess d of f over its extrapolated value `slope`, whether it converged, the calls of f, and the rate."""
         if self.corrector == "pece":
             return f(y) - slope, jnp.array(True), jnp.array(1), state.rate
         k = state.control.order
@@ -276,12 +275,12 @@ class Adams(Multistep):
 
 
 def _field(terms: PyTree[diffrax.AbstractTerm], args: PyTree, unravel: Unravel) -> Field:
-    """Return f as a function of time and of the state as a vector."""
+    """Return f as a function of time and the state vector."""
     return lambda t, y: vector_field(terms, t, unravel(y), args)
 
 
 def _sizes(tolerances: Tolerances, unravel: Unravel, y0: PyTree, y1: PyTree) -> Size:
-    """Return the function that gives the norms of the rows of a matrix, relative to what a step may err."""
+    """Return the function that gives the norms of the rows of a matrix, relative to the tolerance of a step."""
     tolerances, y0, y1 = stop_gradients((tolerances, y0, y1))
     allowed = error_scale(tolerances, y0, y1)
     size = jax.vmap(lambda x: STRICTER * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))

@@ -29,30 +29,30 @@ from udkjax.transforms.gradients import stop_gradients
 
 Terms = PyTree[diffrax.AbstractTerm]
 
-HIGHEST = 5  # the formula of order six is of little use, the seventh unstable (Hairer, Wanner II, section V.1)
-# Constants of VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names behind them.
-WORTHWHILE = 1.5  # THRESH: the step grows by no smaller factor; while it is steady, M serves and the error estimates are good
-LARGEST, SMALLEST = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step; those of diffrax.PIDController, by default
+HIGHEST = 5  # order six is of little use, and order seven unstable (Hairer, Wanner II, section V.1)
+# Constants of VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names.
+WORTHWHILE = 1.5  # THRESH: least growth of a step; with a constant step M can be reused and the error estimates are good
+LARGEST, SMALLEST = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step, the defaults of diffrax.PIDController
 NO_DIVISION_BY_ZERO = 1e-6  # ADDON
-# By how much the estimated error of the next step shall be below the tolerance, if it is of order k - 1, k or k + 1 (BIAS1,
-# BIAS2, BIAS3: 6, 6, 10), beyond STRICTER; and the part of the error that an iteration may leave (CORTES: 0.1). In brackets are
-# VODE's own numbers. With these an error made of many steps is a few times the tolerance, and the same error takes no more
-# right-hand sides than VODE (tests/integrate/test_bdf.py).
+# Ratio of the tolerance to the estimated error of the next step at orders k - 1, k and k + 1 (BIAS1, BIAS2, BIAS3: 6, 6, 10), in
+# addition to STRICTER; and the fraction of the error that an iteration may leave (CORTES: 0.1). VODE's own numbers are in
+# brackets. With these the error of many steps is a few times the tolerance, and the same error takes no more right-hand sides
+# than VODE (tests/integrate/test_bdf.py).
 LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
-# Not of a published code.
-BETTER = 1.1  # another order allows a step larger by this factor, or it is not taken
-REPEATED = 1e-3  # relative: a step that is so much smaller than planned was rejected before
+# Own constants.
+BETTER = 1.1  # another order is taken only if it allows a step larger by this factor
+REPEATED = 1e-3  # relative: a step smaller than planned by more than this was rejected before
 
 
 class BDFState(eqx.Module):
     """The state of the solver after a step: the history, and the choices.
 
-    Of the states accepted at times[0], times[1], ..., newest first, it keeps the modified divided differences
+    It stores the modified divided differences of the states accepted at times[0], times[1], ..., newest first,
 
         phi[i] = (times[0] - times[1]) ... (times[0] - times[i]) y[times[0], ..., times[i]],
 
-    which for a constant step are the backward differences.
+    which for a constant step are backward differences.
     """
 
     times: Float[Array, "m"]
@@ -65,22 +65,22 @@ class BDFState(eqx.Module):
 
     @property
     def evaluations(self):
-        """Calls of the vector field."""
+        """Number of calls of the vector field."""
         return self.newton.evaluations
 
     @property
     def jacobians(self):
-        """Jacobians taken; each gives a value of the vector field too, which is among the evaluations."""
+        """Number of Jacobians; each also gives a value of the vector field, counted among the evaluations."""
         return self.newton.jacobians
 
     @property
     def factorizations(self):
-        """Matrices factorized."""
+        """Number of factorized matrices."""
         return self.newton.factorizations
 
 
 class BDFInterpolation(diffrax.AbstractLocalInterpolation):
-    """The polynomial through the states at the end of a step and before, as many as the order of the step and one."""
+    """The polynomial through the state at the end of a step of order k and the k states before."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
@@ -102,15 +102,15 @@ class BDF(Multistep):
 
         p'(t) + (1 + 1/2 + ... + 1/k) (y - p(t)) / h = f(t, y),
 
-    p being the polynomial through the last k + 1 states: for a constant step it is Gear's formula, for a variable one its
-    "fixed leading coefficient" form. The equation is solved by Newton's method with a Jacobian from forward-mode differentiation,
-    kept for as many steps as it serves. Order and step follow from the estimated errors of orders k - 1, k and k + 1.
+    where p is the polynomial through the last k + 1 states: for a constant step Gear's formula, for a variable one its "fixed
+    leading coefficient" form. The equation is solved by Newton's method with a Jacobian from forward-mode differentiation, reused
+    as long as it converges. Order and step follow from the estimated errors of orders k - 1, k and k + 1.
 
-    Use it as any diffrax solver, with a `PIDController` of default factors, which tells it the tolerances; for a given sequence
-    of steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`, `jacobians` and
+    Use it as any diffrax solver, with a `PIDController` of default factors, which has the tolerances; for a given sequence of
+    steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`, `jacobians` and
     `factorizations`. A step whose equation could not be solved is rejected.
 
-    Orders 3 to 5 are unstable for fast oscillations that are hardly damped: `max_order=2` takes larger steps there.
+    Orders 3 to 5 are unstable for fast, weakly damped oscillations: `max_order=2` takes larger steps for these.
 
     Source: C. W. Gear, Numerical Initial Value Problems in Ordinary Differential Equations, 1971; formulas and error estimates as
     in K. E. Brenan, S. L. Campbell, L. R. Petzold, Numerical Solution of Initial-Value Problems in Differential-Algebraic
@@ -118,9 +118,9 @@ class BDF(Multistep):
 
     Args:
         max_order: the highest order, up to 5.
-        min_order: the lowest order, from 1 on.
-        root_finder: tolerances for steps of given sizes; by default those of the step controller.
-        root_find_max_steps: Newton's iterations of a step, at most.
+        min_order: the lowest order, at least 1.
+        root_finder: tolerances for given steps; by default those of the step controller.
+        root_find_max_steps: largest number of Newton iterations of a step.
     """
 
     max_order: int = eqx.field(default=HIGHEST, static=True)
@@ -149,7 +149,7 @@ class BDF(Multistep):
         t1: Float[Array, ""],
         y: Float[Array, "n"],
     ) -> BDFState:
-        """Return a history of one state, as if the state had always changed at the rate f."""
+        """Return a history of one state, extrapolated at the rate f."""
         m, h = self.max_order + 2, t1 - t0
         phi = jnp.zeros((m, len(y)), y.dtype).at[0].set(y).at[1].set(h * f)
         one, iteration = (
@@ -229,10 +229,10 @@ class BDF(Multistep):
     def _choose(
         self, k: Int[Array, ""], errors: Float[Array, "3"], wait: Int[Array, ""], retried: Bool[Array, ""]
     ) -> tuple[Float[Array, ""], Int[Array, ""], Int[Array, ""]]:
-        """Return, after an accepted step, the factor of the next, its order, and how many steps to wait with another.
+        """Return, after an accepted step, the factor of the next, its order, and the number of steps before another change.
 
-        A better order is taken also where the step does not grow: a run may stand far above the error that it aims at, since a
-        step that was accepted does not shrink.
+        A better order is taken even if the step does not grow: since accepted steps do not shrink, the error may be far above
+        its target.
         """
         orders = k + jnp.array([-1, 0, 1])
         wait = wait - 1
@@ -260,7 +260,7 @@ class _Size(eqx.Module):
 
 
 def _weights(times: Float[Array, "m"], t: Float[Array, ""]) -> Float[Array, "m"]:
-    """Return the weights of phi in the polynomial that it stands for, at t."""
+    """Return the weights of phi in its polynomial at t."""
     return jnp.concatenate([jnp.ones(1, times.dtype), jnp.cumprod((jnp.asarray(t) - times[:-1]) / (times[0] - times[1:]))])
 
 
@@ -272,7 +272,7 @@ def _error_constant(k: Int[Array, ""], alpha: Float[Array, "m"]) -> Float[Array,
 
 
 def _errors(k: Int[Array, ""], alpha: Float[Array, "m"], phi: Float[Array, "m n"], size: _Size) -> Float[Array, "3"]:
-    """Return the norms of h^(j+1) y^(j+1) / (j + 1), the local errors of orders j = k - 1, k, k + 1 with a constant step."""
+    """Return the norms of h^(j+1) y^(j+1) / (j + 1), the local errors of orders j = k - 1, k, k + 1 for a constant step."""
     i = jnp.arange(len(alpha))
     constants = jnp.cumprod((1.0 + i) * alpha) / (1.0 + i)
     rows = jnp.minimum(k + jnp.arange(3), len(alpha) - 1)
@@ -280,6 +280,6 @@ def _errors(k: Int[Array, ""], alpha: Float[Array, "m"], phi: Float[Array, "m n"
 
 
 def _factor(error: Float[Array, "*k"], order: Int[Array, "*k"], below: Array | float) -> Float[Array, "*k"]:
-    """Return the factor of a step whose error is to be `below` times smaller than the tolerance."""
+    """Return the factor of a step with an error `below` times smaller than the tolerance."""
     size = jnp.power(below * error, 1 / (order + 1))
     return 1 / (size + NO_DIVISION_BY_ZERO)

@@ -1,7 +1,7 @@
-"""Count right-hand sides exactly: also those of steps that were rejected.
+"""Exact counts of right-hand sides, including those of rejected steps.
 
-diffrax counts steps, and where its controller rejects a step it restores the solver's state. The controller's own state it does
-not restore. So a step says beside its error estimate what it took, and the controller adds that up.
+diffrax counts only steps, and restores the solver's state after a rejected step, but not the controller's. Each step therefore
+returns its count together with its error estimate, and the controller adds them up.
 """
 
 import diffrax
@@ -9,11 +9,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-NOT_COUNTED = -1  # before the first step, which says how many evaluations the start took
+NOT_COUNTED = -1  # before the first step, which returns the evaluations of the start
 
 
 class Tally(eqx.Module):
-    """An error estimate, the calls of the vector field of the attempt, and those before it; None where they are not known."""
+    """An error estimate, and the calls of the vector field in the attempt and before it; None if unknown."""
 
     error: PyTree[Array]
     evaluations: Int[Array, ""] | None
@@ -23,33 +23,33 @@ class Tally(eqx.Module):
 def tally(solver: diffrax.AbstractSolver, error: PyTree, before: PyTree, after: PyTree, made_jump: Bool[ArrayLike, ""]) -> Tally:
     """Count the calls of an attempt, from the solver's states before and after it.
 
-    Known for explicit Runge-Kutta methods, from their tableau, and for every method whose state has a field `evaluations`, the
-    calls until then.
+    They are known for explicit Runge-Kutta methods, by their tableau, and for methods whose state has a field `evaluations`, the
+    calls so far.
     """
     if hasattr(before, "evaluations"):
         return Tally(error, after.evaluations - before.evaluations, before.evaluations)
-    if not issubclass(type(solver), diffrax.AbstractERK):  # by its own type: a wrapper may take several steps in one
+    if not issubclass(type(solver), diffrax.AbstractERK):  # by its own type: a wrapper may take several steps at once
         return Tally(error, None, None)
     stages = solver.tableau.num_stages  # pyright: ignore[reportAttributeAccessIssue]
-    if before is not None:  # the last stage of the step before is the first of this one, unless there is none
+    if before is not None:  # the last stage of the previous step is the first of this one
         nothing_kept, _ = before
         stages = stages - jnp.where(nothing_kept | made_jump, 0, 1)
     return Tally(error, jnp.asarray(stages), jnp.asarray(0))
 
 
 class Wrapper(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
-    """A diffrax solver around another one, which answers everything that diffrax asks, but for the step itself."""
+    """A diffrax solver that forwards all attributes and methods to another one, except `step`."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
     @property
     def root_finder(self):
-        """Of an implicit solver: diffrax gives it the tolerances of the step size controller."""
+        """The root finder of an implicit solver: diffrax gives it the tolerances of the step size controller."""
         return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def scan_kind(self):
-        """Of a Runge-Kutta method: some adjoints choose the kind of the loop over its stages."""
+        """The kind of the loop over the stages of a Runge-Kutta method, which some adjoints choose."""
         return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
@@ -91,7 +91,7 @@ class CountingSolver(Wrapper):
 
 
 class CountingController(diffrax.AbstractAdaptiveStepSizeController):
-    """A step size controller that adds up what the attempts of a `CountingSolver` took."""
+    """A step size controller that adds up the counts of a `CountingSolver`."""
 
     controller: diffrax.AbstractStepSizeController
 
@@ -123,7 +123,7 @@ class CountingController(diffrax.AbstractAdaptiveStepSizeController):
             t0, t1, y0, y1_candidate, args, y_error.error, error_order, state
         )
         if y_error.evaluations is not None:
-            # diffrax replaces what is not a number in an error, and so makes these of a float type
+            # diffrax replaces NaN in errors, and makes these counts floats by that
             taken, before = (jnp.asarray(x).astype(total.dtype) for x in (y_error.evaluations, y_error.before))
             total = jnp.where(total == NOT_COUNTED, before, total) + taken
         return keep, *times, jumped, (state, total), result
@@ -132,7 +132,7 @@ class CountingController(diffrax.AbstractAdaptiveStepSizeController):
 def count_evaluations(
     solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController
 ) -> tuple[CountingSolver, CountingController]:
-    """Make a solver and its step size controller count: give both, as they come back, to `diffrax.diffeqsolve`.
+    """Return a counting solver and step size controller for `diffrax.diffeqsolve`.
 
     With `saveat=SaveAt(..., controller_state=True)` the count is `evaluations(run.controller_state)`.
     """
@@ -140,8 +140,8 @@ def count_evaluations(
 
 
 def evaluations(controller_state: PyTree) -> Int[Array, ""]:
-    """Return the calls of the vector field by a run's solver, or -1: not known, or no step was taken.
+    """Return the calls of the vector field by a run's solver, or -1 if unknown or without a step.
 
-    The choice of a first step takes more.
+    Those of the choice of the first step are not included.
     """
     return controller_state[1]

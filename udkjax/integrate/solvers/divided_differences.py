@@ -1,6 +1,6 @@
-"""The polynomial through the newest values of f, as Adams methods integrate it.
+"""The polynomial through the newest values of f that Adams methods integrate.
 
-The values at the times t_n > t_{n-1} > ... are kept as Krogh's modified divided differences, which stay of the size of f:
+The values at the times t_n > t_{n-1} > ... are stored as Krogh's modified divided differences, which are of the size of f:
 
     phi_i(n) = psi_1(n) ... psi_{i-1}(n) f[t_n, ..., t_{n-i+1}],        psi_i(n) = t_n - t_{n-i}.
 
@@ -9,7 +9,7 @@ For the step from t_n to t_{n+1} = t_n + h, with psi_i(n+1) = h + psi_{i-1}(n), 
     P(t_n + s h) = sum_{i<=k} c_i(s) phi*_i,        c_i(s) = prod_{j<i} (s h + psi_{j-1}(n)) / psi_j(n+1),
     phi*_i = beta_i phi_i(n),                       beta_i = prod_{j<i} psi_j(n+1) / psi_j(n).
 
-c_{k+1} is zero at these k times and one at t_{n+1}: P + c_{k+1} d is the polynomial through one value more, d above P(t_{n+1}).
+c_{k+1} is zero at these k times and one at t_{n+1}: P + c_{k+1} d is the polynomial through one more value, d above P(t_{n+1}).
 The differences at t_{n+1}, where f is P(t_{n+1}) + d, are phi_i(n+1) = f - sum_{j<i} phi*_j.
 
 L. F. Shampine, M. K. Gordon, Computer Solution of Ordinary Differential Equations, 1975, chapters 5 and 6.
@@ -23,8 +23,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-HIGHEST = 12  # order; beyond it the methods are hardly stable
-# Gauss's points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
+HIGHEST = 12  # order; higher ones are hardly stable
+# Gauss points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
 POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
 
 
@@ -40,20 +40,20 @@ GAMMA = _adams_moulton(HIGHEST + 2)
 
 
 class StepCoefficients(eqx.Module):
-    """The coefficients of a step, which depend on its times alone. Index 0 belongs to i = 1."""
+    """The coefficients of a step, which depend only on its times. Index 0 is i = 1."""
 
     h: Float[Array, ""]
     beta: Float[Array, "N"]
     g: Float[Array, "N"]  # integrals of c_i from 0 to 1
-    errors: Float[Array, "N"]  # h sigma_j |gamma*_j|: with phi_{j+1}(n+1), the local error of order j, were all steps equal to h
+    errors: Float[Array, "N"]  # h sigma_j |gamma*_j|: times phi_{j+1}(n+1), the local error of order j for constant steps h
 
     def gains(self, k: Int[Array, ""]) -> Float[Array, ""]:
-        """Return the factor that makes of d the difference between the results of orders k and k + 1."""
+        """Return the ratio to d of the difference between the results of orders k and k + 1."""
         return self.h * jnp.abs(self.g[k - 1] - self.g[k])
 
 
 def step_coefficients(h: Float[Array, ""], ages: Float[Array, "N"]) -> StepCoefficients:
-    """Return the coefficients of a step, from the step ahead and the ages psi_0(n) = 0, psi_1(n), ... of the values."""
+    """Return the coefficients of a step h, from the ages psi_0(n) = 0, psi_1(n), ... of the values."""
     j = jnp.arange(1, len(ages))
     ahead = h + ages[:-1]
     beta = jnp.concatenate([jnp.ones_like(ages[:1]), jnp.cumprod(ahead / ages[1:])])
@@ -70,7 +70,7 @@ def integrate_basis(s: Float[Array, ""], h: Float[Array, ""], ages: Float[Array,
 
 
 class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
-    """The polynomial that the step itself has integrated, of the step's order."""
+    """The integral of the polynomial of a step, of the step's order."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]

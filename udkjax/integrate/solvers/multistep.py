@@ -1,8 +1,8 @@
-"""Control of step and order, and counting, which the multistep methods of variable order share.
+"""Control of step and order, common to the multistep methods of variable order.
 
 A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an
-error estimate of one fixed order. So the methods here say what they want in the language of that controller: `steer_error` gives
-it an error from which `PIDController` draws the very factor that the method has chosen.
+error estimate of one fixed order. `steer_error` therefore returns an error from which `PIDController` computes exactly the factor
+that the method has chosen.
 """
 
 from collections.abc import Callable
@@ -19,16 +19,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 Flag = Bool[ArrayLike, ""]
 Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
 
-SAFETY = 0.9  # of diffrax.PIDController, by default
-STRICTER = 8.0  # than the tolerance: the errors of many short steps add up
-LOST_STEP = 0.05  # a step that is cut to a smaller part than this starts again at order one: there was a jump
-ERROR_ORDER = 2  # given to the controller: the order of the error of the first step, which is of order one
+SAFETY = 0.9  # default of diffrax.PIDController
+STRICTER = 8.0  # ratio of the tolerance to the target of a step, since the errors of many short steps add up
+LOST_STEP = 0.05  # a step cut to a smaller fraction restarts at order one: there was a jump
+ERROR_ORDER = 2  # for the controller: the order of the error of the first step, which has order one
 
 
 class Tolerances(eqx.Module):
-    """The error that a step may make, and its norm.
+    """The tolerances of a step, and the norm of its error.
 
-    As `root_finder` of a method it stands where diffrax, looking for a root finder, puts its controller's tolerances.
+    As `root_finder` of a method they receive the controller's tolerances from diffrax.
     """
 
     rtol: Float[ArrayLike, ""]
@@ -37,22 +37,22 @@ class Tolerances(eqx.Module):
 
 
 def tolerances_from_controller() -> Tolerances:
-    """Return tolerances that `diffeqsolve` replaces by those of its step size controller."""
+    """Return placeholders that `diffeqsolve` replaces by the tolerances of its step size controller."""
     make: Any = diffrax.with_stepsize_controller_tols
     return make(Tolerances)()
 
 
 def error_scale(tolerances: Tolerances, y0: PyTree[Array], y1: PyTree[Array]) -> PyTree[Array]:
-    """Return atol + rtol max(|y0|, |y1|), as the controller has it."""
+    """Return atol + rtol max(|y0|, |y1|), as in the controller."""
     return jax.tree.map(lambda a, b: tolerances.atol + tolerances.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), y0, y1)
 
 
 def steer_error(
     tolerances: Tolerances, y0: PyTree[Array], y1: PyTree[Array], accept: Bool[Array, ""], factor: Float[Array, ""]
 ) -> PyTree[Array]:
-    """Return an error estimate from which the controller accepts the step or not, and multiplies its size by `factor`.
+    """Return an error estimate that makes the controller accept or reject the step, and multiply it by `factor`.
 
-    The controller takes SAFETY / norm(error / scale)^(1 / ERROR_ORDER); it never shrinks a step after one that it accepted.
+    The controller's factor is SAFETY / norm(error / scale)^(1 / ERROR_ORDER); it never shrinks a step after an accepted one.
     """
     factor = jnp.where(accept, jnp.maximum(factor, 1.0), jnp.minimum(factor, SAFETY * (1 - 1e-3)))
     size = (SAFETY / jax.lax.stop_gradient(factor)) ** ERROR_ORDER
@@ -62,22 +62,22 @@ def steer_error(
 
 def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Float[Array, ""], y: PyTree[Array], args: PyTree) -> Float[Array, "n"]:
     """Return the derivative of y, as a vector."""
-    unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the time that a step would take
+    unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the control of a step
     return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]
 
 
 def check_orders(least: int, most: int, highest: int) -> None:
-    """Refuse orders that a family of methods does not have."""
+    """Raise ValueError for orders outside of a family of methods."""
     if not 1 <= least <= most <= highest:
-        raise ValueError(f"1 <= min_order <= max_order <= {highest}; they are {least} and {most}")
+        raise ValueError(f"orders must satisfy 1 <= min_order <= max_order <= {highest}, not min_order={least}, max_order={most}")
 
 
 class Multistep(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     """A multistep method of variable order and step.
 
-    Its solver state has a field `evaluations`: the calls of the vector field in `init` and in the steps that were accepted. A
-    state y0 that is not the last y1 (it was projected) replaces the newest point of the history, or moves all of it there;
-    `made_jump` begins a new history.
+    Its solver state has a field `evaluations`: the calls of the vector field in `init` and in accepted steps. A state y0 that
+    differs from the last y1, as after a projection, replaces the newest point of the history, or shifts the whole history;
+    `made_jump` starts a new history.
     """
 
     root_finder: eqx.AbstractVar[Tolerances]

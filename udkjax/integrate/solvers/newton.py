@@ -1,16 +1,16 @@
-"""Modified Newton for implicit multistep methods: a Jacobian that is used while it serves.
+"""Modified Newton method for implicit multistep methods, with a Jacobian that is reused while it converges.
 
-An implicit step looks for the correction e to a predicted state y,
+An implicit step solves for the correction e of a predicted state y,
 
     e = c (f(t, y + e) - v),        c = h / gamma,
 
-with v the predicted derivative. Newton's method, with a matrix M = I - c J that may be some steps old, repeats
+where v is the predicted derivative. Newton's method, with a matrix M = I - c J that may be some steps old, repeats
 
     M d = c (f(t, y + e) - v) - e,        e <- e + d.
 
-Its limit does not depend on M, nor does its derivative, which is that of the equation by the implicit function theorem. When to
-take a new J and a new M, when to stop and when to give up are the rules of VODE (Brown, Byrne, Hindmarsh, "VODE: a
-variable-coefficient ODE solver", SIAM J. Sci. Stat. Comput. 10 (1989) 1038), whose names stand behind the numbers below.
+Its limit and its derivative, by the implicit function theorem, do not depend on M. The rules for a new J and M, for stopping and
+for giving up are those of VODE (Brown, Byrne, Hindmarsh, "VODE: a variable-coefficient ODE solver", SIAM J. Sci. Stat. Comput. 10
+(1989) 1038), with its names in the comments below.
 """
 
 from collections.abc import Callable
@@ -25,10 +25,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from udkjax.integrate.solvers.multistep import Unravel, vector_field
 
-ITERATIONS = 3  # MAXCOR: with one matrix, by default; more rarely help
-JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # MSBJ, MSBP: for which they are used at most
-CHANGE = 0.3  # CCMAX: of c, relatively, up to which M is used
-FASTEST = 0.3  # CRDOWN: the rate of convergence falls by this factor an iteration at most; one fast iteration proves little
+ITERATIONS = 3  # MAXCOR: with one matrix; more rarely help
+JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # MSBJ, MSBP: largest ages in steps
+CHANGE = 0.3  # CCMAX: largest relative change of c with the same M
+FASTEST = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since one fast iteration proves little
 DIVERGING = 2.0  # RDIV: ratio of successive corrections at which to give up
 
 
@@ -82,11 +82,11 @@ def invalidate(state: NewtonState) -> NewtonState:
 class _Iteration(eqx.Module):
     state: NewtonState
     e: Float[Array, "n"]
-    size: Float[Array, ""]  # of the last correction
+    size: Float[Array, ""]  # size of the last correction
     count: Int[Array, ""]
-    fresh: Bool[Array, ""]  # the Jacobian is of this step
-    renew: Bool[Array, ""]  # take a Jacobian now
-    factor: Bool[Array, ""]  # and factorize M
+    fresh: Bool[Array, ""]  # the Jacobian was computed in this step
+    renew: Bool[Array, ""]  # compute a Jacobian now
+    factor: Bool[Array, ""]  # factorize M now
     converged: Bool[Array, ""]
     failed: Bool[Array, ""]
 
@@ -97,8 +97,8 @@ def solve(
 ) -> tuple[Float[Array, "n"], Bool[Array, ""], NewtonState]:
     """Return e, whether it was found, and the state for the next step.
 
-    `size` is a pytree that is called: of a correction it tells how much it matters, which shall be less than one. After so many
-    `iterations` with one matrix it is given up.
+    `size` is a callable pytree: the size of a correction, to be less than one. The iteration fails after `iterations` iterations
+    with one matrix.
     """
     renew = state.jacobian_age >= JACOBIAN_STEPS
     factor = renew | (state.matrix_age >= MATRIX_STEPS) | ~(jnp.abs(equation.c / state.c - 1) <= CHANGE)
@@ -138,9 +138,9 @@ def _(primals, tangents):
 
 
 def _matrices(equation: Implicit, now: _Iteration) -> tuple[Float[Array, "n"], NewtonState]:
-    """Return f, and the state with a new J and a new M where they are due.
+    """Return f, and the state with a new J and a new M if they are due.
 
-    Both are branches, also under vmap while no member needs them.
+    Both are branches, also under vmap as long as no member needs them.
     """
     state, renew = now.state, now.renew
 

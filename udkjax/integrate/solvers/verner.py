@@ -26,9 +26,8 @@ TABLEAU = diffrax.ButcherTableau(
     b_error=row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616") - row("13/160 0 2375/5984 5/16 12/85 3/44 0 0"),
 )
 
-# Column m: coefficients of s^(m + 1). Of the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
-# those whose residuals in the conditions of order 5, and then of order 6, are smallest. b(1) is b_sol; b'(0) is the first stage
-# alone.
+# Column m: coefficients of s^(m + 1). Among the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
+# these have the smallest residuals in the conditions of order 5, then of order 6. b(1) is b_sol; b'(0) is the first stage alone.
 DENSE = np.array(
     [
         [1.0, -2.7926169818074067, 2.6533780544166103, -0.6910024927492995, -0.09940999448060499, 0.0046514146207005174],
@@ -44,7 +43,7 @@ DENSE = np.array(
 
 
 class VernerInterpolation(diffrax.AbstractLocalInterpolation):
-    """y(t0 + s h) = y0 + sum_i b_i(s) k_i, of order 4: no stage beyond those of the step."""
+    """Dense output y(t0 + s h) = y0 + sum_i b_i(s) k_i of order 4, without further stages."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
@@ -64,11 +63,11 @@ class VernerInterpolation(diffrax.AbstractLocalInterpolation):
 
 
 class Verner65(diffrax.AbstractERK):
-    """Verner's Runge-Kutta pair of orders 6 and 5 with 8 stages; the result of order 6 is carried on.
+    """Verner's Runge-Kutta pair of orders 6 and 5 with 8 stages; the step continues from the result of order 6.
 
     The method of IMSL's DIVPRK. J. H. Verner, Explicit Runge-Kutta methods with estimates of the local truncation error,
     SIAM J. Numer. Anal. 15 (1978) 772-790; T. E. Hull, W. H. Enright, K. R. Jackson, User's guide for DVERK, Toronto (1976).
-    Between the steps a polynomial of order 4 (the pair has none of its own).
+    Dense output is a polynomial of order 4, since the pair has none of its own.
 
     Args:
         scan_kind: diffrax's way to loop over the stages.

@@ -1,8 +1,8 @@
-"""Real numbers known to within a radius, in arrays: results hold whatever was rounded on the way.
+"""Ball arithmetic: arrays of real numbers with radii that enclose all rounding errors.
 
-A ball is a middle and a radius. Middles are of the longest floating-point type that the processor has, or fractions, which
-are exact; each operation adds to the radius what its rounding may be off by, and radii, in float64, are rounded up by
-INFLATE, which is more than all the operations of a certificate could lose.
+A ball has a middle and a radius. Middles have the longest floating-point type of the processor, or are exact fractions; each
+operation adds a bound of its rounding error to the radius. Radii, in float64, are rounded up by INFLATE, which exceeds the loss
+of all operations of a certificate.
 """
 
 from fractions import Fraction
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 LONG = np.longdouble
-ROUNDING = float(np.finfo(LONG).eps)  # relative, of one operation on middles: twice what it can be
-INFLATE = 1.0 + 1e-10  # of a radius, by each operation: some 1e6 roundings of float64
-SMALLEST = float(np.finfo(float).tiny)  # bound on what underflow loses
+ROUNDING = float(np.finfo(LONG).eps)  # twice the largest relative error of one operation on middles
+INFLATE = 1.0 + 1e-10  # factor of a radius in each operation: some 1e6 roundings of float64
+SMALLEST = float(np.finfo(float).tiny)  # bound of the loss by underflow
 
 
 class Ball(NamedTuple):
@@ -22,7 +22,7 @@ class Ball(NamedTuple):
     mid: np.ndarray
     rad: np.ndarray
 
-    __array_ufunc__ = None  # of arrays and balls, the balls' operators are meant
+    __array_ufunc__ = None  # arrays defer to the operators of balls
 
     @classmethod
     def of(cls, x: Any, rad: Any = 0.0) -> "Ball":
@@ -32,7 +32,7 @@ class Ball(NamedTuple):
 
     @classmethod
     def fractions(cls, x: Any) -> "Ball":
-        """Return numbers as balls whose middles are fractions: exact ones."""
+        """Return numbers as exact balls, whose middles are fractions."""
         x = np.asarray(x, LONG)
         high = x.astype(float)
         low = (x - high).astype(float)
@@ -65,7 +65,7 @@ class Ball(NamedTuple):
     __rmul__ = __mul__  # pyright: ignore[reportAssignmentType]
 
     def __truediv__(self, other: Any) -> "Ball":
-        """Return the quotient: of infinite radius where the divisor may be zero."""
+        """Return the quotient; its radius is infinite where the divisor may be zero."""
         b = self._like(other)
         least = _size(b.mid) / INFLATE - b.rad
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -74,7 +74,7 @@ class Ball(NamedTuple):
         return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
 
     def _like(self, x: Any) -> "Ball":
-        """Return numbers that are no balls as balls, of the same type as these."""
+        """Return numbers as balls of the same type as these."""
         if isinstance(x, Ball):
             return x
         return Ball.fractions(x) if self.mid.dtype == object else Ball.of(x)
@@ -90,16 +90,16 @@ class Ball(NamedTuple):
 
     @property
     def least(self) -> np.ndarray:
-        """The least modulus of any number of the ball, in float64: zero or less where zero is one of them."""
+        """The least modulus of any number of the ball, in float64; zero or less if the ball contains zero."""
         return (_size(self.mid) / INFLATE - self.rad) / INFLATE
 
     def overlaps(self, other: "Ball") -> np.ndarray:
-        """Return a mask of the places where two balls may have a number in common."""
+        """Return a mask of the entries whose balls may overlap."""
         return ~((self - other).least > 0)
 
 
 class ComplexBall(NamedTuple):
-    """Complex numbers of which both parts are balls."""
+    """Complex numbers with balls as real and imaginary parts."""
 
     re: Ball
     im: Ball
@@ -123,7 +123,7 @@ class ComplexBall(NamedTuple):
         return ComplexBall(self.re.part(index), self.im.part(index))
 
     def overlaps(self, other: "ComplexBall") -> np.ndarray:
-        """Return a mask of the places where two may have a number in common."""
+        """Return a mask of the entries whose balls may overlap."""
         return self.re.overlaps(other.re) & self.im.overlaps(other.im)
 
     def distance(self, z: np.ndarray) -> np.ndarray:

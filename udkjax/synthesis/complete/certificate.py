@@ -1,11 +1,10 @@
-"""Certificates of real solutions: a proof, in floating-point numbers, that a system has one near an approximate one.
+"""Certificates of real solutions: proofs, in floating-point numbers, that a system has one near an approximate one.
 
 Krawczyk's theorem: F has continuous derivatives, m is a point, U the box of all u with |u - m| <= r, Y any matrix. If
 
     |Y F(m)| + |1 - Y F'(U)| r < r      in every component,
 
-F has exactly one zero in U, and F' is regular all over it. Both terms are bounded from above with all their roundings
-(balls.py).
+F has exactly one zero in U, and F' is regular on U. Both terms are bounded from above, rounding errors included (balls.py).
 
 Source: R. Krawczyk, Newton-Algorithmen zur Bestimmung von Nullstellen mit Fehlerschranken, Computing 4 (1969); R. E. Moore, A
 test for existence of solutions to nonlinear systems, SIAM J. Numer. Anal. 14 (1977).
@@ -18,12 +17,11 @@ import numpy as np
 
 from udkjax.synthesis.complete.balls import INFLATE, LONG, ROUNDING, SMALLEST, Ball
 
-# A box is so many times as large as the Newton step in it; of components beside the largest one, at least so much.
-WIDTHS = (2.0, 16.0)
-LEAST_SHARE = 1e-3
-NEWTON_STEPS, EXACT_STEPS = 10, 4  # at most: they double the digits
-FARTHEST = 1e8  # units: beyond, Newton's method has left for infinity
-SURE = 1e-3  # relative: a Newton step, rounding included, beyond which more digits do not help either
+WIDTHS = (2.0, 16.0)  # of a box, relative to its Newton step
+LEAST_SHARE = 1e-3  # least width in a component, relative to the largest one
+NEWTON_STEPS, EXACT_STEPS = 10, 4  # at most; each doubles the digits
+FARTHEST = 1e8  # beyond it Newton's method has gone to infinity
+SURE = 1e-3  # largest relative Newton step, rounding included, for which more digits help
 EPS = float(np.finfo(float).eps)
 
 BallFunction = Callable[[Ball], tuple[Ball, Ball]]
@@ -33,9 +31,9 @@ class Certificate(NamedTuple):
     """Boxes of M approximate solutions of N equations.
 
     Attributes:
-        middle: (N, M), improved by Newton's method, in the longest floating-point type.
-        radius: (N, M), of the box.
-        is_proven: whether the box has exactly one solution (M,).
+        middle: centres (N, M), improved by Newton's method, in the longest floating-point type.
+        radius: radii of the boxes (N, M).
+        is_proven: whether each box has exactly one solution (M,).
     """
 
     middle: np.ndarray
@@ -53,15 +51,15 @@ class Certificate(NamedTuple):
 
 
 def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = None) -> Certificate:
-    """Improve approximate solutions and prove that they are some.
+    """Improve approximate solutions and prove them.
 
     Args:
-        system: from unknowns (N, M) to F (N, M) and F' (N, N, M), for balls.
+        system: maps unknowns (N, M) to F (N, M) and F' (N, N, M), as balls.
         u: approximate solutions (N, M).
-        exact: the same system for fractions, if its data are some: for solutions that need more digits than there are.
+        exact: the same system for fractions, used for solutions that need more digits.
 
     Returns:
-        Their boxes; nothing is proven of a solution at which F' is singular, or so nearly that rounding hides the difference.
+        Their boxes; solutions at which F' is singular up to rounding remain unproven.
     """
     m, inverse = _improved(system, np.asarray(u, LONG))
     F, _ = system(Ball.of(m))
@@ -80,13 +78,13 @@ def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = No
 
 
 def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
-    """Return F at points, computed in fractions, and rounded."""
+    """Return F at points, computed in fractions and rounded."""
     F = exact(Ball.fractions(m))[0].mid.astype(float)
     return Ball.of(F, EPS * np.abs(F) + SMALLEST)
 
 
 def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
-    """Return boxes about points with F there; those that satisfy Krawczyk's condition are proven."""
+    """Return boxes around points, given F at these; boxes that satisfy Krawczyk's condition are proven."""
     proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     step = _product(inverse, F)
     size = np.maximum(np.abs(m).astype(float), 1.0)
@@ -113,7 +111,7 @@ def _improved(system: BallFunction, m: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _inverses(A: np.ndarray) -> np.ndarray:
-    """Return inverses; of singular matrices, what is not a number."""
+    """Return inverses; NaN for singular matrices."""
     with np.errstate(all="ignore"):
         rows = np.max(np.abs(A), axis=2, keepdims=True)
         rows = np.where((rows > 0) & np.isfinite(rows), rows, 1.0)
@@ -139,7 +137,7 @@ def _contraction(Y: np.ndarray, slopes: Ball, r: np.ndarray) -> np.ndarray:
     """Return bounds (N, M) of |1 - Y F'(U)| r."""
     n = len(r)
     A = np.moveaxis(slopes.mid, -1, 0).astype(float)
-    rad = np.moveaxis(slopes.rad, -1, 0) + EPS * np.abs(A)  # of the rounding to float64 above
+    rad = np.moveaxis(slopes.rad, -1, 0) + EPS * np.abs(A)  # for the rounding to float64 above
     rest = np.abs(np.eye(n) - Y @ A) * (1.0 + EPS)
     rest = rest + np.abs(Y) @ (rad + (n + 2) * EPS * np.abs(A)) * INFLATE + EPS
     return (rest @ r.T[..., None])[..., 0].T * INFLATE

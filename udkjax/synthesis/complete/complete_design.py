@@ -35,10 +35,10 @@ from udkjax.synthesis.limits import LengthLimits, Range, read_bounds
 
 
 class _Solutions(NamedTuple):
-    """Four-bars with what was proven of each: radius (m), class and cognate; and of all together.
+    """Four-bars with their certificates: radius (m), class and cognate of each, and counts of all.
 
-    `others` has for each other solution its kind, and by the letters of its joints their places from the first place of the goal,
-    as x + i y and x - i y.
+    `others` has the kind of each other solution, and its joints by letter relative to the first place of the goal, as x + i y and
+    x - i y.
     """
 
     bars: FourBars
@@ -61,37 +61,37 @@ def design_all(
     transmission: float = 0.0,
     rotation: bool = False,
 ) -> CompleteDesigns:
-    """Find all four-bars whose coupler point goes through nine places, or whose coupler goes through five poses.
+    """Find all four-bars whose coupler point passes through nine places, or whose coupler passes through five poses.
 
-    Nine places have 1,442 classes of solutions in complex numbers, of which a homotopy follows each; five poses have four dyads,
-    the eigenvectors of a matrix. Each real one is proven: Krawczyk's theorem, with all roundings bounded, says that within
-    `radius` of its pins there is exactly one four-bar that meets the goal as its numbers stand. That no others exist is not
-    proven; `paths` tells what became of all solutions. Positions are then assigned to circuits and branches, mechanisms moved.
+    Nine places have 1,442 classes of complex solutions, all followed by a homotopy; five poses have four dyads, the eigenvectors
+    of a matrix. Each real solution is proven: by Krawczyk's theorem, with all rounding errors bounded, exactly one four-bar that
+    meets the goal exactly lies within `radius` of its pins. It is not proven that no others exist; `paths` counts the outcomes of
+    all solutions. Positions are then assigned to circuits and branches, and the motions are verified.
 
     Args:
-        drawing: a four-bar: a crank and a rocker of two pins each, and a coupler with a third pin. Its own pins do not matter.
-        goal: a `PathGoal` of nine targets for the coupler's pin, or a `PoseGoal` of five for the coupler by that pin (`pin`);
-            without values of the driver. Angles count from the first pose.
-        driver: the motor, or another driver or coordinate that is the angle of a link at the ground; by default the only driver.
-        bounds: (low, high) by the names of pins, such as `pin.O` (m): of the first position. Designs beyond limits are left out.
-        lengths: (least, most) distances (m) by two pins.
-        areas: circles and polygons by pins, as for `design`: of the first position.
-        transmission: the least angle (rad) by which the transmission angle stays away from 0 and pi in all positions.
+        drawing: a four-bar: a crank and a rocker with two pins each, and a coupler with a third pin; their places do not matter.
+        goal: a `PathGoal` with nine targets for the coupler's pin, or a `PoseGoal` with five for the coupler and that pin
+            (`pin`); without values of the driver. Angles count from the first pose.
+        driver: a driver or coordinate that is the angle of a link on the ground; by default the only driver.
+        bounds: (low, high) by the names of pins, such as `pin.O` (m), in the first position. Designs beyond limits are left out.
+        lengths: (least, most) distances (m) by pairs of pins.
+        areas: circles and polygons by pins, as for `design`, in the first position.
+        transmission: the least distance (rad) of the transmission angle from 0 and pi in all positions.
         rotation: whether the driver has to make a whole turn.
 
     Returns:
         `CompleteDesigns`, those without defects first.
 
     Raises:
-        SceneError: the drawing is no four-bar, its driver no crank, or a limit is none.
-        ValueError: the goal has other numbers of positions, or positions for which solutions are not isolated.
+        SceneError: the drawing is not a four-bar, the driver does not turn a crank, or a limit is invalid.
+        ValueError: the goal has another number of positions, or its solutions are not isolated.
     """
     mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
     if goal.values is not None:
-        raise ValueError("values of the driver are given: with them no four-bar meets so many positions; leave them out")
+        raise ValueError("the goal has values of the driver: no four-bar meets them in all positions; leave them out")
     point = goal.point if isinstance(goal, PathGoal) else goal.pin
     if point is None:
-        raise ValueError("pin: name the pin of the coupler that goes through the places")
+        raise ValueError("pin: name the pin of the coupler that passes through the places")
     drawn = read_four_bar(mechanism, point, only_driver(mechanism) if driver is None else driver)
     if isinstance(goal, PoseGoal) and goal.body != drawn.coupler:
         raise SceneError([f"goal: the body is not the coupler, {drawn.coupler}"], mechanism.name)
@@ -131,7 +131,7 @@ def design_all(
 
 
 class _Limits:
-    """Limits of designs that are known: bounds, lengths and areas of pins, transmission and rotation."""
+    """Limits of complete designs: bounds, lengths and areas of pins, transmission and rotation."""
 
     def __init__(
         self,
@@ -150,7 +150,7 @@ class _Limits:
         self.least, self.rotation = np.sin(transmission), rotation
 
     def __call__(self, places: Mapping[str, np.ndarray], transmission: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """Return which four-bars are within them (M,), of pins (M, 2) by name."""
+        """Return a mask (M,) of the four-bars within the limits, from their pins (M, 2) by name."""
         if not len(turns):
             return turns
         x = self.numbers.join(places)
@@ -159,7 +159,7 @@ class _Limits:
 
 
 class CompleteSearch(NamedTuple):
-    """A call of `design_all` that has not been made yet, such as one from a file."""
+    """The arguments of `design_all`, such as those of a file."""
 
     mechanism: Mechanism
     goal: PathGoal | PoseGoal
@@ -167,7 +167,7 @@ class CompleteSearch(NamedTuple):
     limits: Mapping[str, Any]
 
     def __call__(self) -> CompleteDesigns:
-        """Make it."""
+        """Return the designs."""
         return design_all(self.mechanism, self.goal, self.driver, **self.limits)
 
 

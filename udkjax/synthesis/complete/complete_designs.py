@@ -1,4 +1,4 @@
-"""All four-bars that meet a goal exactly, each with its certificate and what its motion is like."""
+"""All four-bars that meet a goal exactly, with their certificates and the classification of their motions."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 
-NEARLY_REAL = 1e-4  # of the extent: singular ends are known to the root of rounding, and less
+NEARLY_REAL = 1e-4  # relative to the extent: singular ends are accurate to the root of rounding at best
 
 
 class CompleteDesign(PrintsTable):
@@ -22,20 +22,20 @@ class CompleteDesign(PrintsTable):
 
     Attributes:
         mechanism: the mechanism, to be run, animated or saved.
-        values: of the driver in the positions (J,) (rad); without jumps where there is no defect.
-        kind: by Grashof: "crank-rocker", "double crank", "double rocker", "rocker-crank" or "triple rocker".
+        values: the driver's values in the positions (J,) (rad); continuous if there is no defect.
+        kind: Grashof's kind: "crank-rocker", "double crank", "double rocker", "rocker-crank" or "triple rocker".
         turns: whether the driver makes a whole turn.
-        defect: "none" where one motion of the driver passes all positions in their order; "circuit" where the four-bar has to be
-            taken apart in between, "branch" where it passes a dead point of the driver, "order" where it passes them in another.
-        circuits: of each position (J,), counted from the first one's, which is 0.
-        branches: likewise.
-        order: the positions in the order in which a motion along the first one's circuit passes them.
+        defect: "none" if one motion of the driver passes all positions in order; "circuit" if the four-bar has to be taken apart
+            in between, "branch" if it passes a dead point of the driver, "order" if it passes them in another order.
+        circuits: the circuit of each position (J,), numbered from that of the first position, 0.
+        branches: the branch of each position (J,), numbered alike.
+        order: the positions in the order of a motion along the circuit of the first one.
         transmission: the least over the positions, from 0 to 1: the sine of the transmission angle.
-        confirmed: mask of the positions that motions of the mechanism passed (J,), each from the first one of its branch on.
-        radius: m: the exact four-bar has its pins no farther than that from these.
-        number: of its class: four-bars of one class trace one curve.
+        confirmed: mask of the positions (J,) reached by motions of the mechanism from the first position of their branch.
+        radius: largest distance (m) of the pins from those of the exact four-bar.
+        number: the number of its class: four-bars of one class trace the same curve.
         cognate: index within the class (0, 1, 2).
-        driver: its driver.
+        driver: the driver.
     """
 
     mechanism: Mechanism
@@ -54,10 +54,10 @@ class CompleteDesign(PrintsTable):
     driver: Drive = eqx.field(static=True)
 
     def motion(self, count: int = 361) -> Kinematics:
-        """Return a motion from the first position, by `kinematics`: a whole turn, or as far as the positions of its branch lead.
+        """Return a motion from the first position by `kinematics`: a whole turn, or to the farthest position of its branch.
 
         Args:
-            count: of values.
+            count: number of values.
         """
         on_branch = self.values[self.branches == 0]
         farthest = on_branch[np.argmax(np.abs(on_branch - self.values[0]))]
@@ -72,7 +72,7 @@ class CompleteDesign(PrintsTable):
 
     @property
     def drawing(self) -> AbstractDrawing | None:
-        """The drawing, with these pins."""
+        """The drawing with these pins."""
         return self.mechanism.drawing
 
     def _table(self) -> PrintedTable:
@@ -85,12 +85,12 @@ class CompleteDesign(PrintsTable):
 
 
 class OtherSolution(NamedTuple):
-    """A solution beside the designs: where the path to it ended, or what could not be proven.
+    """A solution that is not a design: the end of a path, or a real solution without a proof.
 
     Attributes:
-        kind: "singular" where solutions meet or are no isolated ones, "infinite" where a joint goes to infinity, "lost" where a
-            path could not be followed to its end; "unproven" where a real solution is too nearly singular for a proof.
-        pins: the coordinates of the pins in the first position by name (2,), in m, complex ones unless the solution is real.
+        kind: "singular" if solutions meet or are not isolated, "infinite" if a joint goes to infinity, "lost" if the path was not
+            followed to its end; "unproven" if a real solution is too close to singular for a proof.
+        pins: the coordinates of the pins in the first position by name (2,) (m), complex unless the solution is real.
     """
 
     kind: str
@@ -98,37 +98,36 @@ class OtherSolution(NamedTuple):
 
     @property
     def is_real(self) -> bool:
-        """True if the coordinates are real, to within what is known of them."""
+        """True if the coordinates are real to within their accuracy."""
         places = np.array(list(self.pins.values()))
         return bool(np.max(np.abs(np.imag(places))) <= NEARLY_REAL * np.max(np.abs(places - places.mean(axis=0))))
 
 
 class CompleteDesigns(PrintsTable):
-    """All four-bars that meet a goal: a sequence of `CompleteDesign`, each made when it is asked for.
+    """All four-bars that meet a goal: a sequence of `CompleteDesign`, created on access.
 
-    Those without defects come first, of these what motions confirm; then those whose driver turns; then those with the better
-    transmission. Each four-bar is there twice, once with its crank on either side; through nine points each class has three
-    cognates.
+    They are sorted by defect (without defects first, of these the confirmed ones), then by turning driver, then by transmission.
+    Each four-bar occurs twice, with its crank on either side; through nine points each class has three cognates.
 
     Attributes:
         pins: the pins of each in the first position, by name (M, 2), in m.
-        values: of the driver in the positions (M, J) (rad).
+        values: the driver's values in the positions (M, J) (rad).
         kinds: the kind of each.
         turns: whether the driver makes a whole turn (M,).
         defects: the defect of each.
-        circuits: of each position (M, J).
-        branches: of each position (M, J).
-        order: the positions as motions pass them (M, J), then -1.
+        circuits: the circuit of each position (M, J).
+        branches: the branch of each position (M, J).
+        order: the positions in the order of a motion (M, J), then -1.
         transmission: the least over the positions (M,).
-        confirmed: mask of the positions that motions passed (M, J).
-        radius: of the certificates (M,) (m).
-        numbers: of classes (M,).
-        cognates: index within the class (M,).
-        classes: number of real classes, or dyads of a link in poses, proven to be different.
-        others: the other solutions, complex ones counted, that are singular, infinite, lost or unproven.
+        confirmed: mask of the positions reached by motions (M, J).
+        radius: radii of the certificates (M,) (m).
+        numbers: numbers of the classes (M,).
+        cognates: indices within the classes (M,).
+        classes: number of different proven real classes (through poses: of dyads).
+        others: the other solutions, including complex ones, that are singular, infinite, lost or unproven.
         left_out: number of designs left out because they exceed a limit.
-        paths: counts of the solutions of the whole problem, complex ones too, by what became of them.
-        mechanism: the drawing's, as it was given.
+        paths: counts of all solutions of the problem, including complex ones, by outcome.
+        mechanism: the mechanism of the given drawing.
         coupler: the name of its coupler.
         driver: the driver.
     """
@@ -168,7 +167,7 @@ class CompleteDesigns(PrintsTable):
         places = {name: jnp.asarray(pins[k]) for name, pins in self.pins.items()}
         try:
             mechanism = self.mechanism.with_parameters(places)
-        except SceneError:  # a coupler whose pins are on one line is no plate, but a rod
+        except SceneError:  # a coupler with collinear pins is a rod, not a plate
             mechanism = self.mechanism.with_parameters(places | {f"link.{self.coupler}.width": 0.0})
         order = tuple(int(j) for j in self.order[k] if j >= 0)
         return CompleteDesign(

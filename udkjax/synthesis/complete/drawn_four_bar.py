@@ -1,4 +1,4 @@
-"""A drawing of a four-bar read by what its pins are, and batches of it in given positions."""
+"""Roles of the pins of a drawn four-bar, and batches of it in given positions."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,15 +16,15 @@ OTHERS = ("slide", "slot", "gear", "cam", "body", "joint")
 
 
 class DrawnFourBar(NamedTuple):
-    """Names of a four-bar's pins and links, and how its driver counts.
+    """Names of a four-bar's pins and links, and the sign and origin of its driver.
 
     Attributes:
-        mechanism: the mechanism that is drawn.
-        driver: driver of the crank.
-        pins: the pins by what they are: O, A, B, C, P.
+        mechanism: the mechanism of the drawing.
+        driver: the driver of the crank.
+        pins: the pins by role: O, A, B, C, P.
         coupler: the link with the traced point.
-        sign: 1.0 where the driver counts the crank's angle, -1.0 where it counts against it.
-        is_reversed: whether the crank's own axis leads from A to O.
+        sign: 1.0 if the driver is the crank's angle, -1.0 if it is minus that.
+        is_reversed: whether the crank's own axis points from A to O.
     """
 
     mechanism: Mechanism
@@ -41,29 +41,31 @@ class DrawnFourBar(NamedTuple):
         return {f"pin.{self.pins[key]}": np.stack([np.real(z), np.imag(z)], 1) for key, z in joints.items()}
 
     def coordinates(self, joints: Mapping[str, np.ndarray], start: np.ndarray) -> dict[str, np.ndarray]:
-        """Return x, y (2,) by the names of pins, complex, of joints given by x + i y and x - i y from a place (2,)."""
+        """Return complex x, y (2,) by the names of pins, of joints given by x + i y and x - i y relative to a place (2,)."""
         return {f"pin.{self.pins[key]}": start + np.array([z + w, (z - w) / 1j]) / 2 for key, (z, w) in joints.items()}
 
     def values(self, bars: FourBars, angles: np.ndarray) -> np.ndarray:
-        """Return the driver's values (M, J) (rad) at angles of the crank, counted as the mechanism does where it is drawn."""
+        """Return the driver's values (M, J) (rad) at angles of the crank, counted as in the drawn mechanism."""
         own = bars.crank_angles[:, :1] + np.pi * self.is_reversed
         own = own - 2 * np.pi * np.ceil((own - np.pi) / (2 * np.pi))
         return self.sign * (own + angles - angles[:, :1])
 
 
 def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourBar:
-    """Return the roles of a drawing's pins; raise `SceneError` where it is no four-bar with `point` on its coupler."""
+    """Return the roles of a drawing's pins; raise `SceneError` unless it is a four-bar with `point` on its coupler."""
     if mechanism.drawing is None:
-        raise SceneError(["drawing: all solutions are found of four-bars that are drawn: give a Drawing"], mechanism.name)
+        raise SceneError(["drawing: all solutions are found only for drawn four-bars: give a Drawing"], mechanism.name)
     groups = mechanism.drawing.groups
     ground: tuple[str, ...] = getattr(mechanism.drawing, "ground")  # noqa: B009  # of a drawing, whose class is above
     links = {name: list(getattr(link, "pins")) for name, link in groups["link"].items()}  # noqa: B009
     point = point.removeprefix("pin.")
     held = {name: pins for name, pins in links.items() if set(pins) & set(ground)}
     free = [name for name in links if name not in held]
-    problems = [f"{section}s are no part of a four-bar" for section in OTHERS if groups.get(section)]
+    problems = [f"a four-bar has no {section}s: delete them" for section in OTHERS if groups.get(section)]
     if len(links) != 3 or len(free) != 1 or any(len(pins) != 2 or len(set(pins) & set(ground)) != 1 for pins in held.values()):
-        problems.append("a four-bar has three links: two with two pins, one of which is ground, and one that joins them")
+        problems.append(
+            "a four-bar has three links: two with two pins each, one of them on the ground, and one that connects these links"
+        )
     if problems:
         raise SceneError([f"drawing: {p}" for p in problems], mechanism.name)
     (coupler,), pins = free, links[free[0]]

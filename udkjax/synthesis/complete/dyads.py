@@ -1,19 +1,19 @@
-"""The equations of dyads and four-bars: in real coordinates, for numbers and balls; in isotropic ones, as a program for paths.
+"""Equations of dyads and four-bars: in real coordinates for numbers and balls; in isotropic ones as a program for path tracking.
 
-A dyad has its moving joint at x from the traced point, and its crank leads there from the fixed joint by r, both in the first
-position. Where the point has moved by d and the link has turned by the angle of cosine 1 + p and sine s, the joint has moved by
-e, and the crank is as long as before:
+x leads from the traced point of a dyad to its moving joint, and r along its crank from the fixed joint to the moving one, both in
+the first position. If the point moves by d and the link turns by the angle of cosine 1 + p and sine s, the joint moves by e, and
+the crank keeps its length:
 
     g(x, r) = e . e / 2 + e . r = 0,      e = d + [[p, -s], [s, p]] x.
 
-In isotropic coordinates a point p = (px, py) is the pair of complex numbers z = px + i py and Z = px - i py; both are
-unknowns of their own, so that complex solutions count, too. With a turn by the angle of 1 + f, |1 + f| = 1,
+In isotropic coordinates a point p = (px, py) is the pair of complex numbers z = px + i py and Z = px - i py; they are
+independent unknowns, so that complex solutions are included. With a turn by the angle of 1 + f, |1 + f| = 1,
 
     g(x, X, r, R, f; d, D) = e E + e R + E r = 0,      e = d + f x,      E = D + F X,      F = 1 / (1 + f) - 1.
 
-Of a four-bar, two dyads (x, r) and (y, s) share f. Nine points give eight displacements: sixteen equations for x, X, r, R, y,
-Y, s, S and f_1 to f_8. Each f_j is in two of them, and is eliminated first. Written in this way nothing is lost where links are
-long: their turns f are small then, and no large terms cancel.
+The two dyads (x, r) and (y, s) of a four-bar share f. Nine points give eight displacements: sixteen equations for x, X, r, R, y,
+Y, s, S and f_1 to f_8. Each f_j occurs in two of them, and is eliminated first. This form loses no accuracy if links are long:
+their turns f are small, and no large terms cancel.
 """
 
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ ArrayOrBall = Any  # arrays or balls
 
 
 class Displacements(NamedTuple):
-    """Ways of the traced point from its first position (J, 1), and cosines less one and sines of turns, where known."""
+    """Displacements of the traced point from its first position (J, 1), and if given, cosines minus one and sines of turns."""
 
     x: ArrayOrBall
     y: ArrayOrBall
@@ -54,7 +54,7 @@ def dyad_equations(x: ArrayOrBall, y: ArrayOrBall, a: ArrayOrBall, b: ArrayOrBal
 
 
 def dyad_system(d: Displacements):
-    """Return the system of one dyad whose link's angles are given: four equations for the joint and the crank."""
+    """Return the system of one dyad with given angles of its link: four equations for the joint and the crank."""
 
     def system(u: Ball) -> tuple[Ball, Ball]:
         x, y, a, b = (u.part(k) for k in range(4))
@@ -67,10 +67,10 @@ def dyad_system(d: Displacements):
 
 
 def four_bar_system(d: Displacements):
-    """Return the system of a four-bar through points: for two dyads and the J turns of their link.
+    """Return the system of a four-bar through points: two dyads and the J turns of their link.
 
-    The unknowns are joint and crank of the first dyad, of the second one, J cosines less one, J sines; the equations g of both,
-    and (p^2 + s^2) / 2 + p = 0.
+    The unknowns are joint and crank of the first dyad, those of the second, J cosines minus one, and J sines; the equations are g
+    for both dyads, and (p^2 + s^2) / 2 + p = 0.
     """
 
     def system(u: Ball) -> tuple[Ball, Ball]:
@@ -102,17 +102,17 @@ def _full(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 # --- in isotropic coordinates
 
-JOINTS = 8  # unknowns besides the turns: x, X, r, R, y, Y, s, S
+JOINTS = 8  # unknowns x, X, r, R, y, Y, s, S
 POINTS = 8  # displacements from the first of nine points
 UNKNOWNS = JOINTS + POINTS
-LEAST = 1e-3  # unit: least scale of a joint, so that pivots are chosen by their effect
+LEAST = 1e-3  # least scale of a joint, for the choice of pivots
 
 
 def newton_and_tangent() -> ScalarProgram:
-    """Return the program: from unknowns, s and displacements at s = 0 and their rates to the Newton step and the rate dz/ds.
+    """Return the program that maps unknowns, s, displacements at s = 0 and their rates to the Newton step and the rate dz/ds.
 
-    Inputs: real parts, then imaginary parts of the 16 unknowns; of s; of the displacements d_1 to d_8, D_1 to D_8 at s = 0; of
-    their derivatives by s. Outputs: real and imaginary parts of the step; of the rate.
+    Inputs: real parts, then imaginary parts, of the 16 unknowns, of s, of the displacements d_1 to d_8, D_1 to D_8 at s = 0, and
+    of their derivatives by s. Outputs: real and imaginary parts of the step and of the rate.
     """
     graph, inputs = Graph(), []
 

@@ -1,10 +1,9 @@
-"""All dyads through five poses of a link (Burmester): up to four real ones, and so up to six four-bars.
+"""All dyads through five poses of a link (Burmester): up to four real ones, and thus up to six four-bars.
 
-For a joint (x, y) of the link the pivot (a, b) is the solution of four linear equations, M(x, y, 1) (a, b, 1) = 0, whose
-entries are linear, too: M has rank two where its four minors vanish, which are cubics. Four cubics of this kind have six
-common zeros (Hilbert and Burch), two of them the isotropic points at infinity. In coordinates of which no zero is at infinity
-the monomials up to second order are a basis of all polynomials modulo the minors, and the zeros are eigenvectors of a matrix
-of six rows.
+For a joint (x, y) of the link the pivot (a, b) solves four linear equations, M(x, y, 1) (a, b, 1) = 0, with linear entries: M has
+rank two where its four cubic minors vanish. Such cubics have six common zeros (Hilbert and Burch), two of them the isotropic
+points at infinity. In coordinates without a zero at infinity the monomials up to second order are a basis of all polynomials
+modulo the minors, and the zeros are eigenvectors of a 6 x 6 matrix.
 """
 
 from itertools import combinations, permutations
@@ -17,25 +16,25 @@ from udkjax.synthesis.complete.certificate import Certificate, certify
 from udkjax.synthesis.complete.dyads import dyad_system
 from udkjax.synthesis.complete.nine_points import SAME, displacements, power_of_two_near
 
-DYADS = 4  # of generic poses, complex ones counted
+DYADS = 4  # of generic poses, including complex ones
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
-AT_INFINITY = 1e-7  # a joint or pivot so many times as far away as the poses are from each other is at infinity
+AT_INFINITY = 1e-7  # extent of the poses relative to the distance of a joint or pivot that counts as infinite
 ISOTROPIC = 1e-6  # from the isotropic points, of two homogeneous coordinates of length one
-SMALLEST_CUBIC = 1e-11  # of the cubic terms of the minors: below it, zeros are no isolated ones
+SMALLEST_CUBIC = 1e-11  # least singular value of the minors' cubic terms, if zeros are isolated
 MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 CUBIC = ((3, 0), (2, 1), (1, 2), (0, 3))
-SINE_TOL = 8.0 * ROUNDING  # error of a sine of the longest floating-point type
+SINE_TOL = 8.0 * ROUNDING  # error of a sine in the longest floating-point type
 
 
 class RealDyads(NamedTuple):
     """Dyads through five poses, in units of `scale` from the first place.
 
     Attributes:
-        boxes: proven to hold one solution each: the joint (two), the crank from the pivot to it (two).
-        turns: of the link in each pose, as complex numbers (5,).
-        infinite: number of those with a joint or a pivot at infinity, complex ones counted.
-        unproven: dyads that appear to be real, but could not be proven: joints and cranks (4, K).
-        scale: m, a power of two.
+        boxes: boxes that contain exactly one solution: the joint (two), the crank from the pivot to it (two).
+        turns: turns of the link in each pose, as complex numbers (5,).
+        infinite: number of dyads with a joint or pivot at infinity, including complex ones.
+        unproven: dyads that appear to be real without a proof: joints and cranks (4, K).
+        scale: unit (m), a power of two.
     """
 
     boxes: Certificate
@@ -46,7 +45,7 @@ class RealDyads(NamedTuple):
 
 
 def require_five_poses(poses: np.ndarray) -> None:
-    """Raise `ValueError` unless dyads through five poses may be isolated solutions."""
+    """Raise `ValueError` unless there are five different poses."""
     if len(poses) != 5:
         raise ValueError(f"goal: finitely many four-bars go through five poses; there are {len(poses)}: use `design`")
     extent = float(np.max(np.ptp(poses[:, :2], axis=0))) or 1.0
@@ -58,7 +57,7 @@ def require_five_poses(poses: np.ndarray) -> None:
 
 
 def find_real_dyads(poses: np.ndarray) -> RealDyads:
-    """Return the real dyads through five poses (5, 3); raise `ValueError` where dyads are no isolated ones."""
+    """Return the real dyads through five poses (5, 3); raise `ValueError` if dyads are not isolated."""
     require_five_poses(poses)
     scale = power_of_two_near(poses[:, :2]) if np.ptp(poses[:, :2], axis=0).any() else 1.0
     d = displacements(np.asarray(poses[:, :2], np.longdouble) / scale)
@@ -81,7 +80,7 @@ def find_real_dyads(poses: np.ndarray) -> RealDyads:
 
 
 def _first_of_each(found: Certificate) -> np.ndarray:
-    """Return a mask of the boxes that do not overlap one before them."""
+    """Return a mask of the boxes that do not overlap an earlier one."""
     keep = np.ones(len(found.is_proven), bool)
     for j, i in combinations(range(len(keep)), 2):
         keep[i] &= not (keep[j] and found.balls.part(np.s_[:, i]).overlaps(found.balls.part(np.s_[:, j])).all())
@@ -97,13 +96,13 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tupl
     size = ways / turned if ways > 0 and turned > 0 else 1.0
     scales = np.array([size, size, 1.0])
     L = np.transpose([by_x, by_y, rest], (2, 1, 0)) * scales / np.array([1.0, 1.0, size])[:, None]
-    Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]  # no zero of it is at infinity, with probability one
+    Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]  # with probability one, it moves no zero to infinity
     L = L @ Q
     minors = [_determinant(L[list(rows)]) for rows in combinations(range(4), 3)]
     table = np.array([[minor.get(m, 0.0) for m in (*CUBIC, *MONOMIALS)] for minor in minors])
     table /= np.linalg.norm(table, axis=1, keepdims=True) + (np.linalg.norm(table, axis=1, keepdims=True) == 0)
     if np.linalg.svd(table[:, :4], compute_uv=False)[-1] < SMALLEST_CUBIC:
-        raise ValueError("dyads through these poses are no isolated ones: change a pose that others repeat, mirror or translate")
+        raise ValueError("dyads through these poses are not isolated: change a pose that others repeat, mirror or translate")
     reduced = -np.linalg.solve(table[:, :4], table[:, 4:])
     steps = []
     for move in ((1, 0), (0, 1)):

@@ -1,7 +1,7 @@
 """Four-bars in their positions: joints as complex numbers, cognates, kinds by Grashof, circuits, branches and order.
 
-A four-bar turns in positions that form circuits: on one of them it moves without being taken apart. A driver moves it along a
-branch of a circuit, from one dead point to the next, or all around.
+The positions of a four-bar form circuits: it moves on one of them without being taken apart. A driver moves it along a branch of
+a circuit, from one dead point to the next, or all the way round.
 """
 
 from itertools import permutations
@@ -12,8 +12,14 @@ import numpy as np
 from udkjax.synthesis.complete.balls import Ball, ComplexBall
 from udkjax.synthesis.complete.certificate import Certificate
 
-KINDS = ("double crank", "crank-rocker", "double rocker", "rocker-crank", "triple rocker")  # by the shortest link; without one
-IN_ORDER, CIRCUIT, BRANCH, ORDER = 0, 1, 2, 3  # defects of a motion through all positions: none, or of circuit, branch or order
+KINDS = (
+    "double crank",
+    "crank-rocker",
+    "double rocker",
+    "rocker-crank",
+    "triple rocker",
+)  # by the shortest link; the last without Grashof's condition
+IN_ORDER, CIRCUIT, BRANCH, ORDER = 0, 1, 2, 3  # defects of a motion through all positions
 DEFECTS = ("none", "circuit", "branch", "order")
 
 
@@ -47,7 +53,7 @@ class FourBars(NamedTuple):
         return self, self._other(), self.swapped()._other()
 
     def _other(self) -> "FourBars":
-        """Return the cognate on the crank's pivot and the third one: the crank and the coupler change their places.
+        """Return the cognate on the crank's pivot and the third one: crank and coupler change places.
 
         From c - a = k (b - a), k = AP / AB, and b - a = (A - a) + (B - A) + (b - B) follows
         c - a = (P - A) + k (A - a) + k (b - B): the links of the cognate, one after the other.
@@ -69,28 +75,28 @@ class FourBars(NamedTuple):
 
     @property
     def transmission(self) -> np.ndarray:
-        """The sine of the angle between coupler and rocker, with its sign (M, J): zero where the crank is at a dead point."""
+        """The signed sine of the angle between coupler and rocker (M, J): zero at a dead point of the crank."""
         coupler, rocker = self.B - self.A, self.C[:, None] - self.B
         return np.imag(coupler.conj() * rocker) / (np.abs(coupler) * np.abs(rocker))
 
 
 def stack_four_bars(parts: list[FourBars]) -> FourBars:
-    """Return several batches as one, member by member: all of the first one, then all of the second one."""
+    """Return several batches concatenated."""
     O, C, A, B = (np.concatenate([getattr(part, name) for part in parts]) for name in FourBars._fields[:-1])  # noqa: E741
     return FourBars(O, C, A, B, parts[0].P)
 
 
 class Classification(NamedTuple):
-    """Kinds of M four-bars, and where on their motion the J positions are.
+    """Kinds of M four-bars, and circuits, branches and order of their J positions.
 
     Attributes:
-        kind: numbers in KINDS (M,).
+        kind: indices of KINDS (M,).
         turns: whether the crank turns fully (M,).
-        circuits: of each position (M, J), counted from that of the first one, which is 0.
-        branches: likewise.
-        order: the positions as a motion along the circuit of the first one passes them (M, J), then -1.
-        defect: a number in DEFECTS (M,).
-        values: angles of the crank (rad), without jumps from one position to the next where there is no defect (M, J).
+        circuits: the circuit of each position (M, J), numbered from that of the first position, 0.
+        branches: the branch of each position (M, J), numbered alike.
+        order: the positions in the order of a motion along the circuit of the first one (M, J), then -1.
+        defect: indices of DEFECTS (M,).
+        values: angles of the crank (rad), continuous if there is no defect (M, J).
     """
 
     kind: np.ndarray
@@ -114,7 +120,7 @@ def classify(bars: FourBars) -> Classification:
     circuit = np.where(turns[:, None], side, np.where(is_grashof[:, None], np.sign(angle), 0.0))
     branch = np.where(turns[:, None], circuit, 4.0 * circuit + side)
     circuits, branches = _counted(circuit), _counted(branch)
-    # Along a circuit that has dead points the crank goes up on one branch and down on the other one; a turn is a circle.
+    # On a circuit with dead points the crank angle rises on one branch and falls on the other; a turn is a circle.
     along = np.where(turns[:, None], np.mod(angle, 2 * np.pi), np.where(side > 0, angle, 4 * np.pi - angle))
     order = _order(along, circuits == 0)
     values = _values(angle, turns)
@@ -131,7 +137,7 @@ def classify(bars: FourBars) -> Classification:
 
 
 def _relative_angles(bars: FourBars, lengths: np.ndarray) -> np.ndarray:
-    """Return angles between crank and frame, without a jump where the crank of a triple rocker passes the frame's line."""
+    """Return angles between crank and frame, continuous where the crank of a triple rocker passes the line of the frame."""
     angle = np.angle((bars.A - bars.O[:, None]) / (bars.C - bars.O)[:, None])
     frame, crank, coupler, rocker = lengths
     inward = (np.abs(frame - crank) >= np.abs(coupler - rocker)) & (np.abs(frame - crank) <= coupler + rocker)
@@ -140,41 +146,43 @@ def _relative_angles(bars: FourBars, lengths: np.ndarray) -> np.ndarray:
 
 
 def _counted(labels: np.ndarray) -> np.ndarray:
-    """Return labels (M, J) as numbers in the order in which they come, from 0 on."""
+    """Return labels (M, J) numbered from 0 in order of first occurrence."""
     found = np.zeros(labels.shape, int)
     for j in range(1, labels.shape[1]):
         same = labels[:, :j] == labels[:, j : j + 1]
-        known = np.argmax(same, axis=1)
-        found[:, j] = np.where(same.any(axis=1), np.take_along_axis(found, known[:, None], 1)[:, 0], found[:, :j].max(axis=1) + 1)
+        earlier = np.argmax(same, axis=1)
+        found[:, j] = np.where(
+            same.any(axis=1), np.take_along_axis(found, earlier[:, None], 1)[:, 0], found[:, :j].max(axis=1) + 1
+        )
     return found
 
 
-def _order(along: np.ndarray, is_there: np.ndarray) -> np.ndarray:
-    """Return the places of positions as they come along a circle from the first one on (M, J); then -1."""
-    away = np.where(is_there, along, np.inf)
+def _order(along: np.ndarray, exists: np.ndarray) -> np.ndarray:
+    """Return the indices of positions in their order along a circle from the first one (M, J), then -1."""
+    away = np.where(exists, along, np.inf)
     away = np.where(away < along[:, :1], away + 1e3, away)
     order = np.argsort(away, axis=1, kind="stable")
-    return np.where(np.take_along_axis(is_there, order, 1), order, -1)
+    return np.where(np.take_along_axis(exists, order, 1), order, -1)
 
 
 def _goes_round(order: np.ndarray) -> np.ndarray:
-    """Return whether positions come in their order, one way round or the other (M,)."""
+    """Return a mask (M,) of the four-bars whose positions are in cyclic order, in either direction."""
     J = order.shape[1]
     return (order == np.arange(J)).all(axis=1) | (order == -np.arange(J) % J).all(axis=1)
 
 
 def _values(angle: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Return angles (M, J) as a motion passes them: of a crank that turns, all one way, the shorter one."""
+    """Return angles (M, J) along a motion: for a crank that turns, in the shorter direction."""
     ahead, back = (np.cumsum(np.mod(way * np.diff(angle, axis=1, prepend=angle[:, :1]), 2 * np.pi), axis=1) for way in (1, -1))
     shorter = np.where((ahead[:, -1] <= back[:, -1])[:, None], ahead, -back)
     return np.where(turns[:, None], angle[:, :1] + shorter, angle)
 
 
-# --- boxes that hold exact solutions
+# --- boxes that contain exact solutions
 
 
 class FourBarBoxes(NamedTuple):
-    """Fixed joints O, C and moving joints A, B of four-bars (M,) in the first position, from the first place."""
+    """Fixed joints O, C and moving joints A, B of four-bars (M,) in the first position, relative to the first place."""
 
     O: ComplexBall  # noqa: E741  # as it is drawn
     C: ComplexBall
@@ -183,7 +191,7 @@ class FourBarBoxes(NamedTuple):
 
 
 def cognate_joints(boxes: Certificate) -> tuple[FourBarBoxes, FourBarBoxes, FourBarBoxes]:
-    """Return the joints of all three cognates, as `FourBars.cognates` has them."""
+    """Return the joints of all three cognates, in the order of `FourBars.cognates`."""
     u = boxes.balls
     x, r, y, s = (ComplexBall(u.part(k), u.part(k + 1)) for k in (0, 2, 4, 6))
     a, b = x - r, y - s
@@ -197,7 +205,7 @@ def _other(a: ComplexBall, b: ComplexBall, x: ComplexBall, y: ComplexBall) -> Fo
 
 
 def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float) -> np.ndarray:
-    """Return the largest distance of four-bars' pins, as floating-point numbers, from the exact ones (M,) (m)."""
+    """Return the largest distance (M,) (m) of four-bars' rounded pins from the exact ones."""
     start = ComplexBall(Ball.of(np.real(origin)), Ball.of(np.imag(origin)))
     size = ComplexBall(Ball.of(scale), Ball.of(0.0))
     pins = (bars.O, bars.C, bars.A[:, 0], bars.B[:, 0])
@@ -205,7 +213,7 @@ def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float
 
 
 def certainly_different(boxes: Certificate) -> np.ndarray:
-    """Return the places of boxes that hold different classes: their three pivots are proven to be others, in whatever order."""
+    """Return the indices of boxes proven to contain different classes: their three pivots differ in any order."""
     first, second, _ = cognate_joints(boxes)
     pivots, count = (first.O, first.C, second.C), boxes.middle.shape[1]
     rows, columns = np.arange(count)[:, None], np.arange(count)[None, :]

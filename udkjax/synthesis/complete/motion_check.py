@@ -1,4 +1,4 @@
-"""Motions of four-bars that were found: which of their positions does each driver reach from another one of the same branch."""
+"""Motions of the four-bars found: the positions that the driver reaches from another position of the same branch."""
 
 from functools import cache
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from udkjax.positions.position_batch import PositionBatch
 from udkjax.scene.drawing import Drawing
 from udkjax.synthesis.complete.four_bars import Classification, FourBars
 
-REACHED_TOL = 1e-6  # of the extent of the places: how near to its place the traced point comes
+REACHED_TOL = 1e-6  # largest distance of the traced point from its place, relative to the extent of the places
 
 
 class _BranchMotion(NamedTuple):
-    """One motion: the four-bar, the position it is drawn in, and the positions it is to pass, at values of the driver."""
+    """One motion: the four-bar, the position in which it is drawn, and the positions to pass, at values of the driver."""
 
     member: int
     first: int
@@ -22,10 +22,10 @@ class _BranchMotion(NamedTuple):
 
 
 def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
-    """Return which positions (M, J) motions confirm: each branch's are passed from the first one of them on.
+    """Return a mask of the positions (M, J) that motions confirm; each branch is followed from its first position.
 
-    A four-bar, drawn in that position, is driven by its crank and closed again at each value; the traced point, which moves with
-    the coupler, has to come to its place at the value that the classification says, without leaving its branch.
+    A four-bar drawn in that position is driven by its crank and closed again at each value; the traced point of the coupler has
+    to reach its place at the value given by the classification, without leaving the branch.
     """
     M, J = found.values.shape
     confirmed = np.zeros((M, J), bool)
@@ -52,7 +52,7 @@ def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
 
 @cache
 def skeleton() -> PositionBatch:
-    """Return positions of four-bars of bars, compiled: which point is traced, and what links weigh, matters not."""
+    """Return the compiled positions of four-bars; the traced point and the masses do not matter."""
     pins = {"O": (0.0, 0.0), "A": (3.0, 4.0), "B": (12.0, 9.0), "C": (10.0, 0.0)}
     links = {name: {"pins": list(ends), "mass": 1.0} for name, ends in (("crank", "OA"), ("coupler", "AB"), ("rocker", "CB"))}
     mechanism = Drawing(pins, links, ground=["O", "C"]).mechanism()
@@ -60,7 +60,7 @@ def skeleton() -> PositionBatch:
 
 
 def _motions_of(m: int, found: Classification) -> list[_BranchMotion]:
-    """Return motions along each branch: of a crank that turns one turn, else from the first position one way, and the other."""
+    """Return the motions along each branch: one full turn of the crank, or both directions from the first position."""
     motions = []
     for branch in range(found.branches[m].max() + 1):
         places = np.flatnonzero(found.branches[m] == branch)

@@ -1,9 +1,9 @@
-"""All four-bars through nine points: a parameter homotopy from 1,442 known classes of solutions, then certificates of the real
+"""All four-bars through nine points: a parameter homotopy from 1,442 stored classes of solutions, then certificates of the real
 ones.
 
-Generic nine points have 8,652 solutions in complex numbers, 1,442 classes of six: Roberts's three cognates, each with its
-dyads in either order. One of each class, at displacements that are complex numbers drawn at random, is in a file beside this
-module (made by experiments/nine_points.py); each is followed to the displacements that are asked for.
+Nine generic points have 8,652 complex solutions, 1,442 classes of six: Roberts's three cognates, each with its dyads in either
+order. nine_points.npz has one of each class, at random complex displacements (made by experiments/nine_points.py); each is
+tracked to the requested displacements.
 
 Source: C. W. Wampler, A. P. Morgan, A. J. Sommese, Complete solution of the nine-point path synthesis problem for four-bar
 linkages, J. Mech. Des. 114 (1992).
@@ -27,17 +27,17 @@ CLASSES = 1442
 STARTS = Path(__file__).with_name("nine_points.npz")
 FIRST = Precision(3e-3, 3e-2, 1e-5)
 CLOSE = Precision(3e-4, 3e-3, 1e-6)
-BENDS = (0.0, 0.6, -0.6)  # ways around the parameters at which solutions meet, tried in turn while classes are missing
-ALIKE = 1e-7  # relative: classes whose pivots differ by less are one; more, where there would be too many classes
-# Beside the largest unknown: coordinates whose conjugates agree so well may be a real four-bar, which the certificate decides.
+BENDS = (0.0, 0.6, -0.6)  # paths around parameters at which solutions meet, tried in turn while classes are missing
+ALIKE = 1e-7  # relative: classes whose pivots differ by less are the same; raised if there are too many classes
+# Relative to the largest unknown: coordinates with conjugates as close as this may be a real four-bar; the certificate decides.
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
-REFINED = 1e-8  # a Newton step with residuals in long numbers, beside the unknowns, that shows a regular solution
-REFINEMENTS = 8  # of Newton at most: it doubles the digits
-SAME = 1e-12  # of the extent: places or poses nearer than that are one
+REFINED = 1e-8  # largest Newton step at a regular solution, relative to the unknowns, with residuals in long precision
+REFINEMENTS = 8  # Newton steps at most; each doubles the digits
+SAME = 1e-12  # relative to the extent: closer places or poses are the same
 # A coupler curve has degree six and passes three times through both isotropic points at infinity: a line meets it in six
-# points, a circle in 12 - 6 others, unless it is a part of the curve.
+# points, and a circle in 12 - 6 others, unless it is part of the curve.
 MOST_ON_A_LINE = 6
-ON_IT = 1e-10  # of the extent: off a line or circle
+ON_IT = 1e-10  # distance from a line or circle, relative to the extent
 
 
 class Paths(NamedTuple):
@@ -45,9 +45,9 @@ class Paths(NamedTuple):
 
     Attributes:
         tracked: number of paths: one for each class of generic data.
-        regular: distinct classes that were found.
+        regular: distinct classes found.
         infinite: paths to four-bars with a joint at infinity.
-        singular: paths to solutions at which others meet, or which are no isolated ones.
+        singular: paths to solutions that meet or are not isolated.
         lost: paths that could not be followed to their end.
     """
 
@@ -59,20 +59,20 @@ class Paths(NamedTuple):
 
 
 class OtherEnds(NamedTuple):
-    """Ends of paths beside the classes that were found: joints x, X, r, R, y, Y, s, S (8, K), and a word for each."""
+    """Other ends of paths: joints x, X, r, R, y, Y, s, S (8, K), and the kind of each."""
 
     joints: np.ndarray
     kinds: tuple[str, ...]
 
 
 class RealClasses(NamedTuple):
-    """Four-bars of real classes, one each, in units of `scale` from the first place.
+    """Four-bars of real classes, one each, in units of `scale`, relative to the first place.
 
     Attributes:
-        boxes: proven to hold one solution each: joint and crank of both dyads, then cosines less one and sines of turns.
-        paths: outcome of all paths.
-        ends: ends of the other paths, and of those that appear to be real, but could not be proven.
-        scale: m, a power of two.
+        boxes: boxes that contain exactly one solution: joint and crank of both dyads, then cosines minus one and sines of turns.
+        paths: outcomes of all paths.
+        ends: the other ends of paths, including those that appear to be real without a proof.
+        scale: unit (m), a power of two.
     """
 
     boxes: Certificate
@@ -87,14 +87,16 @@ class RealClasses(NamedTuple):
 
 
 def require_nine_points(points: np.ndarray) -> None:
-    """Raise `ValueError` unless four-bars through nine points may be isolated solutions."""
+    """Raise `ValueError` unless there are nine different points, with at most six on a line or circle."""
     if len(points) != 9:
         cure = "leave out the last one of a closed curve" if len(points) == 10 else "use `design` for fewer or more"
         raise ValueError(f"goal: finitely many four-bars go through nine places; there are {len(points)}: {cure}")
     extent = float(np.max(np.ptp(points, axis=0)))
     for i, j in combinations(range(9), 2):
         if np.max(np.abs(points[i] - points[j])) <= SAME * extent:
-            raise ValueError(f"goal: targets {i} and {j} are the same place: eight places leave infinitely many four-bars")
+            raise ValueError(
+                f"goal: targets {i} and {j} are the same place: eight places leave infinitely many four-bars; move one"
+            )
     z = (points - points.mean(axis=0)) / extent
     rows = np.column_stack([np.sum(z**2, axis=1), z, np.ones(9)])
     for columns, what in ((slice(1, 4), "line"), (slice(0, 4), "circle")):
@@ -110,7 +112,7 @@ def require_nine_points(points: np.ndarray) -> None:
 
 
 def find_real_classes(points: np.ndarray) -> RealClasses:
-    """Return the real classes of four-bars through nine points (9, 2); raise `ValueError` where they may not be isolated."""
+    """Return the real classes of four-bars through nine points (9, 2); raise `ValueError` if they may not be isolated."""
     require_nine_points(points)
     scale = power_of_two_near(points)
     places = np.asarray(points, LONG) / scale
@@ -118,13 +120,13 @@ def find_real_classes(points: np.ndarray) -> RealClasses:
     z, paths, ends = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
     x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
     turn = 1.0 + z[JOINTS:]
-    unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex where joints are not
+    unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex although joints are real
     reality = np.maximum(np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0)), unreal)
     near = reality < NEARLY_REAL
     joints, turns = 0.5 * (x + conjugates)[:, near], turn[:, near] / np.abs(turn[:, near]) - 1.0
     u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
     exact = Displacements(*(Ball.fractions(places[1:, k : k + 1]) - Ball.fractions(places[:1, k : k + 1]) for k in (0, 1)))
-    with np.errstate(over="ignore", invalid="ignore"):  # of ends at which Newton's method leaves for infinity: not proven then
+    with np.errstate(over="ignore", invalid="ignore"):  # Newton's method may diverge: not proven then
         found = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
     keep = np.flatnonzero(found.is_proven)
     keep = keep[distinct(isotropic(found.middle[:, keep]))]
@@ -135,7 +137,7 @@ def find_real_classes(points: np.ndarray) -> RealClasses:
 
 
 def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
-    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of a size of one, and the rest."""
+    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of order one, and the other ends."""
     target = np.concatenate([d, d.conj()])
     start, parameters = start_solutions()
     follow = tracker()
@@ -149,21 +151,21 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
     unsettled = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
     if len(unsettled):
         z[:, unsettled], status[unsettled] = take(unsettled, CLOSE, BENDS[0])
-    known = _merged(z[:, status == ACCEPTED])
+    classes = _merged(z[:, status == ACCEPTED])
     for bend in BENDS[1:]:
-        if known.shape[1] == CLASSES or not len(unsettled):
+        if classes.shape[1] == CLASSES or not len(unsettled):
             break
         more, found = take(every, CLOSE, bend)
-        before, known = known.shape[1], _merged(known, more[:, found == ACCEPTED])
-        if known.shape[1] == before:
+        before, classes = classes.shape[1], _merged(classes, more[:, found == ACCEPTED])
+        if classes.shape[1] == before:
             break
-    missing, ends = CLASSES - known.shape[1], {}
+    missing, ends = CLASSES - classes.shape[1], {}
     for code, name in ((INFINITE, "infinite"), (SINGULAR, "singular"), (LOST, "lost")):
         ends[name] = np.flatnonzero(status == code)[: missing - sum(map(len, ends.values()))]
     infinite, singular = len(ends["infinite"]), len(ends["singular"])
-    paths = Paths(CLASSES, known.shape[1], infinite, singular, missing - infinite - singular)
+    paths = Paths(CLASSES, classes.shape[1], infinite, singular, missing - infinite - singular)
     which = np.concatenate(list(ends.values()))
-    return known, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, of in ends.items() for _ in of))
+    return classes, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, of in ends.items() for _ in of))
 
 
 @cache
@@ -179,12 +181,14 @@ def start_solutions() -> tuple[np.ndarray, np.ndarray]:
         joints, parameters = file["joints"], file["displacements"]
     z, converged = tracker().polish(np.concatenate([joints, turns_of(joints, parameters)]), parameters)
     if not converged.all():
-        raise RuntimeError(f"{STARTS} is damaged: {np.count_nonzero(~converged)} of its solutions are none")
+        raise RuntimeError(
+            f"{STARTS} is damaged: {np.count_nonzero(~converged)} of its solutions do not converge; reinstall udkjax"
+        )
     return z, parameters
 
 
 def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Return f (8, M) of four-bars whose joints are known: both dyads' equations are linear in 1 + f and 1 / (1 + f)."""
+    """Return the turns f (8, M) of four-bars with given joints: both dyads' equations are linear in 1 + f and 1 / (1 + f)."""
     d, D = parameters[:POINTS, None], parameters[POINTS:, None]
     rows = []
     for x, X, r, R in (joints[:4], joints[4:]):
@@ -195,44 +199,44 @@ def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
 
 
 def displacements(places: np.ndarray) -> Displacements:
-    """Return displacements from the first of some places (J + 1, 2), as balls: places are exact, differences rounded."""
+    """Return displacements from the first of some places (J + 1, 2), as balls: places are exact, their differences rounded."""
     moved = Ball.of(places[1:]) - Ball.of(places[:1])
     return Displacements(moved.part(np.s_[:, :1]), moved.part(np.s_[:, 1:]))
 
 
 def power_of_two_near(points: np.ndarray) -> float:
-    """Return the power of two next to the size of some points: dividing by it rounds nothing."""
+    """Return the power of two closest to the size of some points: division by it is exact."""
     spread = points - points.mean(axis=0)
     return 2.0 ** np.round(np.log2(np.sqrt(np.mean(np.sum(spread**2, axis=1)))))
 
 
 def isotropic(u: np.ndarray) -> np.ndarray:
-    """Return x, X, r, R, y, Y, s, S (8, M) of real coordinates."""
+    """Return x, X, r, R, y, Y, s, S (8, M) from real coordinates."""
     z = (u[0:JOINTS:2] + 1j * u[1:JOINTS:2]).astype(complex)
     return np.stack([z, z.conj()], 1).reshape(JOINTS, -1)
 
 
-# --- which of them are of one class
+# --- equal classes
 
 
 def class_keys(z: np.ndarray) -> np.ndarray:
-    """Return numbers (4, M) that all six of a class share: symmetric functions of the pivots a, b, c of all cognates."""
+    """Return invariants (4, M) of the six solutions of a class: symmetric functions of the pivots a, b, c of all cognates."""
     x, X, r, R, y, Y, s, S = z[:JOINTS]
     a, A, b, B = x - r, X - R, y - s, Y - S
-    with np.errstate(all="ignore"):  # of ends that are no solutions
+    with np.errstate(all="ignore"):  # for ends that are not solutions
         c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
         return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
 
 
 def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Return a mask of the solutions (M,) that are in a class with others."""
+    """Return a mask of the solutions (M,) that share their class with others."""
     found, places = np.zeros(z.shape[1], bool), np.flatnonzero(of)
     found[places[np.unique(_pairs(z[:, places]))]] = True
     return found
 
 
 def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
-    """Return the places of the first solutions of each class: at most so many, those of generic points."""
+    """Return the indices of the first solution of each class, at most `most` of them."""
     alike = ALIKE
     while True:
         keep = np.ones(z.shape[1], bool)
@@ -244,7 +248,7 @@ def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
 
 
 def _pairs(z: np.ndarray, alike: float = ALIKE) -> np.ndarray:
-    """Return pairs i < j of solutions of one class, sorted."""
+    """Return pairs i < j of solutions of the same class, sorted."""
     if not z.shape[1]:
         return np.zeros((0, 2), int)
     keys = class_keys(z)
@@ -265,7 +269,7 @@ def _merged(*sets: np.ndarray) -> np.ndarray:
 
 
 def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ends (16, M) and their status: paths that have not converged are tried with longer numbers."""
+    """Return ends (16, M) and their status; unconverged ends are refined in long precision."""
     status, z = status.copy(), z.copy()
     open_ends = np.flatnonzero((status != ACCEPTED) & np.isfinite(z).all(axis=0))
     if not len(open_ends):
