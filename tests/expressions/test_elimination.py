@@ -1,4 +1,4 @@
-"""Linear systems of expressions, against NumPy: known numbers first, then rotations, both ways, redundant rows among them."""
+"""Linear systems of expressions, against NumPy: constant pivots first, then rotations; transposed systems; redundant rows."""
 
 import numpy as np
 import pytest

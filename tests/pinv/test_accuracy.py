@@ -62,7 +62,7 @@ def relative_error(x, reference):
 
 
 def penrose_defects(a, x):
-    """The four Penrose conditions, each relative to what its terms are made of."""
+    """The four Penrose conditions, each relative to the size of its terms."""
     ax, xa = a @ x, x @ a
     return {
         "a x a = a": relative_error(ax @ a, a),
@@ -90,7 +90,7 @@ def check_exact_matrices(entry, exact, dtype):
     assert seen == everything if entry.power == 1 else seen >= 11
 
 
-# OneOf is as exact as what it chooses; that it gives what is chosen, test_scale_invariance sees
+# OneOf is as exact as the chosen method; test_scale_invariance checks that it applies the chosen one
 @pytest.mark.parametrize("entry", entries(*(e.name for e in METHODS if e.name != "OneOf")), indirect=True)
 def test_exact_matrices(entry, exact):
     check_exact_matrices(entry, exact, np.float64)

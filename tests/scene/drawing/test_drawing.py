@@ -255,7 +255,7 @@ def test_what_was_changed_by_hand_is_no_structure():
 
 
 def test_pins_are_differentiated_and_batched():
-    """A coupler point's error by all pins against differences; under vmap each member is what it is by itself."""
+    """A coupler point's error by all pins against differences; under vmap each member equals its own run."""
     drawing = four_bar(motors=[{"pin": "O", "speed": 2.0}])
     mech, ts = drawing.mechanism(), np.linspace(0.0, 1.0, 3)
     names, target = list(FOUR_BAR), np.array([1.0, 2.0])
