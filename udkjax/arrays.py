@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import Numbers
+
+ArrayLibrary: TypeAlias = ModuleType  # numpy or jax.numpy
 
 # Bound on a computed number that is zero in theory, relative to the largest of its kind: some hundred rounding units.
 ROUNDING = 256 * float(np.finfo(float).eps)

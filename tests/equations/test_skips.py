@@ -7,9 +7,9 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations.analysis import analyse
-from udkjax.equations.differentiable_programs import FORWARD, REVERSE
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
+from udkjax.expressions.loop_derivative import FORWARD, REVERSE
 from udkjax.pinv.rank_policy import RankPolicy
 
 GROUND = "ground"

@@ -17,11 +17,10 @@ from tests.run_programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import analyse
-from udkjax.equations.differentiable_programs import PREFIXES, TWICE
 from udkjax.equations.scene_arrays import constants_of
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.unrolled import Unrolled
-from udkjax.expressions.loop_derivative import LoopDerivative
+from udkjax.expressions.loop_derivative import PREFIXES, TWICE, LoopDerivative
 from udkjax.expressions.loop_program import KernelLoop, Reset
 from udkjax.native.base import machine
 from udkjax.native.base.loops import LoopWriter

@@ -9,7 +9,7 @@ import udkjax as udk
 from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import duration_of
-from udkjax.studio.templates import TEMPLATES
+from udkjax.studio.tasks import TEMPLATES
 from udkjax.studio.worker import Worker
 
 SIX_BAR = """format = 2

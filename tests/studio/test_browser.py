@@ -7,7 +7,7 @@ import pytest
 
 import udkjax as udk
 from tests.studio.browsing import PATIENCE, served, studio_page
-from udkjax.studio.templates import TEMPLATES
+from udkjax.studio.tasks import TEMPLATES
 
 TOLERANCE = 1e-8  # of the page's runs
 STEPS = 600  # moves of a pulling mouse: ten seconds at 60 frames per second

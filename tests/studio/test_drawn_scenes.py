@@ -6,7 +6,7 @@ import pytest
 import udkjax as udk
 from udkjax.studio.drawn_scenes import drawing_text_of
 from udkjax.studio.shown_runs import duration_of
-from udkjax.studio.templates import TEMPLATES, template_text
+from udkjax.studio.tasks import TEMPLATES, template_text
 
 FEW = ("parallelogram", "planetary_gear", "excavator", "elliptic_trammel")
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
+from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
-from udkjax.equations.scales import Scales, concrete_scales, mass_of
+from udkjax.equations.scales import Scales, concrete_scales
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism

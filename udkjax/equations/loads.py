@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.annotations import NumericArray
+from udkjax.arrays import ArrayLibrary
 from udkjax.equations.constraints import BodyArray, bodies, vector
-from udkjax.equations.structure import ElementKind, evaluate_by_kind
+from udkjax.equations.structure import ElementKind, evaluate_by_kind, numbers_as_vector
 from udkjax.programs.deferred import traced_once
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
@@ -29,6 +31,13 @@ def mass(mechanism: Mechanism) -> Float[Array, "n"]:
         m, m (kg) and I (kg m^2) of each body (n,).
     """
     return vector([m for body in mechanism.bodies.values() for m in (body.mass, body.mass, body.inertia)])
+
+
+def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
+    """Return the diagonal of the mass matrix, by NumPy or JAX."""
+    bodies = mechanism.bodies.values()
+    mass, inertia = (numbers_as_vector([getattr(body, name) for body in bodies]) for name in ("mass", "inertia"))
+    return xp.ravel(xp.stack([mass, mass, inertia], 1))
 
 
 @traced_once

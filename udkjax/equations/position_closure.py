@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from udkjax.annotations import AnyArray, Time
+from udkjax.arrays import ArrayLibrary
 from udkjax.equations.abstract_system import MechanismSystem
-from udkjax.equations.control_flow import control_flow
 from udkjax.equations.scales import Scales
-from udkjax.equations.structure import ArrayLibrary
+from udkjax.programs.control_flow import control_flow
 
 # Psi in units of the scene's scales, at or below which a position counts as closed. Rounding leaves 1e-15; a scene that cannot be
 # closed leaves the error of its lengths.

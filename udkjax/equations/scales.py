@@ -14,11 +14,11 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.annotations import AnyArray, NumericArray
-from udkjax.arrays import library_for, number
+from udkjax.annotations import AnyArray
+from udkjax.arrays import ArrayLibrary, library_for, number
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import ArrayLibrary, join_concrete_numbers, numbers_as_vector
+from udkjax.equations.structure import join_concrete_numbers, numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
@@ -130,10 +130,3 @@ scales_p.def_abstract_eval(
 batching.primitive_batchers[scales_p] = _batch
 mlir.register_lowering(scales_p, mlir.lower_fun(scales_by_jax, multiple_results=False))
 evaluate_as(scales_p, evaluate_scales)
-
-
-def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
-    """Return the diagonal of the mass matrix, by NumPy or JAX."""
-    bodies = mechanism.bodies.values()
-    mass, inertia = (numbers_as_vector([getattr(body, name) for body in bodies]) for name in ("mass", "inertia"))
-    return xp.ravel(xp.stack([mass, mass, inertia], 1))

@@ -7,8 +7,9 @@ from typing import Generic
 import numpy as np
 
 from udkjax.annotations import AnyArray, Time
+from udkjax.arrays import ArrayLibrary
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import ArrayLibrary, numbers_as_vector
+from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.scene.mechanism import Mechanism
 

@@ -20,9 +20,10 @@ from scipy.sparse.linalg import splu
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
 from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE, RowTerms
+from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.scales import concrete_scales, mass_of
+from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.mechanism import Mechanism

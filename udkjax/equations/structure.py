@@ -6,7 +6,6 @@ Elements of the same structure, such as all revolute joints, are traced once and
 import dataclasses
 from collections.abc import Callable, Hashable, Sequence
 from itertools import groupby
-from types import ModuleType
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -24,7 +23,6 @@ from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
 LeafShapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # the shape and the type of each number of a tree
-ArrayLibrary: TypeAlias = ModuleType  # numpy or jax.numpy
 Element: TypeAlias = Constraint | ForceElement
 Result = TypeVar("Result")
 

@@ -9,10 +9,10 @@ from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
-from udkjax.equations.differentiable_programs import FORWARD, PREFIXES, REVERSE, TWICE, DifferentiableProgram
+from udkjax.equations.differentiable_programs import DifferentiableProgram
 from udkjax.equations.scene_programs import RESULTS, ScenePrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
-from udkjax.expressions.loop_derivative import COTANGENT, OTHER, SECOND, TANGENT
+from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIXES, REVERSE, SECOND, TANGENT, TWICE
 from udkjax.expressions.loop_program import LoopProgram
 from udkjax.expressions.unroll import ArrayPlace, Arrays, unroll
 

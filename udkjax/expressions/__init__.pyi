@@ -12,9 +12,13 @@ from udkjax.expressions.graph import Scalar as Scalar
 from udkjax.expressions.jaxpr_reader import read_jaxpr as read_jaxpr
 from udkjax.expressions.jaxpr_reader import trace as trace
 from udkjax.expressions.loop_derivative import COTANGENT as COTANGENT
+from udkjax.expressions.loop_derivative import FORWARD as FORWARD
 from udkjax.expressions.loop_derivative import OTHER as OTHER
+from udkjax.expressions.loop_derivative import PREFIXES as PREFIXES
+from udkjax.expressions.loop_derivative import REVERSE as REVERSE
 from udkjax.expressions.loop_derivative import SECOND as SECOND
 from udkjax.expressions.loop_derivative import TANGENT as TANGENT
+from udkjax.expressions.loop_derivative import TWICE as TWICE
 from udkjax.expressions.loop_derivative import LoopDerivative as LoopDerivative
 from udkjax.expressions.loop_program import ADD as ADD
 from udkjax.expressions.loop_program import ALL as ALL

@@ -16,6 +16,9 @@ from udkjax.expressions.scalar_program import ScalarProgram
 
 TANGENT, COTANGENT = "d_", "bar_"
 OTHER, SECOND = "e_", "de_"  # tangents along another direction, and along both
+# Modes of differentiation: along a direction, its transpose, and along two directions with the second derivative of both.
+FORWARD, REVERSE, TWICE = "forward", "reverse", "twice"
+PREFIXES = {FORWARD: (TANGENT,), REVERSE: (COTANGENT,), TWICE: (TANGENT, OTHER, SECOND)}  # of arrays of changes, or cotangents
 
 
 class LoopDerivative:

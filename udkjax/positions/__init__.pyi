@@ -54,8 +54,6 @@ from udkjax.positions.kinematics import travel as travel
 from udkjax.positions.motion_ranges import MotionRanges as MotionRanges
 from udkjax.positions.motion_ranges import motion_ranges as motion_ranges
 from udkjax.positions.motion_ranges import range_lines as range_lines
-from udkjax.positions.native_positions import compile_programs as compile_programs
-from udkjax.positions.native_positions import position_code as position_code
 from udkjax.positions.open_rows import MOST_NAMED as MOST_NAMED
 from udkjax.positions.open_rows import explain_open as explain_open
 from udkjax.positions.open_rows import name_not_finite as name_not_finite
@@ -68,6 +66,8 @@ from udkjax.positions.path_tracking import PathTracker as PathTracker
 from udkjax.positions.path_tracking import Precision as Precision
 from udkjax.positions.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.position_batch import PositionBatch as PositionBatch
+from udkjax.positions.position_batch import compile_programs as compile_programs
+from udkjax.positions.position_batch import position_code as position_code
 from udkjax.positions.transmission import Workspace as Workspace
 from udkjax.positions.transmission import coupler_curve as coupler_curve
 from udkjax.positions.transmission import mechanical_advantage as mechanical_advantage

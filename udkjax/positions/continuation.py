@@ -25,14 +25,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.equations.control_flow import sequential
+from udkjax.arrays import ArrayLibrary
 from udkjax.equations.position_closure import CLOSED_TOL
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.structure import ArrayLibrary
 from udkjax.native.base.host_function import call_seldom
 from udkjax.positions.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing, find_toggle
 from udkjax.positions.curve import AbstractCurve
 from udkjax.printing import PrintsWords
+from udkjax.programs.control_flow import sequential
 
 FIRST_STEP, LONGEST_ARC, SHORTEST_ARC = 0.1, 0.3, 1e-9  # steps along the arc, in characteristic lengths or radians
 LARGEST_BEND = 0.95  # cosine of the largest turn of the tangent in a step, 18 degrees; crossing branches differ by more

@@ -10,13 +10,13 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
-from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import ROUNDING_UNITS
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.svd import SVDFactors
 from udkjax.positions.drive import Driven
+from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.scene.mechanism import Mechanism
 
 NEWTON_STEPS = 8  # three are usual

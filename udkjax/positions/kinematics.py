@@ -12,7 +12,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.positions.assembly import State, assemble
 from udkjax.positions.branches import SAME_POSITION
 from udkjax.positions.carried_bodies import carried_bodies
@@ -22,6 +21,7 @@ from udkjax.positions.drive import Drive, Driven, drive, element_of
 from udkjax.positions.march import MarchResult, can_march, march, march_at_once
 from udkjax.positions.position_derivatives import with_derivative, with_derivatives
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
+from udkjax.programs.control_flow import BY_JAX, ControlFlow, solve
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame, frame_over_time
 from udkjax.scene.checks import SceneError

@@ -1,6 +1,7 @@
 """Positions of batches of mechanisms that differ in some numbers, with exact derivatives by these, by machine code in lanes."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,13 +9,15 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
 from udkjax.equations.position_closure import LONGEST_STEP
-from udkjax.equations.position_programs import trace_model
+from udkjax.equations.position_programs import PositionPrograms, TracedModel, trace_model
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.closing.positions import PositionCode
 from udkjax.positions.drive import Drive, Driven, drive
 from udkjax.positions.free_numbers import FreeNumbers, position_model
-from udkjax.positions.native_positions import compile_programs, position_code
 from udkjax.printing import PrintedTable, PrintsTable, prints_table, units
 from udkjax.requirements import require_finite
 from udkjax.scene.arguments import checked
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -127,3 +130,21 @@ class PositionBatch:
 def coordinate_units(driven: Driven) -> Float[np.ndarray, "n"]:
     """Return the units of x, y (the characteristic length) and angle (1 rad) of each body."""
     return np.asarray(driven.analysis.scales.coordinates(driven.analysis.coordinates))
+
+
+def compile_programs(
+    mechanism: Mechanism, model: TracedModel, parameters: int, coordinates: int, **choices: Any
+) -> PositionPrograms:
+    """Return the programs of a model; raise `SceneError` if positions do not follow from the driver."""
+    try:
+        return PositionPrograms(model, parameters, coordinates, **choices)
+    except ValueError as problem:
+        raise SceneError([f"positions do not follow from the driver: {problem}"], mechanism.name) from None
+
+
+def position_code(mechanism: Mechanism, programs: PositionPrograms) -> PositionCode:
+    """Return the machine code of programs; raise `SceneError` if an operation has no instruction."""
+    try:
+        return PositionCode(programs)
+    except UnsupportedError as problem:
+        raise SceneError([f"machine code has no instruction for {problem}"], mechanism.name) from None

@@ -22,12 +22,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.annotations import TimeSeries
-from udkjax.equations.control_flow import sequential
 from udkjax.native.base.host_function import call_seldom
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.positions.continuation import Points
 from udkjax.positions.crossing import FARTHEST_NODE, nodes, weights
 from udkjax.positions.curve import Curve
+from udkjax.programs.control_flow import sequential
 from udkjax.programs.varying_axes import result_type
 from udkjax.transforms.gradients import stop_gradients
 

@@ -1,5 +1,11 @@
 """The door of `programs`: the names that floors above import, each from the module that it is in."""
 
+from udkjax.programs.control_flow import BY_JAX as BY_JAX
+from udkjax.programs.control_flow import BY_NUMPY as BY_NUMPY
+from udkjax.programs.control_flow import ControlFlow as ControlFlow
+from udkjax.programs.control_flow import control_flow as control_flow
+from udkjax.programs.control_flow import sequential as sequential
+from udkjax.programs.control_flow import solve as solve
 from udkjax.programs.deferred import deferred as deferred
 from udkjax.programs.deferred import deferred_if_traced as deferred_if_traced
 from udkjax.programs.deferred import deferred_p as deferred_p

@@ -11,7 +11,7 @@ All means of avoiding repeated work in the package, and their uses:
     deferred                        a program that users wait for: NumPy evaluates it at first
     deferred_if_traced              likewise, for a function that checks or branches on concrete numbers
     traced_once                     a function that larger programs call many times: one trace, compiled within each of them
-    equations.control_flow.solve    an algorithm too long to trace: Python loops if everything is concrete, else one program
+    control_flow.solve              an algorithm too long to trace: Python loops if everything is concrete, else one program
     native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
     scene cached_by_identity        a result that does not depend on numbers: cached by the identity of objects
 """

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations import analyse, energy, violation
-from udkjax.equations.quantities import Energy
+from udkjax.equations.analysis import analyse
+from udkjax.equations.quantities import Energy, energy, violation
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
 from udkjax.scene.bodies import GROUND

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.equations import efforts
+from udkjax.equations.quantities import efforts
 from udkjax.integrate import Solution
 from udkjax.integrate.solution import format_work
 from udkjax.positions.assembly import Check, check_lines, numbered

@@ -12,19 +12,19 @@ from jaxtyping import Array, Bool, Float
 from udkjax.annotations import NumberLike
 from udkjax.arrays import library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
-from udkjax.equations.load_scale import LoadScale, load_scale
 from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
 from udkjax.positions.assembly import State, close
 from udkjax.positions.branches import distinct_positions, random_positions
 from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
 from udkjax.positions.drive import Driven
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
+from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.linearization import Linearization, linearize, with_unit_mass
+from udkjax.statics.load_scale import LoadScale, load_scale
 from udkjax.transforms.gradients import stop_gradients
 
 MOST_NEWTON_STEPS = 100  # of limited length: ten are usual, a hundred cross any scene

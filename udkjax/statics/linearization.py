@@ -20,8 +20,8 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.control_flow import BY_JAX, ControlFlow
 from udkjax.pinv import SVD
+from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.scene.mechanism import Mechanism
 
 

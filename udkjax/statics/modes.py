@@ -8,12 +8,11 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import library_for, number, stored
+from udkjax.arrays import ArrayLibrary, library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.control_flow import ControlFlow, solve
-from udkjax.equations.structure import ArrayLibrary
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
+from udkjax.programs.control_flow import ControlFlow, solve
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.annotations import NumberLike
-from udkjax.equations import efforts
+from udkjax.equations.quantities import efforts
 from udkjax.positions.drive import with_halted_drivers
 from udkjax.printing import align_columns, format_number
 from udkjax.scene.mechanism import Mechanism

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations import analyse, efforts
+from udkjax.equations.analysis import analyse
+from udkjax.equations.quantities import efforts
 from udkjax.integrate import Solution, simulate
 from udkjax.positions.assembly import close
 from udkjax.positions.channels import StateHistory

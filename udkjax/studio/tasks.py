@@ -1,14 +1,15 @@
 """Tasks of the studio's worker processes: read, compile, diagnose and export drawings. Arguments and results are plain data."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations import analyse
+from udkjax.equations.analysis import analyse
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.base.program import UnsupportedError
+from udkjax.scene import library
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.files import loads
@@ -18,8 +19,27 @@ from udkjax.studio.exports import exported
 from udkjax.studio.findings import examine
 from udkjax.studio.limits import RefusedError, require_few, require_size
 from udkjax.studio.shown_runs import duration_of, effort_name, recorded_motion
-from udkjax.studio.templates import TEMPLATES, template_text
 from udkjax.studio.text_edits import merge_document, read_document
+
+Maker = Callable[[], Mechanism]
+# Drawings that one may start from: mechanisms of the library, drawn anew.
+TEMPLATES: Mapping[str, tuple[str, Maker]] = {
+    "four_bar": ("Four-bar linkage", library.four_bar),
+    "slider_crank": ("Slider-crank", library.slider_crank),
+    "parallelogram": ("Five-bar parallelogram with a redundant link", library.parallelogram),
+    "peaucellier": ("Peaucellier straight-line linkage", library.peaucellier),
+    "planetary_gear": ("Planetary gear", library.planetary_gear),
+    "scissor_lift": ("Scissor lift", library.scissor_lift),
+    "excavator": ("Excavator", library.excavator),
+    "andrews_squeezer": ("Andrews' squeezer mechanism", library.andrews_squeezer),
+    "n_four_bar": ("Four-bars in a row", library.n_four_bar),
+    "elliptic_trammel": ("Elliptic trammel", library.elliptic_trammel),
+    "double_pendulum": ("Double pendulum", library.double_pendulum),
+    "compound_pendulum": ("Compound pendulum", library.compound_pendulum),
+    "driven_pendulum": ("Driven pendulum", library.driven_pendulum),
+    "simple_pendulum": ("Simple pendulum", library.simple_pendulum),
+    "chain": ("Chain of ten links", library.chain),
+}
 
 
 def list_templates() -> JsonObject:
@@ -146,3 +166,8 @@ def export(text: str, suffix: str) -> JsonObject:
         raise RefusedError(422, "; ".join(error.problems)) from None
     except ImportError as error:
         raise RefusedError(422, str(error)) from None
+
+
+def template_text(name: str) -> str:
+    """Return a template as the text of a drawing."""
+    return drawing_text_of(TEMPLATES[name][1]())

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations import energy, violation
 from udkjax.equations.analysis import analyse
+from udkjax.equations.quantities import energy, violation
 from udkjax.integrate import Solution
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Revolute

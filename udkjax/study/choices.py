@@ -5,8 +5,9 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TypeAlias
 
-from udkjax.equations import Augmented, Baumgarte, CoordinatePartitioning, NullSpaceQR, NullSpaceSVD
-from udkjax.equations.formulations import Formulation
+from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
+from udkjax.equations.partitioning import CoordinatePartitioning
+from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate import Projection
 from udkjax.integrate.solvers import Solver, solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga

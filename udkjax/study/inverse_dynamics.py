@@ -26,7 +26,6 @@ from udkjax.annotations import NumberLike
 from udkjax.arrays import number, number_called
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.load_scale import load_sizes
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.positions.channels import StateHistory
@@ -40,6 +39,7 @@ from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import CALLED
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
+from udkjax.statics.load_scale import load_sizes
 from udkjax.wording import quote
 
 

@@ -13,7 +13,7 @@ from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.positions.drive import Drive, drive
 from udkjax.positions.free_numbers import FreeNumbers, position_model
 from udkjax.positions.kinematics import FULL_TURN
-from udkjax.positions.native_positions import compile_programs, position_code
+from udkjax.positions.position_batch import compile_programs, position_code
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.goals import Goal, goal_scale, place_of

@@ -15,7 +15,7 @@ from udkjax.equations.position_programs import trace_model
 from udkjax.positions.drive import Drive, Driven
 from udkjax.positions.free_numbers import FreeNumbers, position_model
 from udkjax.positions.kinematics import FULL_TURN, kinematics
-from udkjax.positions.native_positions import compile_programs, position_code
+from udkjax.positions.position_batch import compile_programs, position_code
 from udkjax.programs.deferred import deferred
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.annotations import TreeDef
-from udkjax.equations.scales import mass_of
+from udkjax.equations.loads import mass_of
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import added_joints, joint_numbers
 from udkjax.integrate.events.condition_program import condition_numbers

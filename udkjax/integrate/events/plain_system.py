@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.scales import mass_of
+from udkjax.equations.loads import mass_of
 from udkjax.integrate.events.crossings import NO_EVENT
 from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
 from udkjax.integrate.events.hybrid import Added, Hybrid

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
-from udkjax.equations.differentiable_programs import FORWARD
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
+from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter

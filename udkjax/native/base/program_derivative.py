@@ -13,8 +13,8 @@ where all but the accelerations leave their changes in `result` of a tangent, an
 
 from collections.abc import Sequence
 
-from udkjax.equations.differentiable_programs import PREFIXES, TWICE, DifferentiableProgram
-from udkjax.expressions.loop_derivative import COTANGENT
+from udkjax.equations.differentiable_programs import DifferentiableProgram
+from udkjax.expressions.loop_derivative import COTANGENT, PREFIXES, TWICE
 from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import PointerPlace

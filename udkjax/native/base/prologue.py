@@ -9,8 +9,7 @@ of all numbers, and of the constants that move; the last along two directions, a
 
 from collections.abc import Sequence
 
-from udkjax.equations.differentiable_programs import FORWARD, PREFIXES, REVERSE, TWICE
-from udkjax.expressions.loop_derivative import COTANGENT, LoopDerivative
+from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, PREFIXES, REVERSE, TWICE, LoopDerivative
 from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.base.module import Module
 

@@ -9,9 +9,9 @@ much beside the manifold by the square of that.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from udkjax.equations.differentiable_programs import FORWARD, REVERSE, TWICE
 from udkjax.equations.position_closure import CLOSURE_ITERATIONS, VELOCITIES
 from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.expressions.loop_derivative import FORWARD, REVERSE, TWICE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Layout
 from udkjax.native.base.program_derivative import GIVEN, WAYS, ProgramDerivative

@@ -14,7 +14,7 @@ Members walk back side by side, in lanes; the next ones follow when all are back
 
 from collections.abc import Sequence
 
-from udkjax.equations.differentiable_programs import REVERSE
+from udkjax.expressions.loop_derivative import REVERSE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative

@@ -12,7 +12,7 @@ and the accelerations, the end of a step and the outputs, which are projected, b
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from udkjax.equations.differentiable_programs import FORWARD, TWICE
+from udkjax.expressions.loop_derivative import FORWARD, TWICE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Layout, Plan
 from udkjax.native.base.program_derivative import GIVEN, WAYS

@@ -1,4 +1,4 @@
-"""DenseMatrices matrices in the memory of a run, one of each lane, and the operations on their rows.
+"""Dense matrices in the memory of a run, one per lane, and operations on their rows.
 
 The entries of a row lie behind one another, each in all lanes, and fill whole registers; padding of the last one is zero. So
 an operation on rows is one on registers: of one member they hold several columns, of W members side by side one column of each.

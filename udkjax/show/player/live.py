@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations import analyse
+from udkjax.equations.analysis import analyse
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.base.program import UnsupportedError

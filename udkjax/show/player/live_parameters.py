@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations import analyse
+from udkjax.equations.analysis import analyse
 from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units

@@ -9,17 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from udkjax.equations import (
-    Analysis,
-    analyse,
-    determinacy,
-    efforts,
-    energy,
-    reactions,
-    singular_values,
-    unique_reactions,
-    violation,
-)
+from udkjax.equations import determinacy
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.evaluate import singular_values
+from udkjax.equations.quantities import efforts, energy, violation
+from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.programs.deferred import deferred
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism

@@ -29,7 +29,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.annotations import JsonObject
-from udkjax.equations import analyse
+from udkjax.equations.analysis import analyse
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
 from udkjax.positions.channels import locate

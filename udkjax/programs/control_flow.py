@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from udkjax.arrays import is_traced, is_within_jit
-from udkjax.equations.structure import ArrayLibrary
+from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit
 from udkjax.programs.deferred import deferred
 
 Carry = TypeVar("Carry")
