@@ -40,9 +40,13 @@ CLEAN = [  # folders with all below them, or files
     "udkjax/programs",
     "udkjax/progress.py",
     "udkjax/scene",
+    "udkjax/show",
     "udkjax/statics",
+    "udkjax/studio",
     "udkjax/synthesis",
     "udkjax/transforms",
+    "tests/show",
+    "tests/studio",
 ]
 
 # Pattern of the beginning of a docstring or a comment: (pattern, an example, a correct sentence).
@@ -96,6 +100,13 @@ def texts(source: str) -> tuple[list[str], list[str]]:
     return [*(doc.value for doc in docs), *comments, *blocks.values()], [text for text in messages if " " in text.strip()]
 
 
+def script_texts(source: str) -> tuple[list[str], list[str]]:
+    """The comments of a JavaScript module, and its strings of several words."""
+    found = re.findall(r'"(?:[^"\\\n]|\\.)*"|`(?:[^`\\]|\\.)*`|/\*.*?\*/|(?:^//[^\n]*\n)+|//[^\n]*', source, flags=re.M | re.S)
+    comments = [re.sub(r"^ *(//|/?\*+/?) ?|\*/$", "", text, flags=re.M).strip() for text in found if text.startswith("/")]
+    return comments, [text[1:-1] for text in found if not text.startswith("/") and " " in text.strip()]
+
+
 def one_line(text: str) -> str:
     return " ".join(text.split())
 
@@ -115,12 +126,13 @@ def findings(begun: list[str], other: list[str]) -> list[str]:
 
 def files(name: str) -> list[Path]:
     place = ROOT / name
-    return [place] if place.is_file() else sorted(x for x in place.rglob("*") if x.suffix in (".py", ".md"))
+    return [place] if place.is_file() else sorted(x for x in place.rglob("*") if x.suffix in (".py", ".md", ".js"))
 
 
 def problems(file: Path) -> list[str]:
     text = file.read_text(encoding="utf-8")
-    found = findings(*texts(text)) if file.suffix == ".py" else findings([], prose(text).split("\n\n"))
+    parts = {".py": texts, ".js": script_texts}.get(file.suffix, lambda page: ([], prose(page).split("\n\n")))
+    found = findings(*parts(text))
     return [f"{file.relative_to(ROOT)}: {phrase}" for phrase in found]
 
 
@@ -145,6 +157,13 @@ def test_each_phrase_finds_its_example_alone(pattern, wrong, right):
 def test_texts_of_a_module_are_found():
     source = '"""Module of two."""\nA = 1  # one\n# Two\n# three\nB = f"four five {A}"\n'
     assert texts(source) == (["Module of two.", "one", "Two three"], ["Module of two.", "four five "])
+
+
+def test_texts_of_a_script_are_found():
+    source = (
+        '// Of one.\n// Two.\nlet a = "three four";  // five\n/** Six\n *  seven. */\nlet b = `eight ${a} nine`, c = "ten";\n'
+    )
+    assert script_texts(source) == (["Of one.\nTwo.", "five", "Six\n seven."], ["three four", "eight ${a} nine"])
 
 
 def test_phrases_across_lines_are_found():

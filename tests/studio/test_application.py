@@ -145,7 +145,7 @@ def test_the_paper_linkage_is_diagnosed(client):
     assert found["sets"][0]["constraints"] == ["A1", "A2", "A3", "B1", "B2", "B3"]
     assert {fix["constraint"] for fix in found["sets"][0]["fixes"]} == {"A1", "A2", "A3", "B1", "B2", "B3"}
     assert set(found["not_unique"]) == {"A1", "A2", "A3", "B1", "B2", "B3"}
-    assert found["motion"] == "Gravity and loads move it; add a motor to drive it"
+    assert found["motion"] == "Gravity and loads move the mechanism; add a motor to drive it"
 
 
 def test_a_triangle_is_said_not_to_move(client):

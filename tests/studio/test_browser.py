@@ -60,7 +60,7 @@ def test_the_paper_five_bar_is_drawn_diagnosed_moved_and_saved(studio):
     assert "1 degree of freedom · 1 redundant constraint" in found
     assert "A, B, C, D, E, F: 1 redundant constraint in every position. Any one of these changes removes it:" in found
     for pin in "ABCDEF":
-        assert f"{pin}: make it a slot" in found
+        assert f"{pin}: let the pin on " in found
     assert "not unique at A (x, y)" in found
     before = studio.pin("B")
     studio.page.keyboard.press(" ")
@@ -123,7 +123,7 @@ def test_a_slider_crank_is_drawn_and_its_text_is_edited_beside_it(studio):
     assert_moves_as_simulated(studio, studio.js("studio.state.text"))
     text = studio.js("studio.state.text")
     area = studio.page.locator("textarea")
-    area.fill(text.replace('"60 rpm"', '"30 rpm" # half of what it was'))
+    area.fill(text.replace('"60 rpm"', '"30 rpm" # half as fast'))
     studio.until("studio.document.motor[0].speed === '30 rpm'")
     studio.settle()
     assert studio.js("studio.motion.end") == 4.0  # two turns
@@ -134,7 +134,7 @@ def test_a_slider_crank_is_drawn_and_its_text_is_edited_beside_it(studio):
     studio.settle()
     assert studio.document["pins"]["B"] == [60, 150]
     changed = studio.js("studio.state.text")
-    assert changed == text.replace('"60 rpm"', '"30 rpm" # half of what it was').replace("B = [70, 140]", "B = [60, 150]")
+    assert changed == text.replace('"60 rpm"', '"30 rpm" # half as fast').replace("B = [70, 140]", "B = [60, 150]")
     assert area.input_value() == changed
     assert_moves_as_simulated(studio, changed)
 

@@ -5,7 +5,7 @@
 
     plots.draw_energy(pyplot.gca(), sol.ts, udk.energy(mech, sol))
 
-Every axis has its unit. The colours can be told apart by colour-blind readers, too, and curves also differ by markers or dashes.
+Every axis has its unit. Colour-blind readers can distinguish the colours, too, and curves also differ by markers or dashes.
 Only `trajectory` makes a figure of its own.
 """
 

@@ -98,10 +98,10 @@ def _why(found: Diagnosis, mechanism: Mechanism) -> str:
     if len(drivers) > found.joint_mobility:
         return f"{plural(len(drivers), 'motor')} for {_freedom(found.joint_mobility)}: their motions must agree"
     if drivers:
-        return f"{names} and the loads move it; {_freedom(found.degrees_of_freedom)} left to the loads"
+        return f"{names} and the loads move the mechanism; {_freedom(found.degrees_of_freedom)} left to the loads"
     if mechanism.forces or np.any(np.asarray(mechanism.gravity)):
-        return "Gravity and loads move it; add a motor to drive it"
-    return "Nothing moves it: add a motor or a load"
+        return "Gravity and loads move the mechanism; add a motor to drive it"
+    return "Nothing moves the mechanism: add a motor or a load"
 
 
 def _freedom(count: int) -> str:

@@ -99,9 +99,9 @@ def test_keys_and_scrubbing(opened, animation):
         page.keyboard.press("+")
         assert page.evaluate(f"{PLAYER}.speed") > speed
         page.keyboard.press("?")
-        assert page.get_by_text("one frame back, ahead").is_visible()
+        assert page.get_by_text("one frame back, forward").is_visible()
         page.keyboard.press("Escape")
-        assert page.get_by_text("one frame back, ahead").is_hidden()
+        assert page.get_by_text("one frame back, forward").is_hidden()
         page.get_by_role("slider", name="time").fill("5000")
         assert time() == pytest.approx(1.0)
         strip = page.locator(".strip canvas").bounding_box()

@@ -352,7 +352,7 @@ def test_loops_that_cannot_be_closed_are_reported_and_the_last_motion_stays(open
     with opened(udk.animate(mechanism, udk.simulate(mechanism, TS), live=["joint.A3.points"], measures=())) as page:
         before = shown_q(page)
         move(page, "A3 point 1 x", 9.0)  # the third link is half a metre long
-        assert "do not close" in note(page) and "m. The last motion" in note(page)
+        assert "do not close" in note(page) and "m remains. The last valid motion" in note(page)
         assert page.locator(".note.bad").count() == 1
         assert_array_equal(shown_q(page), before)
         move(page, "A3 point 1 x", 2.0)

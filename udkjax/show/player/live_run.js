@@ -63,7 +63,7 @@ export class LiveRun {
   begin() {
     this.drop();
     const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
-    if (!state.closed) return `The loops do not close with these numbers: a gap of ${this.lengthOf(state.violation)} remains. The last possible motion is shown.`;
+    if (!state.closed) return `The loops do not close with these numbers: a gap of ${this.lengthOf(state.violation)} remains. The last valid motion is shown.`;
     const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
     this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
     this.updater.update(engine.numbers(values));
@@ -104,7 +104,7 @@ export class LiveRun {
     if (hand) cancelAnimationFrame(hand.request);
   }
 
-  // What is shown
+  // Display
 
   show(run) {
     const {count} = run, n = this.engine.size, cut = (x, size) => x.subarray(0, count * size);

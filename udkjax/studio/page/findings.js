@@ -123,7 +123,7 @@ const pinOf = pins => name => (Object.hasOwn(pins, name) ? name : Object.keys(pi
 
 function changeWords({change, drawn}) {
   const of = name => (name === "ground" ? "the ground" : name);
-  return drawn?.kind === "slot" ? `make it a slot in ${of(drawn.on)} for the pin of ${of(drawn.link)}` : change;
+  return drawn?.kind === "slot" ? `let the pin on ${of(drawn.link)} slide in a slot of ${of(drawn.on)}` : change;
 }
 
 function travelWords({motor, unit, ends, lost}) {

@@ -170,7 +170,7 @@ export class Motion {
     this.studio.redraw();
   }
 
-  // What is shown
+  // Display
 
   showLoops(violation = null) {
     const {run, pageEngine, studio} = this;

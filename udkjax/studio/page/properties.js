@@ -85,10 +85,10 @@ export class PropertiesPanel {
       const select = make("select", {"aria-label": `unit of ${key}`, onchange: () => change("units", {...units, [key]: select.value})}, ...names.map(name => make("option", {value: name}, name)));
       select.value = units[key] ?? usual;
       select.title = "Unit of numbers without a unit. Changing it does not convert them.";
-      return make("label", {class: "field"}, make("span", {}, `${key} in`), select, make("span", {class: "unit"}));
+      return make("label", {class: "field"}, make("span", {}, `${key} unit`), select, make("span", {class: "unit"}));
     };
-    return [
-      this.field("name", document.name ?? "", "", value => change("name", value), "name of the mechanism"),
+    return [make("h3", {}, "mechanism"),
+      this.field("name", document.name ?? "", "", value => change("name", value), "e.g. four-bar"),
       this.field("gravity", valueText(document.gravity), unitOf(document, "acceleration") || "m/s²", value => change("gravity", readValue(value)), "[0, -9.81 m/s2]"),
       unit("length", ["mm", "cm", "m", "in", "ft"], "m"), unit("angle", ["deg", "rad"], "rad"),
     ];

@@ -200,7 +200,7 @@ class Studio {
 
   canPull(item) { return Boolean(this.motion.pageEngine?.engine) && (item.kind === "link" || (item.kind === "pin" && members(this.document, item.name).some(name => name !== "ground") && this.canvas.carrier(this.document, item.name) >= 0)); }
 
-  // What is shown
+  // Display
 
   /** Update everything around the canvas, and redraw. */
   shown() {
