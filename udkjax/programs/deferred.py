@@ -13,7 +13,7 @@ All means of avoiding repeated work in the package, and their uses:
     traced_once                     a function that larger programs call many times: one trace, compiled within each of them
     control_flow.solve              an algorithm too long to trace: Python loops if everything is concrete, else one program
     native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
-    scene cached_by_identity        a result that does not depend on numbers: cached by the identity of objects
+    cached_by_identity              a result that does not depend on numbers: cached by the identity of objects
 """
 
 from collections.abc import Callable, Hashable, Sequence

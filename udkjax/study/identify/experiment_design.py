@@ -4,7 +4,7 @@ With J the derivatives of the predicted measurements, divided by the standard de
 the Fisher information M: M^-1 is the covariance of an estimate, to first order in the noise. Nuisance unknowns (initial states,
 other parameters) are eliminated by projecting J on the complement of their columns. The best candidate has the largest det M
 (criterion "D"), the smallest trace M^-1 ("A"), or the largest smallest eigenvalue of M ("E"), in the dimensionless unknowns of
-`udkjax.study.identify.parameters`. F. Pukelsheim, Optimal Design of Experiments, 2006.
+`identify/parameters.py`. F. Pukelsheim, Optimal Design of Experiments, 2006.
 """
 
 from collections.abc import Mapping, Sequence
