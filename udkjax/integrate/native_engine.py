@@ -20,7 +20,7 @@ from udkjax.native.base.steps import Status
 from udkjax.native.operations import MarkRows
 from udkjax.native.packing import ActiveNumbers
 from udkjax.native.primitive import call_concrete, native_p
-from udkjax.native.run.formulations import formulation_settings
+from udkjax.native.run.formulations import MethodCode
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, OneOf
 from udkjax.pinv.rank_policy import RankPolicy
@@ -192,7 +192,7 @@ def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPo
     number = xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
     settings = {"length": textbook.scales.length, "fallback_tol": fallback_tol, "method": number}
     if isinstance(equations, FormulatedSystem):
-        settings |= formulation_settings(equations.formulation, textbook.scales.mass)
+        settings |= MethodCode.formulation_settings(equations.formulation, textbook.scales.mass)
     numbers = jax.tree.leaves((mechanism, textbook.baumgarte))
     return SceneInputs(numbers, [drop_tol, safe_tol], textbook.scales.rows, settings)
 

@@ -7,8 +7,7 @@ from udkjax.native.base.host_function import call_seldom as call_seldom
 from udkjax.native.base.ir import Function as Function
 from udkjax.native.base.machine import lanes as lanes
 from udkjax.native.base.program import UnsupportedError as UnsupportedError
-from udkjax.native.base.program import consecutive as consecutive
-from udkjax.native.base.program import write as write
+from udkjax.native.base.program import vector_function as vector_function
 from udkjax.native.base.steps import FACTORS as FACTORS
 from udkjax.native.base.steps import LOOK_AHEAD as LOOK_AHEAD
 from udkjax.native.base.steps import NORMAL_ERROR_WEIGHT as NORMAL_ERROR_WEIGHT
@@ -34,7 +33,6 @@ from udkjax.native.primitive import machine_code as machine_code
 from udkjax.native.primitive import native_p as native_p
 from udkjax.native.primitive import unsupported as unsupported
 from udkjax.native.run.formulations import MethodCode as MethodCode
-from udkjax.native.run.formulations import formulation_settings as formulation_settings
 from udkjax.native.run.state_functions import Evaluation as Evaluation
 from udkjax.native.runs import RunStates as RunStates
 from udkjax.native.runs import RunWatched as RunWatched

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
 from udkjax.integrate.events.conditions import frames_of, sees_velocity
 from udkjax.integrate.events.event import Event
-from udkjax.native.base.program import UnsupportedError, consecutive, write
+from udkjax.native.base.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
@@ -114,8 +114,7 @@ def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _text(program: ScalarProgram) -> str:
-    places = consecutive("in", len(program.inputs)), consecutive("out", len(program.outputs))
-    return write(program, "conditions", 1, ("in", "out"), *places).text()
+    return vector_function(program, "conditions", "in", "out").text()
 
 
 def conditions_of(events: Sequence[Event], names: Sequence[str], t: Array, q: Array, v: Array) -> Float[Array, "E"]:

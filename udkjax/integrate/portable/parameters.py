@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
 from udkjax.native.base.ir import Function
-from udkjax.native.base.program import consecutive, write
+from udkjax.native.base.program import vector_function
 from udkjax.native.packing import SampleRows
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_in, split_index
@@ -98,9 +98,7 @@ class NumberProgram:
 
     def function(self) -> Function:
         """Return `numbers(parameters, numbers)`, which writes those that depend on parameters."""
-        inputs = consecutive("parameters", len(self._program.inputs))
-        outputs = [("numbers", k) for k in self.changing]
-        return write(self._program, "numbers", 1, ("parameters", "numbers"), inputs, outputs)
+        return vector_function(self._program, "numbers", "parameters", "numbers", self.changing)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
         """Return all numbers, by NumPy."""

@@ -62,6 +62,12 @@ def write(
     return f
 
 
+def vector_function(program: ScalarProgram, name: str, given: str, found: str, places: Sequence[int] | None = None) -> Function:
+    """Return a function of two pointers: inputs are contiguous at `given`; outputs go to `places` of `found`, None: all."""
+    outputs = consecutive(found, len(program.outputs)) if places is None else [(found, k) for k in places]
+    return write(program, name, 1, (given, found), consecutive(given, len(program.inputs)), outputs)
+
+
 def from_memory(f: Function, x: Value, dtype: Any) -> Value:
     """Return a number from memory as what it is in the graph."""
     if dtype.kind == "b":

@@ -266,12 +266,12 @@ class MethodCode(NamedTuple):
             raise UnsupportedError(f"the pseudoinverse {type(method).__name__}")
         return found
 
-
-def formulation_settings(formulation: Any, mass: Any) -> dict[str, Any]:
-    """Return the settings of a formulation by name: the threshold of its rank, and the scale of masses (kg)."""
-    if isinstance(formulation, Augmented):
-        tol = None if formulation.method is None else formulation.method.rank_tol
-        tol = RANK_TOL**2 if tol is None else tol
-    else:
-        tol = formulation.rank_tol
-    return dict(zip(FORMULATION_SETTINGS, (tol, mass), strict=True))
+    @staticmethod
+    def formulation_settings(formulation: Any, mass: Any) -> dict[str, Any]:
+        """Return the settings of a formulation by name: the threshold of its rank, and the scale of masses (kg)."""
+        if isinstance(formulation, Augmented):
+            tol = None if formulation.method is None else formulation.method.rank_tol
+            tol = RANK_TOL**2 if tol is None else tol
+        else:
+            tol = formulation.rank_tol
+        return dict(zip(FORMULATION_SETTINGS, (tol, mass), strict=True))
