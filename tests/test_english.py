@@ -33,6 +33,8 @@ CLEAN = [  # folders with all below them, or files
     "udkjax/extras.py",
     "udkjax/lazy_names.py",
     "udkjax/integrate/causes",
+    "udkjax/integrate/events",
+    "udkjax/integrate/portable",
     "udkjax/integrate/solvers",
     "udkjax/pinv",
     "udkjax/positions",

@@ -143,5 +143,5 @@ def test_numbers_of_conditions_follow_those_of_the_mechanism():
 def test_what_no_page_can_do_is_named():
     pendulum = udk.library.simple_pendulum()
     cut = udk.Event(lambda t, at: at["bob"].x, udk.Release("rod"), name="cut")
-    with pytest.raises(ValueError, match=r'the jump of event "cut" \(Release\) is no program yet'):
+    with pytest.raises(ValueError, match=r'the jump of event "cut" \(Release\) cannot run in a page yet'):
         portable_engine(pendulum, events=[cut])

@@ -120,7 +120,7 @@ def compile_mechanism(
 
 @cached_by_identity
 def compile_concrete(system: Mechanism, *choices: Any) -> CompiledMechanism:
-    """Return the same of a mechanism of known numbers, as arrays of NumPy: each operation of JAX would be a program."""
+    """Return the same for a mechanism of concrete numbers, as NumPy arrays, since JAX would compile each operation."""
     compiled = compile_mechanism(system.without_origin, *choices)
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, compiled)
 

@@ -1,4 +1,4 @@
-"""Integration by `diffrax.diffeqsolve`: for every solver, adjoint and progress meter that it knows."""
+"""Integration by `diffrax.diffeqsolve`, with any of its solvers, adjoints and progress meters."""
 
 from typing import Any
 
@@ -67,9 +67,9 @@ def integrate_by_diffrax(
 
 
 def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:
-    """Return the times of a run that begins behind a breakpoint at its first time, and ends before one at its last.
+    """Return the times of a run moved to just after a breakpoint at the first time, and just before one at the last.
 
-    A breakpoint nearer than the smallest step is one: no step leads from the one time to the other.
+    A breakpoint closer than the smallest step counts as equal: no step leads from the one time to the other.
     """
     ts, breakpoints = problem.ts, problem.compiled.breakpoints
     if breakpoints is None:
@@ -118,10 +118,10 @@ def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
 
 
 class _FrozenSteps(diffrax.PIDController):
-    """Chooses sizes of steps that have no derivatives.
+    """A step controller whose steps have no derivatives.
 
-    Those of the controller follow the size of the step before: where a breakpoint has cut one short, the ones behind it, up to
-    ten times as long each, would have derivatives along it that grow as fast.
+    A step of the controller depends on the previous one: after a breakpoint has cut one short, the following ones, each up to ten
+    times as long, would have derivatives along it that grow as fast.
     """
 
     def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:

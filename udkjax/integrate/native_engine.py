@@ -1,4 +1,4 @@
-"""Machine code for problems: how their numbers go in and come out (native/)."""
+"""Integration by machine code (native/): inputs, outputs and derivatives of problems."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -37,12 +37,12 @@ FALLBACK_RANK_SHARE = 0.2
 
 
 def packed(problem: Problem) -> list[np.ndarray]:
-    """Return the inputs of the run of a problem whose numbers are all known."""
+    """Return the inputs of the run of a problem with concrete numbers."""
     return run_inputs(problem, _operation(problem), np)
 
 
 def integrate_concrete(problem: Problem) -> IntegratorOutput:
-    """Integrate a problem whose numbers are all known, without tracing anything: `IntegratorOutput` of NumPy's arrays."""
+    """Integrate a problem with concrete numbers without tracing anything: `IntegratorOutput` of NumPy arrays."""
     operation = _operation(problem)
     return _output(call_concrete(operation, run_inputs(problem, operation, np), len(problem.ts)))
 
@@ -78,7 +78,7 @@ def serves_derivatives(active: Problem) -> bool:
 
 
 def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
-    """Return the numbers of a run, or a change of them; zeros stand for one row of what has samples."""
+    """Return the numbers of a run, or a change of them, with zeros in place of one row of sampled quantities."""
     of = problem if change is None else change
     return problem.compiled.samples.stand_in(of.textbook.mechanism), of.textbook.baumgarte, of.marks
 
@@ -174,9 +174,9 @@ class SceneInputs(NamedTuple):
     numbers: list[Any]  # all numbers of the scene, and the gains
     thresholds: list[Any]  # two, of pivots
     rows: Any  # the scales of the rows of Psi
-    settings: dict[str, Any]  # the unit of lengths, and what the method and the formulation are told
+    settings: dict[str, Any]  # the unit of lengths, and the arguments of method and formulation
     breaks: Any = ()  # times (s) where the motion is not smooth, in their order
-    samples: tuple[Any, ...] = ()  # the rows of all that has samples, if there is any
+    samples: tuple[Any, ...] = ()  # the rows of sampled quantities, if any
 
 
 def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
@@ -205,14 +205,14 @@ def _inputs_of_run(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleTy
 
 @cached_by_identity
 def _concrete_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
-    """Return the inputs of a run of known numbers, which are one vector."""
+    """Return the inputs of a run with concrete numbers, as one vector."""
     assert compiled.plan.operation is not None  # a run by machine code has one
     found = _inputs_of_run(compiled, compiled.plan.operation.code.policy, np)
     return found._replace(numbers=[numbers_as_vector(found.numbers)])
 
 
 def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp) -> Any:
-    """Return a mark for each row of Psi, one where it is independent near a state; None where that is known beforehand."""
+    """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code has them."""
     if not compiled.plan.marks_rows:
         return None
     equations = compiled.textbook

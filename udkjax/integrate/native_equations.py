@@ -36,7 +36,7 @@ class NativeEquations(WrappedSystem):
     """Textbook equations whose accelerations and projections are machine code."""
 
     equations: TextbookEquations
-    marks: Float[Array, "m"] | None  # of independent rows; None: machine code knows them
+    marks: Float[Array, "m"] | None  # of independent rows; None if the machine code contains them
     scene: SceneInputs  # at the first time: put together once, not in every step
     operation: Accelerate = eqx.field(static=True)
 
@@ -74,7 +74,7 @@ class NativeEquations(WrappedSystem):
 
 
 def native_equations(compiled: CompiledMechanism, marks: Float[Array, "m"] | None) -> NativeEquations:
-    """Return equations by machine code, with marks of independent rows, or None where it knows them."""
+    """Return equations by machine code, with marks of independent rows, or None if the machine code contains them."""
     operation, textbook = compiled.plan.evaluation, compiled.textbook
     assert operation is not None  # checked by the caller
     scene = scene_inputs(compiled.equations, textbook.mechanism.at(0.0), operation.code.policy)
@@ -98,7 +98,7 @@ def _pack(
 
 
 class ConcreteRates:
-    """The derivative (v, a) of a state (q, v) of a mechanism of known numbers, for integrators outside of JAX.
+    """The derivative (v, a) of a state (q, v) of a mechanism of concrete numbers, for integrators outside of JAX.
 
     Raises:
         ValueError: There is no machine code for the equations.

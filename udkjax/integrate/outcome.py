@@ -29,7 +29,7 @@ class FinishedRun(NamedTuple):
 
 
 def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
-    """Tell whether output times are finite, and each after the one before."""
+    """Return True if output times are finite and increasing."""
     return jnp.all(jnp.diff(ts) > 0) & jnp.all(jnp.isfinite(ts))
 
 
@@ -56,9 +56,9 @@ def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
 
 
 def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
-    """Return the status of a run that ended in (t, y): `NOT_FINITE` where its step became too small beside what is not finite.
+    """Return the status of a run that ended in (t, y): `NOT_FINITE` if its step became too small near a non-finite number.
 
-    That may be in (t, y) itself or up to `LOOK_AHEAD` of the span later.
+    That number may occur in (t, y) itself or up to `LOOK_AHEAD` of the span later.
     """
     q, v = jnp.split(y, 2)
     times = t + jnp.array([0.0, LOOK_AHEAD]) * span
@@ -71,7 +71,7 @@ def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Arra
 
 
 def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:
-    """Count steps and what follows from them; right-hand sides are -1 where they are not known."""
+    """Return counts of steps, right-hand sides and projections; right-hand sides are -1 if unknown."""
     return {
         "steps": raw.tried,
         "accepted": raw.accepted,

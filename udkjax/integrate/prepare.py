@@ -1,4 +1,4 @@
-"""A run before its first step: what all kinds of runs decide in the same way, of known numbers or of traced ones."""
+"""Preparation of a run before its first step, common to all kinds of runs, with concrete or traced numbers."""
 
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     import diffrax
 
 AUTO = Auto()  # one for all runs that do not say otherwise
-# Of the rows' scales. Projection leaves rounding errors, unless the rows that it does not see drift. Without it drift is what one
-# looks at, up to where a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
+# Relative to the rows' scales. Projection leaves rounding errors, unless rows that it leaves out drift. Without it drift is
+# expected, up to a bound beyond which a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
 # 2e-3 open.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
 LOOSE_TOL = 1e3  # of runs that have failed before they begin, and
@@ -39,7 +39,7 @@ NO_DRIFT = -1.0  # the violation of Psi that they may have: no output of theirs 
 
 
 class Choices(NamedTuple):
-    """The arguments of `simulate` besides the mechanism, its initial state, the times and the events."""
+    """The arguments of `simulate` except the mechanism, its initial state, the times and the events."""
 
     rtol: Any  # numbers, which may be traced
     atol: Any
@@ -56,12 +56,12 @@ class Choices(NamedTuple):
 
     @property
     def of_mechanism(self) -> tuple[Any, ...]:
-        """The arguments of `compile_mechanism` besides the mechanism and its analysis."""
+        """The arguments of `compile_mechanism` except the mechanism and its analysis."""
         return (*self[4:10], self.engine)
 
     @property
     def take_diffrax(self) -> bool:
-        """True if diffrax integrates, whatever the mechanism is."""
+        """True if diffrax integrates every mechanism with these choices."""
         others = self.adjoint is not None or self.meter is not None or not is_explicit(self.solver)
         return self.engine == "diffrax" or others
 
@@ -71,7 +71,7 @@ class Choices(NamedTuple):
         return self._replace(rtol=number(self.rtol), atol=number(self.atol), drift_tol=number(self.drift_tol), dt0=dt0)
 
     def settings(self, why_not_native: str) -> tuple[tuple[str, str], ...]:
-        """Return the choices of a run, in words, by name."""
+        """Return the choices of a run as texts by name."""
         return (
             ("method", type(self.method).__name__),
             ("formulation", "UdwadiaKalaba" if self.formulation is None else type(self.formulation).__name__),
@@ -130,12 +130,12 @@ def prepare_run(
 
     Args:
         compiled: The mechanism.
-        analysis: The mechanism's `Analysis`; None of a system of the user's own.
+        analysis: The mechanism's `Analysis`; None for a user-defined system.
         ts: Output times (s).
         state: The initial state, or None: that of `closure`.
         closure: The assembled initial guess.
         choices: All other arguments of `simulate`.
-        xp: jax.numpy, or NumPy, where all numbers are known, and so have passed the door.
+        xp: jax.numpy, or NumPy if all numbers are concrete, and thus checked.
 
     Returns:
         The run. One that cannot be used, or is open, gets loose tolerances: as a member of a batch it would hold up others.
@@ -206,5 +206,5 @@ def _start(
 def _concrete_start(
     compiled: CompiledMechanism, analysis: Analysis | None, state: State | None, closure: Closure | None
 ) -> RunStart:
-    """Return the start of a run of known numbers, by NumPy."""
+    """Return the start of a run with concrete numbers, by NumPy."""
     return _start(compiled, analysis, state, closure, np)

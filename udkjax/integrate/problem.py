@@ -27,7 +27,7 @@ class Problem:
     atol: Float[Array, ""]
     smallest: Float[Array, ""]  # step (s)
     h: Float[Array, ""] | None  # the first step; None: chosen
-    # Of the system, which `atol` is relative to (m); None: its coordinates are of order one as they are.
+    # Characteristic length (m), to which `atol` is relative; None: coordinates are of order one.
     length: Float[Array, ""] | None
     rate: Float[Array, ""]  # of the system and the run (1/s)
     max_steps: Int[ArrayLike, ""]
@@ -57,7 +57,7 @@ class Problem:
 class IntegratorOutput(NamedTuple):
     """A run as an integrator leaves it: `status` is one of `native.steps`, from `DONE` on."""
 
-    q: Float[Array, "T n"]  # no number where it was not reached, or behind the first that is lost
+    q: Float[Array, "T n"]  # NaN where it was not reached, or after the first lost output
     v: Float[Array, "T n"]
     reached: Bool[Array, "T"]
     lost: Float[Array, ""]  # the number of the first output at which Psi is violated by more than `drift_tol`; infinite: none

@@ -38,7 +38,7 @@ from udkjax.transforms.gradients import stop_gradients
 if TYPE_CHECKING:
     import diffrax
 
-MAX_STEPS = 100_000  # tried by default: at some microseconds each, a small scene that hangs ends within a second or so
+MAX_STEPS = 100_000  # default: at some microseconds each, a small scene that hangs ends within about a second
 MAX_EVENTS = 64  # by default; the arrays of events are as long
 
 
@@ -178,12 +178,12 @@ def simulate(
 
 
 def _has_failed(solution: Solution) -> bool:
-    """Return whether a single run, of known numbers, has not reached its end."""
+    """Return True if a single run with concrete numbers has not reached its end."""
     return not isinstance(solution.code, Tracer) and int(solution.code) not in SUCCESSES
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
-    """Return a solution; raise what a run that failed raises."""
+    """Return a solution, or raise the error of a failed run."""
     if throw and _has_failed(solution):
         raise SimulationError(solution.cause, solution)
     return solution
@@ -200,7 +200,7 @@ def _run(
 ) -> tuple[Solution, Any, Any]:
     """Return the solution, whether it takes rows that the method leaves out, and the last state (t, (q, v)) of the integrator.
 
-    Machine code is called at once where all numbers are known, by NumPy; everything else is traced.
+    With concrete numbers machine code is called directly, by NumPy; everything else is traced.
     """
     if all_concrete and isinstance(system, Mechanism):
         with jax.ensure_compile_time_eval():  # while something else is traced
@@ -210,7 +210,7 @@ def _run(
                 return _finish(run, integrate_concrete(run.problem), system.body_names, choices, np)
     bare = system.without_origin if isinstance(system, Mechanism) else system
     given = bare, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
-    if is_within_jit():  # in which known numbers are traced, too
+    if is_within_jit():  # concrete numbers become tracers, too
         return _simulate(*given)
     takes_diffrax = choices.take_diffrax or not isinstance(system, Mechanism)
     return _compiled(*given) if takes_diffrax else _deferred(*given)  # diffrax takes hundreds of operations for each step

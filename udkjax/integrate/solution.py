@@ -83,11 +83,11 @@ _ORDER = "steps rejected right_hand_sides projections events"  # of counts in te
 
 
 class SimulationError(RuntimeError):
-    """A simulation did not reach its end. `solution` is what it got.
+    """A simulation did not reach its end.
 
     Attributes:
         message: the cause, and the cure.
-        solution: the `Solution` as far as it came.
+        solution: the `Solution` up to the failure.
     """
 
     def __init__(self, message: str, solution: "Solution"):
@@ -214,7 +214,7 @@ class Solution(PrintsTable):
 
 
 def format_work(stats: Mapping[str, ArrayLike]) -> str:
-    """Return the work of a run as text; a count of -1 is not known."""
+    """Return the counts of a run as text; a count of -1 is unknown."""
     words = {name: name.replace("_", " ") for name in stats} | {"right_hand_sides": "right-hand sides"}
     counts = {name: int(np.asarray(count)) for name, count in stats.items() if name != "accepted"}
     return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_ORDER.find) if counts[name] >= 0)

@@ -1,4 +1,4 @@
-"""One control interval: from a state and inputs that are held to the next state, for loops that decide as they go."""
+"""One control interval with held inputs, from one state to the next, for control loops."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
@@ -43,11 +43,11 @@ def step(
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax"] = "auto",
 ) -> State:
-    """Return the state one control interval later, with inputs that are held throughout it.
+    """Return the state one control interval later, with inputs held constant.
 
     For `jax.lax.scan`, jit, vmap and grad: all numbers may be traced. The integrator chooses its own steps within the interval,
-    the first of which is all of it. Nothing is assembled: states stay on the constraints by projection, so begin with one of
-    `assemble`. Whoever knows all inputs beforehand may give them to `simulate` as a `Held`, which takes less time.
+    the first of which is the whole interval. Nothing is assembled: projection keeps states on the constraints, so begin with one of
+    `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
 
     Args:
         mechanism: the mechanism.
@@ -57,16 +57,16 @@ def step(
         t: the time at its beginning (s), for drivers and whatever else depends on time.
         rtol: relative tolerance, as in `simulate`.
         atol: absolute tolerance, as in `simulate`.
-        max_steps: the largest number of steps that are tried.
-        analysis: the mechanism's `Analysis`, by default made here.
+        max_steps: the largest number of steps tried.
+        analysis: the mechanism's `Analysis`; by default computed here.
         engine: engine, as in `simulate`.
 
     Returns:
-        The `State` at t + dt; while traced, not a number where the end was not reached.
+        The `State` at t + dt; in a traced call NaN if the end was not reached.
 
     Raises:
-        SimulationError: all numbers are known, and the end was not reached.
-        SceneError: `inputs` names no parameter, or a value of another shape.
+        SimulationError: all numbers are concrete, and the end was not reached.
+        SceneError: a name in `inputs` is not a parameter, or a value has another shape.
     """
     values, has_concrete_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
     numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}

@@ -1,4 +1,4 @@
-"""Derivatives of a run along its times, whatever integrates it.
+"""Derivatives of a run along its times, for every integrator.
 
 With the flow Phi of y' = f(t, y), the state at t_k of a run that begins at t_0 with y_0 is Phi(t_k; t_0, y_0), and
 
@@ -65,7 +65,7 @@ class RatesOfState(Rates):
 
 
 class RatesOfChange(Rates):
-    """The rates of x, and those of its changes behind it."""
+    """The rates of x, followed by those of its changes."""
 
     rates: Rates
 

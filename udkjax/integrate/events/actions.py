@@ -74,7 +74,7 @@ class Stop(Action):
 
 
 class Log(Action):
-    """Note time and state, and go on."""
+    """Record time and state, and go on."""
 
     changes = False
     on_page = True
@@ -89,7 +89,7 @@ class Impact(Action):
     the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
 
     Args:
-        restitution: the part of the approaching speed that comes back, 0 to 1.
+        restitution: ratio of the rebound speed to the approach speed, 0 to 1.
         at_rest: "hold": rest in contact; "stop": end the run.
     """
 
@@ -120,7 +120,7 @@ class Release(Action):
     """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name.
 
     Args:
-        name: of the joint or driver.
+        name: name of the joint or driver.
     """
 
     name: str = eqx.field(static=True)
@@ -163,7 +163,7 @@ class Attach(Action):
 class Lock(Action):
     """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
 
-    Its constraint has the name of the joint with ".lock" behind it: `Release("elbow.lock")` takes it away again.
+    Its constraint is named after the joint, with ".lock" appended: `Release("elbow.lock")` removes it again.
 
     Args:
         joint: the name of a joint of the scene.

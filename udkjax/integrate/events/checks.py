@@ -1,4 +1,4 @@
-"""Checks of the parts of events: each error names the event, its argument, what was given and what is meant."""
+"""Checks of the arguments of events: each error names the event, the argument, the given value and the allowed ones."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from udkjax.scene.joints import Joint
 
 
 def number_if_any(value: Any) -> Any:
-    """Make an array leaf of a number; leave what is none as it is, for the checks to name it."""
+    """Convert a number to an array leaf; return anything else unchanged, for the checks to name it."""
     try:
         return None if value is None else number(value)
     except (TypeError, ValueError):
@@ -20,7 +20,7 @@ def number_if_any(value: Any) -> Any:
 
 
 def require_name_text(name: str, value: object, may_be_empty: bool = False) -> None:
-    """Raise ArgumentTypeError where a name is not a text, ValueError where it is empty."""
+    """Raise ArgumentTypeError if a name is not a text, ValueError if it is empty."""
     if not isinstance(value, str):
         raise ArgumentTypeError(f"{name} must be a text, {describe(value)}")
     if not value and not may_be_empty:
@@ -28,7 +28,7 @@ def require_name_text(name: str, value: object, may_be_empty: bool = False) -> N
 
 
 def require_vector(name: str, value: Any) -> None:
-    """Raise where a point or a normal is not two finite numbers; of traced ones, where they are not two."""
+    """Raise unless a point or a normal is two numbers, finite unless traced."""
     found = array(name, value)
     if found.shape != (2,):
         raise ValueError(f"{name} must be two numbers, x and y, not an array of the shape {found.shape}")
@@ -36,21 +36,21 @@ def require_vector(name: str, value: Any) -> None:
 
 
 def require_normal(name: str, value: Any) -> None:
-    """Raise where a normal has no direction."""
+    """Raise if a normal is zero."""
     require_vector(name, value)
     if not isinstance(value, Tracer) and not np.any(np.asarray(value)):
         raise ValueError(f"{name} must not be zero: it points to the side that is allowed")
 
 
 def require_restitution(name: str, value: Any) -> None:
-    """Raise where a restitution is not one number from 0 to 1."""
+    """Raise unless a restitution is one number from 0 to 1."""
     require_number(name, value)
     if not isinstance(value, Tracer) and not 0 <= float(value) <= 1:
         raise ValueError(f"{name} must be from 0 to 1, is {float(value):g}")
 
 
 def require_limits(where: str, lower: Any, upper: Any) -> None:
-    """Raise where the limits of a joint's travel are not finite, or leave none."""
+    """Raise if the limits of a joint's travel are not finite, missing or in the wrong order."""
     for name, limit in (("lower", lower), ("upper", upper)):
         if limit is not None:
             require_number(f"{where}: {name}", limit)

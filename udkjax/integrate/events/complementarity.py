@@ -1,9 +1,8 @@
-"""Linear complementarity problems of contacts: 0 <= x, y = W x + b >= 0, x y = 0, of a symmetric W >= 0 of a few rows.
+"""Linear complementarity problems of contacts: 0 <= x, y = W x + b >= 0, x y = 0, for a symmetric W >= 0 of a few rows.
 
-These are the conditions of the least of x W x / 2 + b x over x >= 0. Lawson and Hanson's active-set method (Solving Least Squares
-Problems, 1974, chapter 23) finds which x are positive, the passive set, in few steps, and never takes rows into it that depend on
-one another; then x is the solution of linear equations, which is what derivatives are those of. Arrays are of JAX, or of NumPy,
-with any dimensions in front.
+These are the conditions of the minimum of x W x / 2 + b x over x >= 0. Lawson and Hanson's active-set method (Solving Least
+Squares Problems, 1974, chapter 23) finds the positive x, the passive set, in few steps, and keeps its rows independent; x then
+solves linear equations, whose derivatives are taken. Arrays are those of JAX or NumPy, with any leading dimensions.
 """
 
 from types import ModuleType
@@ -16,10 +15,9 @@ from jaxtyping import Bool, Float
 
 from udkjax.transforms.gradients import stop_gradients
 
-# Of the largest |b|, rows of unit size: a y above minus that is not negative. Rounding errors are some 1e-15 of it, more where
-# rows nearly depend on one another.
+# Tolerance on y >= 0, relative to max |b|, for rows of unit size. Rounding errors are some 1e-15, more for nearly dependent rows.
 TIGHT = 1e-12
-STEPS_PER_ROW = 6  # Lawson and Hanson found half a step for each row; rounding could make the method go round in circles
+STEPS_PER_ROW = 6  # Lawson and Hanson found half a step per row; the limit stops cycles by rounding
 
 
 class Complementary(NamedTuple):
@@ -48,13 +46,13 @@ def solve_complementarity(
 
     Args:
         W: symmetric, and positive semidefinite.
-        b: y where x is zero.
-        allowed: mask of the x that may be positive at all; the others are zero, whatever their y.
-        floor: a y above minus that is not negative.
+        b: y for x = 0.
+        allowed: mask of the x that may be positive; the others are zero for any y.
+        floor: tolerance on y >= 0.
         xp: jax.numpy, or NumPy.
 
     Returns:
-        x and y, with derivatives at the passive set that it has.
+        x and y, with derivatives for the final passive set.
     """
     size = xp.sqrt(xp.where(allowed, diagonal(W, xp), 1.0))
     scaled, rhs = W / size[..., None, :] / size[..., :, None], b / size
@@ -70,7 +68,7 @@ def diagonal(W: Any, xp: ModuleType) -> Any:
 
 
 def times(W: Any, x: Any) -> Any:
-    """Return W x, of any dimensions in front."""
+    """Return W x, with any leading dimensions."""
     return (W @ x[..., None])[..., 0]
 
 
@@ -87,7 +85,7 @@ def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, xp: ModuleType) -> An
     if xp is np and allowed.sum(-1).max(initial=0) <= 1:
         return allowed & (b + floor < 0)
 
-    def step(at: _ActiveSet) -> _ActiveSet:  # it changes nothing more where it is done
+    def step(at: _ActiveSet) -> _ActiveSet:  # no change once done
         z = _solve_passive(W, b, at.passive, xp)
         leaves = at.passive & (z <= 0)
         # Go towards z as far as all x stay positive; entries that are zero there leave the passive set.

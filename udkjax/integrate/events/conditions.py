@@ -1,4 +1,4 @@
-"""Conditions of events: the frames that they see, the coordinate of a joint, the gap of a contact."""
+"""Conditions of events: frames, the coordinate of a joint, the gap of a contact."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -19,7 +19,7 @@ Frames = Mapping[str, Frame]
 
 
 def frames_of(names: Sequence[str], q: Array | np.ndarray, v: Array | np.ndarray | None = None) -> dict[str, Frame]:
-    """Return the frames of all bodies by name, and the ground's, of flat q and v; without v they have no velocities."""
+    """Return the frames of all bodies and the ground by name, from flat q and v; without v they have no velocities."""
     xp = library_for((q, v))
     q = xp.asarray(q).reshape(-1, 3)
     rates = [()] * len(names) if v is None else xp.asarray(v).reshape(-1, 3)
@@ -37,7 +37,7 @@ class JointCoordinate(eqx.Module):
     axis: Float[Array, ""] | None = None
 
     def of(self, one: Frame, two: Frame) -> Number:
-        """Return the coordinate, of the frames of its bodies."""
+        """Return the coordinate from the frames of its bodies."""
         if self.points is None or self.axis is None:
             return two.angle - one.angle
         return one.vector((jnp.cos(self.axis), jnp.sin(self.axis))).dot(between(self.points, one, two))
@@ -73,7 +73,7 @@ class Gap(eqx.Module):
 
 
 def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoordinate:
-    """Return the coordinate of a joint of a mechanism, by its name. Raises ValueError, whose message begins with `where`."""
+    """Return the coordinate of a joint by its name. Raises ValueError with a message that begins with `where`."""
     require_name(joint, mechanism.joint_names, where, "joint")
     found = mechanism.joints[joint]
     if isinstance(found, Revolute):
@@ -93,6 +93,6 @@ def sees_velocity(condition: Callable[[Number, Frames], Any], mechanism: Mechani
 
 
 def require_name(name: str, known: Sequence[str], where: str, what: str) -> None:
-    """Raise ValueError where a name is not known."""
+    """Raise ValueError unless a name is among the `known` ones."""
     if name not in known:
         raise ValueError(f"{where}: no {what} named {quote(name)}{suggestion(name, known)}")

@@ -1,4 +1,4 @@
-"""Crossings of zero: the side of zero of each condition, the events that happen, and the roots of Hermite's cubics."""
+"""Zero crossings: the side of zero of each condition, the resulting events, and the roots of Hermite cubics."""
 
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-# Of a condition's scale, that is what a displacement of L or a turn of one radian changes in it: below it the condition is zero,
-# and so are its first and second rate, per T and T^2. Rounding errors of a state are some 1e-15 of it.
+# Relative to a condition's scale, its change by a displacement of L or a turn of one radian: smaller conditions are zero, and so
+# are their first and second rates, per T and T^2. Rounding errors of a state are some 1e-15.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
-PARTS, DIVISIONS = 32, 6  # parts of a bracket of a root of a cubic, and number of divisions: down to 1e-9 of it
-NO_EVENT = -1  # no index of an event
+PARTS, DIVISIONS = 32, 6  # parts of the bracket of a cubic's root, and number of subdivisions: down to 1e-9 of it
+NO_EVENT = -1
 
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1
 
@@ -22,13 +22,13 @@ class ConditionValues(NamedTuple):
 
     h: Float[Any, "*m E"]
     rate: Float[Any, "*m E"]
-    rate_2: Float[Any, "*m E"]  # 0 of conditions that depend on velocities
+    rate_2: Float[Any, "*m E"]  # 0 for conditions that depend on velocities
     a: Float[Any, "*m n"]
     scale: Float[Any, "*m E"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
 
 
 def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType = jnp) -> Int[Any, "*m C"]:
-    """Return the side of zero of each condition, -1 or 1; at zero the side that it is about to enter, 0 where that is unknown.
+    """Return the side of zero of each condition, -1 or 1; at zero the side that it is about to enter, or 0 if unknown.
 
     Args:
         values: the conditions and their rates.
@@ -49,11 +49,11 @@ def first_crossing(
     after: Int[Any, "*m C"],
     xp: ModuleType = jnp,
 ) -> Int[Any, "*m"]:
-    """Return the first event that happens as conditions change their sides of zero; `NO_EVENT` where none does.
+    """Return the first event whose condition changes its side of zero, or `NO_EVENT`.
 
     Args:
-        direction: in which the zero of each counts.
-        watched: mask of the conditions that count.
+        direction: direction of the crossings of interest.
+        watched: mask of the watched conditions.
         before: the sides of zero before.
         after: the sides of zero now.
         xp: jax.numpy, or NumPy.
@@ -63,14 +63,14 @@ def first_crossing(
 
 
 def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: Int[Array, "*G C"]) -> Bool[Array, "*G C"]:
-    """Return a mask of the conditions that cross zero in the direction that counts, 0 for either."""
+    """Return a mask of the conditions that cross zero in the given direction, 0 for either."""
     return (before != 0) & (after == -before) & ((direction == 0) | (after == direction))
 
 
 def carry_signs(first: Int[Array, "E"], signs: Int[Array, "G E"]) -> Int[Array, "G E"]:
-    """Replace each zero of signs along a grid by the sign before it."""
-    known = jnp.where(signs != 0, np.arange(1, len(signs) + 1)[:, None], 0)
-    return jnp.take_along_axis(jnp.concatenate([first[None], signs]), jax.lax.cummax(known, axis=0), axis=0)
+    """Replace zeros in signs along a grid by the last nonzero sign."""
+    last = jnp.where(signs != 0, np.arange(1, len(signs) + 1)[:, None], 0)
+    return jnp.take_along_axis(jnp.concatenate([first[None], signs]), jax.lax.cummax(last, axis=0), axis=0)
 
 
 def cubic_value(cubic: Cubic, x: Array) -> Array:

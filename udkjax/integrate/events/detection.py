@@ -1,10 +1,9 @@
-"""Crossings of zero within a window: which there are for certain, which may be, and where the window is too coarse to tell.
+"""Zero crossings within a window: certain ones, and intervals that are too coarse to decide.
 
-At the nodes of a window the conditions are known, and their rates where they depend on positions alone. Between two nodes a
-condition is Hermite's cubic up to E x^2 (1 - x)^2, with E measured: how far the cubic over two intervals misses the value and the
-rate at the node in between, of which one interval makes a sixteenth, or less. A crossing is certain where Bernstein's
-coefficients of the cubic plus and minus this change their sign once (Descartes' rule), none where they do not change it. All else
-is refined.
+The conditions are evaluated at the nodes of a window, and their rates if they depend on positions alone. Between two nodes a
+condition is a Hermite cubic up to E x^2 (1 - x)^2. E is measured: the error of the cubic over two intervals in the value and rate
+at the node in between, of which one interval has a sixteenth or less. There is exactly one crossing if the Bernstein coefficients
+of the cubic plus and minus this error change sign once (Descartes' rule), and none if they do not. Other intervals are refined.
 """
 
 from typing import NamedTuple
@@ -25,13 +24,13 @@ from udkjax.integrate.events.crossings import (
 from udkjax.native.watching.conditions import RESOLUTION
 
 INTERVALS = 32  # of a window
-# The nodes, of a window's length: not quite uniform, so that no oscillation is zero at all of them.
+# The nodes, relative to a window's length: slightly irregular, so that no oscillation is zero at all of them.
 _shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
 NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
 INTERVALS_OF_JUMP = 6  # intervals too coarse to resolve a jump or a kink, at every scale
 
-BESIDE = 4  # intervals before one that is too coarse that are done again
+REDONE = 4  # intervals before a coarse one that are repeated
 
 
 class Nodes(NamedTuple):
@@ -40,7 +39,7 @@ class Nodes(NamedTuple):
     t: Float[Array, "G"]
     g: Float[Array, "G C"]
     g_dot: Float[Array, "G C"]
-    good: Bool[Array, "G"]  # whether the run got there
+    good: Bool[Array, "G"]  # whether the run reached the node
 
 
 class Detection(NamedTuple):
@@ -48,15 +47,15 @@ class Detection(NamedTuple):
 
     sides: Int[Array, "G C"]  # of zero, at the nodes
     place: Int[Array, ""]  # the last node before the first crossing at which its condition is not zero
-    behind: Int[Array, ""]  # the first node behind it
+    behind: Int[Array, ""]  # the first node after it
     is_found: Bool[Array, ""]
     event: Int[Array, ""]
     root: Float[Array, ""]  # between the two, from 0 to 1
     is_exact: Bool[Array, ""]  # to rounding
-    is_coarse: Bool[Array, ""]  # whether an interval before, or that one, is too coarse
-    last_sure: Int[Array, ""]  # the node up to which all is certain, where an interval is too coarse
-    coarse: Bool[Array, "C"]  # of which conditions
-    undefined: Bool[Array, "C"]  # conditions that are not a number at its end
+    is_coarse: Bool[Array, ""]  # whether this or an earlier interval is too coarse
+    last_sure: Int[Array, ""]  # the last node before a coarse interval that is certain
+    coarse: Bool[Array, "C"]  # conditions for which it is too coarse
+    undefined: Bool[Array, "C"]  # conditions that are NaN at its end
 
 
 def detect(
@@ -70,18 +69,18 @@ def detect(
     is_short: Bool[Array, ""],
     unresolved: Bool[Array, "C"],
 ) -> Detection:
-    """Find the first crossing in a window, or the first interval that is too coarse.
+    """Find the first crossing in a window, or the first coarse interval.
 
     Args:
         nodes: the conditions at the nodes of the window.
-        has_rates: of which conditions the rates are known; of others they are taken from differences.
-        direction: the direction in which the zero of each counts, 0 for either.
+        has_rates: conditions with given rates; the rates of others are taken by differences.
+        direction: direction of the crossings of each condition, 0 for either.
         sides: the sides of zero at the first node.
         scale: scale of each condition.
-        located: the condition that is known to cross zero, wherever it is; -1: none.
-        watched: mask of the conditions that count.
-        is_short: whether the window is so short that what is too coarse in it may be a jump.
-        unresolved: mask of the conditions not to be refined.
+        located: the condition that certainly crosses zero in this window; -1: none.
+        watched: mask of the watched conditions.
+        is_short: whether the window is short enough to take coarse intervals for a jump.
+        unresolved: mask of the conditions that are not refined.
     """
     t, g, g_dot, good = nodes
     finite = jnp.isfinite(g)
@@ -103,13 +102,13 @@ def detect(
     away = (jnp.min(low, 0) >= -ZERO * scale) & (resolved | (jnp.min(low, 0) >= RESOLUTION.far * error - ZERO * scale))
     usable = good[1:, None] & watched
     coarse = (usable & ~unresolved & ~jnp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
-    # Intervals too coarse in a short window, and only there, hold a jump or a kink: finer windows would not tell more.
+    # A few coarse intervals in a short window contain a jump or a kink: finer windows would not help.
     jumps = is_short & (jnp.sum(coarse, 0) <= INTERVALS_OF_JUMP) & jnp.all(finite, 0)
     coarse = coarse & ~jumps
 
     found = hits & crosses(direction, before, after) & usable
     place, coarse_place = (jnp.argmax(jnp.any(x, axis=1)) for x in (found, coarse))
-    last_sure = jnp.maximum(coarse_place - BESIDE, 0)  # intervals before may only look fine enough
+    last_sure = jnp.maximum(coarse_place - REDONE, 0)  # earlier intervals may only look fine enough
     at_place: Cubic = (cubic[0][place], cubic[1][place], cubic[2][place], cubic[3][place])
     root = jnp.where(found[place], cubic_root(at_place, before[place]), jnp.inf)
     event, is_found = jnp.argmin(root), jnp.any(found)
@@ -134,7 +133,7 @@ def detect(
 def _slopes(
     t: Float[Array, "G"], g: Float[Array, "G C"], g_dot: Float[Array, "G C"], has_rates: Bool[np.ndarray, "C"]
 ) -> Float[Array, "G C"]:
-    """Return the rates at the nodes; by differences, of second order, where they are not known or not finite."""
+    """Return the rates at the nodes; by differences of second order where they are not given or not finite."""
     step = jnp.diff(t)[:, None]
     secant = jnp.diff(g, axis=0) / jnp.where(step > 0, step, 1.0)
     total = step[1:] + step[:-1]
@@ -147,13 +146,13 @@ def _slopes(
 def _errors(
     t: Float[Array, "G"], g: Float[Array, "G C"], slope: Float[Array, "G C"], has_rates: Bool[np.ndarray, "C"]
 ) -> Float[Array, "I C"]:
-    """Return the error of the cubic that counts in each interval: of those over two intervals, it and those beside it."""
+    """Return the error of the cubic in each interval: the largest over its pair of intervals and the neighbouring pairs."""
     start, middle, end = t[:-2:2, None], t[1:-1:2, None], t[2::2, None]
     length = end - start
     x = (middle - start) / jnp.where(length > 0, length, 1.0)
     cubic: Cubic = (g[:-2:2], length * slope[:-2:2], g[2::2], length * slope[2::2])
     miss = jnp.abs(g[1:-1:2] - cubic_value(cubic, x))
-    # The rate tells a kink from what is smooth, of which it misses less.
+    # The rate tells a kink from a smooth condition, for which its error is smaller.
     of_rate = jnp.abs(length * slope[1:-1:2] - cubic_slope(cubic, x)) * RESOLUTION.miss
     miss = jnp.where(has_rates, jnp.maximum(RESOLUTION.miss * miss, of_rate), miss)
     beside = jnp.pad(miss, ((1, 1), (0, 0)))
@@ -161,13 +160,13 @@ def _errors(
 
 
 def _coefficients(cubic: Cubic, side: Int[Array, "I C"], error: Float[Array, "I C"]) -> Float[Array, "5 I C"]:
-    """Return Bernstein's coefficients of degree 4 of the cubic, times its side of zero, less an error in the middle one."""
+    """Return the Bernstein coefficients of degree 4 of the cubic, times its side of zero, minus an error in the middle one."""
     a, da, b, db = (side * x for x in cubic)
     one, two = a + da / 3, b - db / 3
     return jnp.stack([a, (a + 3 * one) / 4, (one + two) / 2 - error, (3 * two + b) / 4, b])
 
 
 def _sign_changes(x: Float[Array, "5 I C"]) -> Int[Array, "I C"]:
-    """Return the number of changes of sign of the coefficients, from the positive one that the first stands for."""
+    """Return the number of sign changes of the coefficients, with the first one taken as positive."""
     signs = (x > 0).at[0].set(True)
     return jnp.sum(signs[1:] != signs[:-1], axis=0)

@@ -1,12 +1,12 @@
-"""Events: what happens to a mechanism where a scalar condition along its motion crosses zero.
+"""Events: actions on a mechanism where a scalar condition along its motion crosses zero.
 
 An event is a `condition`, the `direction` in which its zero counts, and an `action`. Conditions see the frames of all bodies by
 name, as joints and force elements see theirs:
 
     udk.Event(lambda t, at: at["link"].angle, udk.Log(), name="vertical")
 
-Ready-made ones: `JointLimit`, `Contact`. Numbers that are traced or differentiated belong into an equinox module whose `__call__`
-is the condition, as those of the ready-made ones do: numbers that a plain function closes over are fixed when it is compiled.
+Ready-made ones: `JointLimit`, `Contact`. Numbers that are traced or differentiated belong in an equinox module whose `__call__`
+is the condition, like the ready-made ones: numbers that a plain function closes over are fixed when it is compiled.
 """
 
 from collections.abc import Callable, Sequence
@@ -67,13 +67,13 @@ class Event(PrintsLine):
 class JointLimit(PrintsLine):
     """A stop at the `lower` or `upper` end of a joint's travel, or both: an `Impact` at each.
 
-    Of a revolute joint the coordinate is theta2 - theta1 (rad), of a prismatic joint or a slot how far point 2 is from point 1
-    along the axis (m). The events are called as the joint (or `name`), with ".lower" or ".upper" behind it.
+    The coordinate of a revolute joint is theta2 - theta1 (rad), that of a prismatic joint or a slot the distance of point 2 from
+    point 1 along the axis (m). The events have the name of the joint (or `name`) with ".lower" or ".upper" appended.
 
     Args:
         joint: the name of a revolute or prismatic joint, or of a slot.
-        lower: end of travel (rad, m), or None.
-        upper: likewise.
+        lower: lower end of travel (rad, m), or None.
+        upper: upper end of travel (rad, m), or None.
         restitution: the part of the approaching speed that comes back, 0 to 1.
         at_rest: "hold": rest in contact; "stop": end the run.
         name: name in lists; by default that of the joint.
@@ -109,9 +109,9 @@ class Contact(PrintsLine):
 
     Args:
         body: the name of the body that hits.
-        point: of that body, in its own frame (m).
+        point: point of that body, in its own frame (m).
         through: a point of the line, in the frame of `on` (m).
-        normal: of the line, towards what is allowed, in the frame of `on`.
+        normal: normal of the line, towards the allowed side, in the frame of `on`.
         restitution: the part of the approaching speed that comes back, 0 to 1.
         on: the body that has the line, or "ground".
         at_rest: "hold": rest in contact; "stop": end the run.
@@ -166,8 +166,8 @@ class Events(PrintsTable):
     q_after: Float[Array, "events bodies 3"]
     v_after: Float[Array, "events bodies 3"]
     count: Int[Array, ""]
-    unresolved: Float[Array, "conditions"]  # from when on (s) crossings may be missed, as it varies too quickly; else inf
-    undefined: Bool[Array, "conditions"]  # whether a condition is not a number, where the run ends by that
+    unresolved: Float[Array, "conditions"]  # time (s) from which crossings may be missed, as it varies too quickly; else inf
+    undefined: Bool[Array, "conditions"]  # whether a condition was NaN and ended the run
     names: tuple[str, ...] = eqx.field(static=True)
 
     _units = units(time="s", unresolved="s")
@@ -197,7 +197,7 @@ class Events(PrintsTable):
 
 
 class ExpandsToEvents(Protocol):
-    """An `Event`, or what stands for several."""
+    """An `Event`, or an object that expands to several."""
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return the events, for a mechanism."""
@@ -205,7 +205,7 @@ class ExpandsToEvents(Protocol):
 
 
 def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tuple[Event, ...]:
-    """Return all events, each with a name of its own. Raises `ValueError` where one cannot be."""
+    """Return all events with unique names. Raises `ValueError` if one is invalid."""
     found: list[Event] = []
     for k, event in enumerate(events):
         try:
@@ -234,7 +234,7 @@ def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Ev
 def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
     """Tell whether the numbers of events are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
 
-    Those that are known were checked before; those that were traced then are looked at here.
+    Concrete numbers were checked before; this checks those that were traced.
     """
     found, limits = jnp.array(True), {}
     for e in events:
@@ -268,9 +268,9 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error
     if not is_traced(event):
-        known = np.linspace(0.1, 0.9, mechanism.q0.size)
+        probe = np.linspace(0.1, 0.9, mechanism.q0.size)
         with jax.ensure_compile_time_eval():
-            found = event.condition(0.0, frames_of(mechanism.body_names, known, known))
+            found = event.condition(0.0, frames_of(mechanism.body_names, probe, probe))
         if isinstance(found, Tracer):  # its derivatives by them would be lost
             cure = "make it an equinox module that holds them and has a `__call__`"
             raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")

@@ -33,12 +33,12 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.numpy_program import Meter, numpy_program
 from udkjax.transforms.gradients import stop_gradients
 
-SHARED, NUMBERS = 9, 5  # arrays of a run besides those of its phases, and which are the numbers of conditions
+SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index of the numbers of conditions
 
 
 @dataclass(frozen=True)
 class PlainForm:
-    """A run in its plain form, as a function of arrays: what is asked where machine code cannot tell what happens."""
+    """A run in its plain form as a function of arrays: the fallback for members that machine code cannot resolve."""
 
     tree: TreeDef  # of the system
     others: tuple[Any, ...]  # its leaves that are no arrays, None for each that is one
@@ -87,7 +87,7 @@ class HostRun:
         plan: common part of all runs.
         times: number of output times.
         coordinates: n.
-        plain: the plain form of one member; None: members that it is to be asked for are left with the code -1.
+        plain: the plain form of one member; None: unresolved members get the code -1.
     """
 
     plan: MachinePlan
@@ -138,7 +138,7 @@ def machine_plan(plan: EventPlan, phases: Phases, compiled: Sequence[CompiledMec
 
 @cached_by_identity
 def concrete_plan(phases: Phases, conditions: Conditions, max_steps: int, max_events: int, *others: Any) -> MachinePlan:
-    """Return the same for all events, and the compiled mechanisms behind them, of known numbers."""
+    """Return the plan from all events, then the compiled mechanism of each phase; their numbers are concrete."""
     count = len(others) - len(phases.mechanisms)
     plan = event_plan(phases, others[:count], max_steps, max_events)
     return machine_plan(plan, phases, others[count:], conditions)
@@ -160,8 +160,8 @@ def event_arrays(
         events: all events.
         phases: the phases.
         problems: the run in each phase.
-        code: the `Result` that is known before.
-        drift_tol: the violation of the constraints that ends it.
+        code: the `Result` before the run.
+        drift_tol: the violation of the constraints that ends the run.
         xp: jax.numpy, or NumPy.
     """
     first, scales = problems[0], problems[0].textbook.scales

@@ -1,11 +1,11 @@
-"""Impacts and rest of contacts: all that are closed at one instant, together.
+"""Impacts and rest of contacts: all contacts that are closed at one instant, together.
 
 A contact g(t, q) >= 0 has the rate g_dot = n v + g_t, n = g_q, and its impulse Lambda >= 0 acts along n^T; those of the joints
 act along Psi_q^T, and keep Psi_dot = 0. With
 
     D = Psi_q M^(-1/2),        u_i = (I - D^+ D) M^(-1/2) n_i^T,        W_ij = u_i . u_j,
 
-where u_i is the part of an impulse that the joints do not take, however redundant they are,
+where u_i is the part of an impulse that the joints, redundant or not, leave,
 
     v+ = v- + M^(-1/2) sum_i u_i Lambda_i,        g_dot+ = g_dot- + W Lambda.
 
@@ -13,14 +13,13 @@ Newton's law of restitution, with complementarity (Moreau 1988; Glocker, Set-Val
 
     0 <= Lambda_i,        g_dot+_i + e_i g_dot-_i >= 0,        one of them zero.
 
-No contact pulls, none is penetrated, one alone has g_dot+ = -e g_dot-, and one that the others lift opens. Those take part that
-are closed and do not separate already, g_dot- <= 0: contacts that their impact penetrates hit next. So of a scleronomic
-mechanism
+No contact pulls, none is penetrated, a single one has g_dot+ = -e g_dot-, and one that the others lift opens. Contacts take part
+that are closed and do not separate, g_dot- <= 0: contacts that their impact penetrates hit next. For a scleronomic mechanism
 
     T+ - T- = (g_dot+ + g_dot-) . Lambda / 2 = sum_i (1 - e_i) g_dot-_i Lambda_i / 2 <= 0:
 
-energy never grows, of different restitutions either. (With a contact that separates and is pushed back, Newton's law could.) The
-law treats what happens at one instant as one impact: the first of three equal balls in a row, e = 1, bounces off the other two.
+energy never grows, even with different restitutions. (With a contact that separates and is pushed back, it could.) The law treats
+all contacts of one instant as one impact: the first of three equal balls in a row, e = 1, bounces off the other two.
 
 Contacts whose g_dot stays zero are in complementarity in accelerations: 0 <= lambda, g_ddot = g_ddot(lambda = 0) + W lambda >= 0,
 one of them zero. Those with lambda > 0 are held, as constraints.
@@ -44,29 +43,29 @@ from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionV
 from udkjax.transforms.gradients import stop_gradients
 
 # (u . u) / (n M^(-1) n): the square of the sine between a contact's row and those of the constraints, in the metric of M. At a
-# sine of 1e-8, half of the digits, u is what rounding leaves of the difference of two rows, and no impulse follows from it.
+# sine of 1e-8, half of the digits, u is the rounding error of the difference of two rows, and no impulse follows from it.
 BLOCKED = 1e-16
-# Of a condition's scale: contacts that are no farther from zero when another one hits are hit with it. It is above the errors of
-# a run at ordinary tolerances in what is symmetric, and what is done too early by it lasts 1e-9 T. Of the fastest approach in an
-# impact, or of the strongest pull: less of another contact is zero, since the rows of these contacts are known that well.
+# CLOSED, relative to a condition's scale: contacts this close to zero are hit together with another one. It exceeds the errors of
+# a symmetric mechanism at usual tolerances, and advances a hit by 1e-9 T at most. STILL, relative to the fastest approach in an
+# impact or the strongest pull: smaller ones of other contacts are zero, to the accuracy of the rows of these contacts.
 CLOSED = STILL = 1e-9
-# The square of the sine between the row of a contact and those of contacts that are held: below it they hold it, too. A row that
-# depends on others in theory has a sine of some CLOSED over the distance of the contacts, here down to a thousandth of L.
+# Squared sine between the row of a contact and those of held contacts, below which these hold it, too. A dependent row has a sine
+# of some CLOSED over the distance of the contacts, here down to a thousandth of L.
 CARRIED = (1e3 * CLOSED) ** 2
-# Of a condition's scale per T: an impact slower than this, where the contact is pressed on, is rest. Its rebound rises by 1e-10
-# of that scale, a hundredth of what ordinary tolerances tell from zero.
+# Relative to a condition's scale per T: a slower impact of a pressed contact is rest. Its rebound rises by 1e-10 of that scale, a
+# hundredth of the accuracy at usual tolerances.
 REST = 1e-5
-# Of |u_i| |u_j|: two contacts whose W_ij is below that do not act on one another; each has an event of its own. It is a cosine,
-# of which rounding leaves 1e-15, or more by the condition number of the constraints, up to a thousand.
+# Relative to |u_i| |u_j|: contacts with a smaller W_ij do not act on one another, and each has its own event. It is a cosine,
+# with rounding errors of 1e-15 times the condition number of the constraints, up to a thousand.
 COUPLED = 1e-12
 
-ATTACHABLE = 1e-6  # of L, or rad: a joint that is attached must be closed up to that
+ATTACHABLE = 1e-6  # relative to L, or rad: largest gap of an attached joint
 
 OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
 
 
 class Contacts(NamedTuple):
-    """The contacts among E events, whatever the state is."""
+    """The contacts among E events, independent of the state."""
 
     impacts: Bool[np.ndarray, "E"]  # events that are contacts
     hold: Bool[np.ndarray, "E"]  # contacts that are held at rest
@@ -76,11 +75,11 @@ class Contacts(NamedTuple):
 
 
 class ContactRows(NamedTuple):
-    """The rows of all conditions, as far as constraints leave them."""
+    """The rows of all conditions, projected by the constraints."""
 
     W: Float[Any, "*m E E"]
     directions: Float[Any, "*m E n"]  # M^(-1/2) u: the velocities that unit impulses give
-    free: Bool[Any, "*m E"]  # whether the constraints leave a condition any motion
+    free: Bool[Any, "*m E"]  # whether the constraints let a condition change
 
 
 class Impulses(NamedTuple):
@@ -92,7 +91,7 @@ class Impulses(NamedTuple):
 
 
 class ContactChanges(NamedTuple):
-    """The contacts at an event, and what becomes of them."""
+    """The contacts at an event, and their states after it."""
 
     v: Float[Any, "*m n"]  # after it
     closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
@@ -117,7 +116,7 @@ def contact_rows(
 def rows_of_directions(
     normals: Float[Any, "*m E n"], directions: Float[Any, "*m E n"], inverse_mass: Float[Any, "*m n"]
 ) -> ContactRows:
-    """Return the rows of contacts whose directions of impulses are known."""
+    """Return the rows of contacts from given directions of impulses."""
     mobility = inverse_mass[..., None, :]
     W, given = directions / mobility @ directions.swapaxes(-1, -2), (normals**2 * mobility).sum(-1)
     return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED * given)
@@ -138,7 +137,7 @@ def impulses_of_impact(
         rate: g_dot before it.
         restitution: e of each contact, from 0 to 1.
         closed: mask of the contacts that take part; they do not separate.
-        floor: a rate above minus that is not negative.
+        floor: tolerance on rates >= 0.
         xp: jax.numpy, or NumPy.
     """
     found = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor, xp)
@@ -218,7 +217,7 @@ def hit_contacts(
     rows, rate, found = stop((rows, rate, found))
     fastest = _largest(rate, closed > OPEN, xp)
     stays = (closed > OPEN) & rows.free & (found.rate <= xp.maximum(floor, STILL * fastest))
-    # A contact that has fallen to zero and rises all the same, slow and pressed on, rises by less than can be told.
+    # A slow pressed contact that has fallen to zero and rises nevertheless rises by rounding.
     stays = stays | ((np.arange(rate.shape[-1]) == k[..., None]) & (closed == SLOW) & (rate > 0))
     stays = stays & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
     is_held, ends, carried = xp.where(closed > OPEN, False, held), xp.zeros_like(stays), xp.zeros_like(stays)

@@ -32,7 +32,7 @@ def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
 
 
 def _settle(system: System, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
-    """Return the runs with all that happens now to some members: at the start, behind an event, or where they have come to."""
+    """Return the runs with all that happens now to some members: at the start, after an event, or at a crossing."""
     plan, xp, E = system.plan, system.xp, system.plan.count
     state, event, sides = runs.state(some), take(runs.event, some), take(runs.sides, some)
     values, found = condition_values(system, some, state)
@@ -83,7 +83,7 @@ def _settle(system: System, runs: MemberRuns, some: MemberIndices) -> MemberRuns
 
 
 def condition_values(system: System, some: MemberIndices, at: RunState) -> tuple[ConditionValues, StateValues]:
-    """Return the conditions of some members at their states, and what is known of these besides."""
+    """Return the conditions of some members at their states, and the other quantities evaluated there."""
     xp, found, unit = system.xp, system.look(some, at), take(system.coordinates, some)
     rate, t = take(system.rate, some)[:, None], at.t[:, None]
     by_q = xp.abs(found.by_q) * xp.maximum(unit, xp.abs(at.q))[:, None]
@@ -94,7 +94,7 @@ def condition_values(system: System, some: MemberIndices, at: RunState) -> tuple
 
 
 def _settled(system: System, runs: MemberRuns, some: MemberIndices) -> Bool[Any, "b E"]:
-    """Return a mask of what the last event has settled: contacts that took part, and the condition that it took note of."""
+    """Return a mask of the conditions settled by the last event: its contacts, and its own if it only took note."""
     xp, plan = system.xp, system.plan
     last = xp.maximum(take(runs.count, some) - 1, 0)
     members = np.arange(len(runs.t)) if some is None else some
@@ -164,6 +164,6 @@ def _jump(system: System, runs: MemberRuns, some: MemberIndices, values: Conditi
 def _may_follow(
     system: System, values: ConditionValues, watched: Bool[Any, "b E"], closed: Int[Any, "b E"], own: Bool[Any, "b E"]
 ) -> Bool[Any, "b"]:
-    """Tell of which members another event may follow at once: where a condition is zero, or depends on velocities."""
+    """Return a mask of the members that another event may follow at once: a condition is zero, or depends on velocities."""
     unclear = watched & ~own & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
     return system.xp.any(unclear | np.array(system.plan.by_velocity), axis=-1)

@@ -1,7 +1,7 @@
 """Runs with events by machine code: all members of a batch together, from one crossing to the next.
 
-Where machine code cannot tell what happens, as conditions vary too quickly or are no numbers, members are `unresolved` and run no
-farther: the plain form (`plain_system`) takes them.
+Members whose conditions vary too quickly for machine code, or are NaN, are `unresolved` and stop: the plain form (`plain_system`)
+runs them.
 """
 
 from collections.abc import Callable, Sequence
@@ -117,12 +117,12 @@ class MachineSystem:
         return joints
 
     def when(self, those: Bool[np.ndarray, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the runs with a change of those members."""
+        """Return the runs with a change of the masked members."""
         some = np.flatnonzero(those)
         return runs if not some.size else change(runs, None if some.size == those.size else some)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
-        """Return the runs after as many changes as it takes until none is running."""
+        """Return the runs after changing them until none is running."""
         with np.errstate(all="ignore"):
             while runs.running.any():
                 runs = change(runs)
@@ -184,7 +184,7 @@ class MachineSystem:
         known: Bool[np.ndarray, "b"],
         drifts: Bool[np.ndarray, "b"],
     ):
-        """Take over how the runs have ended that do not go on, and where."""
+        """Store the results and ends of the runs that stop."""
         status, (n, fails) = found.info[:, STATUS], (runs.q.shape[1], ~known)
         self.unresolved[some] |= (status == Status.UNRESOLVED) & ~drifts
         code = np.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)

@@ -31,7 +31,7 @@ class PhasePlan(NamedTuple):
 
     run: RunWatched
     states: EvaluateEvents
-    marking: MarkRows | None  # of independent rows, where they are not known beforehand
+    marking: MarkRows | None  # of independent rows, if the run has to find them
     projected: bool
     project: StateOperation | None  # to the joints that events add, where they do
     joints: tuple[tuple[int, ...], ...]  # of each such joint: the places of its numbers, none where the phase does not have it
@@ -83,11 +83,11 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
 class StretchEnd(NamedTuple):
     """The ends of some runs, at a crossing or not, and their outputs; whole numbers as floats."""
 
-    q: Float[np.ndarray, "b T n"]  # at the times that were asked for
+    q: Float[np.ndarray, "b T n"]  # at the requested times
     v: Float[np.ndarray, "b T n"]
     violation: Float[np.ndarray, "b T"]
     info: Float[np.ndarray, "b K"]  # `RunStates.info_names`, and the last state of the integrator
-    event: Float[np.ndarray, "b"]  # of what is watched: which crosses; -1: none
+    event: Float[np.ndarray, "b"]  # index of the watched quantity that crosses; -1: none
     t: Float[np.ndarray, "b"]  # up to which nothing else happens
     worst: Float[np.ndarray, "b"]  # violation at a node
     sides: Float[np.ndarray, "b C"]

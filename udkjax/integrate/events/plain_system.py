@@ -48,7 +48,7 @@ def run_plain(hybrid: Hybrid) -> EventRun:
     window = Window(ts[-1] - ts[0], jnp.array(NO_EVENT), ts[0], jnp.array(False), ts[0], never)
     start = with_member(hybrid.first_state())
     runs = run_loop(system, runs_before(hybrid.plan, start, len(ts), hybrid.code[None], jnp, window))
-    # Before it is no number, a condition may vary quickly: the end of the run says so.
+    # A condition may vary quickly before it becomes NaN: the result of the run tells that.
     unresolved = jnp.where(runs.undefined, jnp.inf, runs.window.unresolved[: hybrid.count])
     return jax.tree.map(lambda x: x[0], results(hybrid.plan, runs, ts[None], unresolved, jnp))
 
@@ -113,7 +113,7 @@ class PlainSystem:
         return jax.lax.cond(those[0], lambda runs: change(runs, None), lambda runs: runs, runs)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
-        """Return the run after as many changes as it takes."""
+        """Return the run after changing it until it stops."""
         return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
 
     def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:

@@ -22,7 +22,7 @@ from udkjax.native.watching.conditions import Conditions
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
 
-OUTPUTS = 32  # of one piece
+OUTPUTS = 32  # per piece
 
 
 def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
@@ -90,7 +90,7 @@ def _(primals, tangents):
 # Between events the flow has derivatives of its own, along the state in which it begins and all numbers. At an event the state
 # y before it, taken at the time t0 at which it was found, and so at a fixed time, meets the condition a little later or earlier:
 # h(t0 + d, y + f d) = 0 gives d = -h / h_dot to first order (the theorem of implicit functions). The jump J is done there, and
-# the state that it leaves is taken back to t0 with the flow f+ behind it:
+# the state after it is taken back to t0 with the flow f+:
 #
 #     y+ = J(t0 + d, y + f d) - f+ d,        dy+ = J_y dy - (J_y f + J_t - f+) h_y dy / h_dot,
 #
@@ -119,7 +119,7 @@ class PieceOutput(NamedTuple):
 
 
 def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
-    """Return the smooth parts of a known run as a function with its first derivatives: the first fields of `EventRun`."""
+    """Return the smooth results of a run with their first derivatives: the first fields of `EventRun`."""
     system = PlainSystem(hybrid)
     ts, T, K, n = stop_gradients(hybrid.ts), len(hybrid.ts), len(found.event_time), len(hybrid.q)
     width = min(OUTPUTS, T)
@@ -171,8 +171,8 @@ def _integrate_piece(
     at_end = RunState(end, q[-1], v[-1], state.phase, state.joints)
 
     def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
-        known = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
-        after, d, (t, qs, vs) = _apply_at_fixed_time(system, found, j, known, shift, short)
+        found_state = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
+        after, d, (t, qs, vs) = _apply_at_fixed_time(system, found, j, found_state, shift, short)
         return after, d, (j, t, qs, vs)
 
     after, shift, record = jax.lax.cond(happens, jump, lambda: (at_end, shift, _no_event(len(state.q), K)))
@@ -224,5 +224,5 @@ def _no_event(n: int, K: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _with_value(x: Array, value: Array) -> Array:
-    """Return a known value, with the derivatives of x."""
+    """Return a value with the derivatives of x."""
     return x + stop_gradients(jnp.where(jnp.isfinite(value), value, x) - x)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.solution import Result
 
-# In place of an event: the conditions are not known yet, at the start of the run, or behind an event.
+# In place of an event: conditions not evaluated yet, at the start of the run or after an event.
 BEGIN, AGAIN = -3, -2
 
 MemberIndices = Int[np.ndarray, "b"] | None  # the indices of some members; None: all of them
@@ -31,7 +31,7 @@ class RunState(NamedTuple):
 
 
 class EventRun(NamedTuple):
-    """The outputs and events of a run, infinite where it did not get. In derivatives a field is None that has none."""
+    """The outputs and events of a run, infinite where it did not get. In tangents, fields without derivatives are None."""
 
     q: Float[Any, "*m T n"]
     v: Float[Any, "*m T n"]
@@ -68,17 +68,17 @@ class MemberRuns(NamedTuple):
     phase: Int[Any, "B"]
     joints: Any
     event: Int[Any, "B"]  # at this time: its number, from E on of a contact that lets go; or `NO_EVENT`, `BEGIN`, `AGAIN`
-    sides: Int[Any, "B 2E"]  # the last known side of zero of each condition and contact force: -1, 1, or 0: not known
+    sides: Int[Any, "B 2E"]  # the last side of zero of each condition and contact force: -1 or 1; 0 if unknown
     scale: Float[Any, "B E"]  # of conditions, as in `ConditionValues`
     carried: Bool[Any, "B E"]  # the contacts that are held at zero by others that are at rest
     running: Bool[Any, "B"]
     code: Int[Any, "B"]
-    undefined: Bool[Any, "B E"]  # the conditions that are not a number where the run ends by that
+    undefined: Bool[Any, "B E"]  # the conditions whose NaN ended the run
     totals: Int[Any, "B 4"]
     qs: Float[Any, "B T n"]
     vs: Float[Any, "B T n"]
     count: Int[Any, "B"]  # of events
-    record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with room for one more, which takes what is not to be noted
+    record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with one more row as a sink for entries without an event
     window: Any  # of the plain form
 
     def state(self, some: MemberIndices) -> RunState:
@@ -112,7 +112,7 @@ def take(x: Any, some: MemberIndices) -> Any:
 
 
 def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], xp: ModuleType, window: Any = None) -> MemberRuns:
-    """Return runs before their start, each with a `Result` that is known before."""
+    """Return runs before their start, each with its `Result` so far."""
     (B, n), E = state.q.shape, plan.count
     shapes = shapes_of_run(plan, T, n, plan.max_events + 1)._asdict()
     values = dict.fromkeys(RECORD[:3], np.inf) | {"event_index": -1, "event_phase": -1, "together": False, "closed": 0}

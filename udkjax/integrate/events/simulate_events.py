@@ -1,4 +1,4 @@
-"""Simulate with events: prepare a hybrid system of a mechanism, run it, and say how it went."""
+"""Simulate with events: prepare the hybrid system of a mechanism, run it, and return the solution."""
 
 import warnings
 from collections.abc import Sequence
@@ -92,7 +92,7 @@ def simulate_events(
     if is_within_jit() or is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
         return solution(mechanism, names, given, found, reasons, None)
-    found = jax.tree.map(np.asarray, found)  # of which each operation of JAX would be a program to compile
+    found = jax.tree.map(np.asarray, found)  # each operation of JAX would compile a program
     if np.isfinite(found.unresolved).any():
         fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
@@ -100,7 +100,7 @@ def simulate_events(
 
 
 def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
-    """Return the result of `_run`, of known numbers; None where machine code alone does not find it."""
+    """Return the result of `_run` for concrete numbers; None if machine code alone cannot find it."""
     is_concrete = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
     if given.conditions is None or not is_concrete or jax.config.jax_disable_jit:
         return None
@@ -123,7 +123,7 @@ Prepared = tuple[tuple[Event, ...], Phases]
 
 
 def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToEvents], analysis: Analysis) -> Prepared:
-    """Return all events by their names, and the phases that they lead to; from the cache where numbers are known."""
+    """Return all events by their names, and the phases that they lead to; from the cache if numbers are concrete."""
     listed = tuple(events) if isinstance(events, Sequence) else (events,)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, listed, analysis))):
         return _expand(mechanism, listed, analysis)
@@ -189,7 +189,7 @@ def _solution(
     reasons: tuple[str, ...],
     count: int | None,
 ) -> Solution:
-    """Return the solution; its events are `count`, or padded to the most that there may be where that is None."""
+    """Return the solution with `count` events, or, for a traced count (None), padded to `max_events`."""
     xp: Any = jnp if count is None else np
     bodies, choices = (-1, len(mechanism.body_names), 3), given.choices
 
@@ -223,7 +223,7 @@ def _solution(
     why = next(filter(None, reasons), "")
     engine = f"diffrax: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"
     settings = dict(choices.settings(why)) | {"max_events": str(given.max_events), "engine": engine}
-    with jax.debug_nans(False):  # they stand for outputs behind the end of a run, and alarm nobody
+    with jax.debug_nans(False):  # NaN stands for outputs after the end of a run
         q, v = (xp.where(xp.isinf(x), xp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
     return Solution(
         ts=given.ts,

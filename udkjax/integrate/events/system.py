@@ -1,4 +1,4 @@
-"""The motion that runs with events follow: conditions at states, and the way to the next crossing."""
+"""The interface of the loop to the motion: conditions at states, and the advance to the next crossing."""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -64,9 +64,9 @@ class System(Protocol):
         ...
 
     def when(self, those: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the runs with a change of those members."""
+        """Return the runs with a change of the masked members."""
         ...
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
-        """Return the runs after as many changes as it takes until none is running."""
+        """Return the runs after changing them until none is running."""
         ...

@@ -1,6 +1,6 @@
-"""The engine of one mechanism as data that a page runs by itself: WebAssembly, and what its numbers mean.
+"""The engine of one mechanism as data that a page runs by itself: WebAssembly, and the meaning of its numbers.
 
-`portable_engine` makes it. What is in it, and what a page does with it:
+`portable_engine` returns it. Its contents:
 
 format       1
 bodies       names; a state is q and v, x, y (m), angle (rad) of each body in turn, and their rates
@@ -13,28 +13,28 @@ events       {names, directions: in which zeros count, 0 for either, by_velocity
              integrate/events by their names}, or null
 held         engines of the same mechanism with the contact of one event at rest, by the number of that event; without "close"
 forces_watched  1 of such an engine, whose run ends as well where the contact would have to pull; else 0
-thresholds   of pivots, which a run takes behind the numbers; of closing, those in `closing`
+thresholds   of pivots, which a run takes after the numbers; for closing, those in `closing`
 closing      {thresholds, settings, tol and rounding: what counts as closed (equations/position_closure.py)}
 guess        {q, v}: places in `numbers` of the initial guess
 rows         scales of the rows of Psi (m, rad)
 scales       {length (m), rate (1/s), mass (kg)}
-marks        how many rows of Psi have a mark, behind the numbers: one for those that are independent, which the module "mark"
-             finds; 0 where all are
+marks        number of rows of Psi with a mark, after the numbers: 1 for independent rows, which the module "mark" finds; 0 if
+             all rows are independent
 settings     of a run, by name, in their order; `smallest` and `omega` follow from the times and the state
 smallest     step, in units of rounding of the end time
 drift_tol    violation of Psi, in units of the rows' scales, beyond which a run has failed
-info         names of the first numbers of a run's result "info"; behind them are its last q and v
-sampled      places in `numbers` of what has samples; `samples`: base64 of float64, a row for each interval between breaks
+info         names of the first numbers of a run's result "info"; its last q and v follow
+sampled      places in `numbers` of sampled quantities; `samples`: base64 of float64, a row for each interval between breaks
 masses       of each body the places in `numbers` of its mass and inertia
 efforts      a list of {driver, unit, row: of Psi, place: of that row in x0}
-forces       how the forces of joints are found, while no row is redundant
+forces       how to compute the forces of joints if no row is redundant
 pulls        of each body the places in `numbers` of a spring that holds it: point x, y, target x, y, stiffness, damping; or []
-why          why there is no "run"; empty where there is
+why          the reason why there is no "run"; else empty
 modules      run, states (conditions of events), close, evaluate, mark: {code: base64 of deflated WebAssembly, data_end, fields or
              places and size, settings, inputs, results}
 
 udkjax/show/player/engine.js runs it: `loadEngine(data)` gives an object with `close(parameters, guess)` and
-`run(parameters, state, times)`, which say there what they return.
+`run(parameters, state, times)`, see there for their results.
 """
 
 from udkjax.integrate.portable.engine import PortableEngine, drawn_points, portable_engine

@@ -51,7 +51,7 @@ def independent_parameters(mechanism: Mechanism) -> list[str]:
 
 
 class NumberProgram:
-    """The numbers of a mechanism's equations as a function of some parameters; behind them its breakpoints and further numbers.
+    """The numbers of a mechanism's equations as a function of some parameters, followed by its breakpoints and further numbers.
 
     Attributes:
         base: all of them as they are.
@@ -73,7 +73,7 @@ class NumberProgram:
             mechanism: the scene.
             values: the parameters, as they are.
             dress: makes, of the mechanism with parameters in, the one that is simulated.
-            further: numbers besides that follow from the mechanism with parameters in.
+            further: additional numbers that follow from the mechanism with these parameters.
         """
 
         def parts(given: Mechanism) -> list[Array | np.ndarray]:

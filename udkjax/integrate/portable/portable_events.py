@@ -36,11 +36,11 @@ TOLERANCES = {
 
 
 class PortableEvents:
-    """The events of the runs of a portable engine; there may be none.
+    """The events, if any, of the runs of a portable engine.
 
     Raises:
         ArgumentError: an event changes the constraints.
-        UnsupportedError: a condition takes what machine code has no instruction for.
+        UnsupportedError: a condition has an operation without a machine instruction.
     """
 
     def __init__(self, events: Sequence[ExpandsToEvents], mechanism: Mechanism):
@@ -49,7 +49,7 @@ class PortableEvents:
         for event in self._events:
             if not event.action.on_page:
                 kind, cure = type(event.action).__name__, "a page knows Log, Stop and Impact; leave out live"
-                raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) is no program yet: {cure}")
+                raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) cannot run in a page yet: {cure}")
         self._conditions = watched_conditions(self._events, mechanism) if events else None
         if self._conditions is None and events:
             raise UnsupportedError("the condition of an event")
@@ -70,7 +70,7 @@ class PortableEvents:
         return [name for name, _ in analysis.row_names].index(CONTACT.format(self._events[event].name))
 
     def data(self, analysis: Analysis) -> dict[str, Any] | None:
-        """Return the events as data of a page; None where there are none."""
+        """Return the events as data of a page; None without events."""
         if not self._events:
             return None
         assert self._conditions is not None  # since there are events

@@ -1,4 +1,4 @@
-"""Springs by which a hand pulls bodies: one for each, without stiffness until it does."""
+"""Springs by which a hand pulls bodies: one for each body, without stiffness until it is pulled."""
 
 import equinox as eqx
 import numpy as np
