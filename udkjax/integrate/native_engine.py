@@ -27,7 +27,7 @@ from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
-# Of the rank threshold: what fallback steps take for theirs. They begin on the constraint manifold, unless states are not
+# Rank threshold of fallback steps, relative to that of other steps. They begin on the constraint manifold, unless states are not
 # projected, and only those beside singular configurations take it. Rows that count as redundant there and are not leave what they
 # hold back in velocities, as large as the threshold, and rounding errors are as large as a unit over its square: both are least
 # at some third root of a unit. With three times more, linkages that turn back in singular configurations take up to a quarter
@@ -90,12 +90,12 @@ def _active_numbers(problem: Any, active: Any) -> ActiveNumbers:
 
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
-    """Integrate a problem, with the changes of positions, velocities and the end along a `change` of what is active."""
+    """Integrate a problem, with the changes of positions, velocities and the end along a `change` of the active numbers."""
     return _integrate_along(problem, [(active, change)], _operation(problem, active))
 
 
 def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
-    """Return the second derivatives of positions, velocities and the end along two changes, each of what is active in it."""
+    """Return the second derivatives of positions, velocities and the end along two changes, each of its active numbers."""
     operation = _operation(problem).with_second_tangents(_active_numbers(problem, active).mask)
     return _integrate_along(problem, changes, operation)[1]
 
@@ -120,7 +120,7 @@ def _integrate_along(
 
 
 def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) -> Problem:
-    """Return the cotangents of what is `active`, from those of the states at the outputs (T, 2n) and of the end (2n,)."""
+    """Return the cotangents of the `active` numbers from those of the states at the outputs (T, 2n) and of the end (2n,)."""
     operation, kept = _operation(problem, active, reverse=True), run.kept[:, None]
     states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
     given = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]
@@ -138,7 +138,7 @@ def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) 
 
 
 def _operation(problem: Problem, active: Problem | None = None, reverse: bool = False) -> RunStates:
-    """Return the operation of a problem: a run, or one with tangents or cotangents of what is active."""
+    """Return the operation of a problem: a run, or one with tangents or cotangents of active numbers."""
     run = problem.compiled.plan.operation
     assert run is not None  # checked by the caller
     if active is None:

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 AUTO = Auto()  # one for all runs that do not say otherwise
 # Relative to the rows' scales. Projection leaves rounding errors, unless rows that it leaves out drift. Without it drift is
-# expected, up to a bound beyond which a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when its loops are
-# 2e-3 open.
+# expected, up to a bound beyond which a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when
+# its loops are 2e-3 open.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
-LOOSE_TOL = 1e3  # of runs that have failed before they begin, and
-NO_DRIFT = -1.0  # the violation of Psi that they may have: no output of theirs counts but the first
+LOOSE_TOL = 1e3  # tolerance of runs that have failed before they begin
+NO_DRIFT = -1.0  # their largest violation of Psi: only their first output is kept
 
 
 class Choices(NamedTuple):

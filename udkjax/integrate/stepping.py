@@ -46,8 +46,8 @@ def step(
     """Return the state one control interval later, with inputs held constant.
 
     For `jax.lax.scan`, jit, vmap and grad: all numbers may be traced. The integrator chooses its own steps within the interval,
-    the first of which is the whole interval. Nothing is assembled: projection keeps states on the constraints, so begin with one of
-    `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
+    the first of which is the whole interval. Nothing is assembled: projection keeps states on the constraints, so begin with one
+    of `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
 
     Args:
         mechanism: the mechanism.
