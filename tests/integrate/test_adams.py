@@ -317,7 +317,7 @@ def test_first_step_out_of_the_domain():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="1 <= min_order <= max_order <= 12; they are 1 and 13"):
+    with pytest.raises(ValueError, match="1 <= min_order <= max_order <= 12, not min_order=1, max_order=13"):
         udk.Adams(max_order=13)
     with pytest.raises(ValueError, match="'pc'"):
         udk.Adams("pc")  # pyright: ignore[reportArgumentType]

@@ -318,5 +318,5 @@ def test_linkage():
 
 
 def test_impossible_orders_are_named():
-    with pytest.raises(ValueError, match="1 <= min_order <= max_order <= 5; they are 1 and 6"):
+    with pytest.raises(ValueError, match="1 <= min_order <= max_order <= 5, not min_order=1, max_order=6"):
         udk.BDF(max_order=6)

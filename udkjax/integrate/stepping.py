@@ -99,8 +99,8 @@ def _advance(
 ) -> State:
     dt, t, rtol, atol = (number(numbers[name]) for name in ("dt", "t", "rtol", "atol"))
     moved = mechanism.with_parameters(values).without_origin if values else mechanism.without_origin
-    known = not isinstance(t, Tracer) and not isinstance(dt, Tracer)  # and stays so while something else is traced
-    ts = number(np.array([float(t), float(t) + float(dt)])) if known else jnp.stack([t, t + dt])
+    is_concrete = not isinstance(t, Tracer) and not isinstance(dt, Tracer)  # and stays so while something else is traced
+    ts = number(np.array([float(t), float(t) + float(dt)])) if is_concrete else jnp.stack([t, t + dt])
     choices = Choices(rtol, atol, DRIFT_PROJECTED, dt, AUTO, Projection(), max_steps=max_steps, engine=engine)
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)

@@ -72,7 +72,7 @@ def test_solvers_are_found_by_name():
     for name in ("Adams", "BDF", "Verner65", "Dopri8", "Tsit5"):
         assert type(solver_named(name)).__name__ == name
     for name in ("Dopri9", "ODETerm", "diffeqsolve"):
-        with pytest.raises(ValueError, match=f"'{name}' is no solver"):
+        with pytest.raises(ValueError, match=f"'{name}' is not a solver"):
             solver_named(name)
 
 

@@ -177,8 +177,8 @@ class Events(PrintsTable):
             counts = {name: np.asarray(count) for name, count in self.counts.items() if np.any(count)}
             rows = [(name, f"{count.sum()} in {np.sum(count > 0)} members") for name, count in counts.items()]
             return PrintedTable(f"events of {np.size(self.count)} members", rows)
-        known = [(t, int(k)) for t, k in zip(np.asarray(self.time), np.asarray(self.index), strict=True) if k >= 0]
-        return PrintedTable(f"events: {int(self.count)}", [(f"{t:.9g} s", self.names[k]) for t, k in known])
+        listed = [(t, int(k)) for t, k in zip(np.asarray(self.time), np.asarray(self.index), strict=True) if k >= 0]
+        return PrintedTable(f"events: {int(self.count)}", [(f"{t:.9g} s", self.names[k]) for t, k in listed])
 
     def of(self, name: str) -> Float[Array, "k"]:
         """Return the times (s) of the events of one name, of a single run."""
