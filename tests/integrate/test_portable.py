@@ -19,6 +19,9 @@ def test_parameters_are_named_one_number_at_a_time():
     every = scalar_parameters(mechanism)
     assert every["pin.P[0]"] == pytest.approx(0.5)
     assert scalar_parameters(mechanism, ["pin.P", "gravity[1]"]) == {k: every[k] for k in ("pin.P[0]", "pin.P[1]", "gravity[1]")}
+    # A body's numbers follow from the drawing; one that was changed has its own, and goes on having it.
+    own = scalar_parameters(mechanism.with_parameters({"body.crank.mass": 3.0}))
+    assert own == {**every, "body.crank.mass": 3.0} and "body.crank.mass" not in every
 
 
 @pytest.mark.parametrize("name", ["pin.Q", "pin.P[2]", "pin.P[0][0]", "body.crank.mas"])

@@ -83,11 +83,12 @@ def test_texts_of_an_svg_are_texts(hostile, tmp_path):
     assert "<script" not in text and "&lt;/script&gt;" in text
 
 
-def test_a_gif_moves_as_long_as_the_run(animation, tmp_path):
-    path = animation.save(tmp_path / "motion.gif", fps=10, width=200, speed=0.5)
+@pytest.mark.parametrize(("fps", "speed", "frames", "duration"), [(10, 0.5, 40, 100), (30, 4.0, 17, 30), (60, 4.0, 25, 20)])
+def test_a_gif_moves_as_long_as_the_run(animation, tmp_path, fps, speed, frames, duration):
+    """Frames last whole hundredths of a second, and at least two: 30 a second become 33, 60 become 50."""
+    path = animation.save(tmp_path / "motion.gif", fps=fps, width=200, speed=speed)
     with Image.open(path) as film:
-        frames = getattr(film, "n_frames", 1)
-        assert frames == 40 and film.info["duration"] == 100 and film.info["loop"] == 0
+        assert getattr(film, "n_frames", 1) == frames and film.info["duration"] == duration and film.info["loop"] == 0
         first = np.asarray(film.convert("RGB"), float)
         film.seek(10)
         later = np.asarray(film.convert("RGB"), float)
@@ -95,6 +96,12 @@ def test_a_gif_moves_as_long_as_the_run(animation, tmp_path):
     assert (later[0] == 255).all()  # the background is as white as a page
     with pytest.raises(ValueError, match="more than 1500: give a higher speed"):
         animation.save(tmp_path / "motion.gif", speed=0.001)
+
+
+def test_frames_are_of_times_from_the_start_of_the_run(linkage):
+    run = udk.simulate(linkage, np.linspace(2.0, 3.0, 11))
+    shown = udk.animate(linkage, run, measures=())
+    np.testing.assert_allclose(films.film_times(shown, 10.0, 0.5), 2.0 + 0.05 * np.arange(20))
 
 
 def test_an_mp4_is_a_film(animation, tmp_path):
@@ -109,6 +116,9 @@ def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
     space = drawing.modelspace()
     places = sorted((c.dxf.center.x, c.dxf.center.y) for c in space.query('CIRCLE[layer=="joints"]'))
     np.testing.assert_allclose(places, sorted(closed_form.pins(0.3).values()), atol=2e-5)
+    text, scale = animation.save(tmp_path / "pose.svg", t=0.3, width=1000).read_text(), view_of(animation.data["bounds"], 1000).scale
+    sizes = sorted(float(r) / scale for r in re.findall(r'<circle class="pin" [^>]*?\br="([\d.]+)"', text))
+    np.testing.assert_allclose(sorted(c.dxf.radius for c in space.query('CIRCLE[layer=="joints"]')), sizes, rtol=1e-3)
     assert {"links", "joints", "ground", "motors", "blocks"} <= {layer.dxf.name for layer in drawing.layers}
     paths = space.query('LWPOLYLINE[layer=="paths"]')
     assert_paths_of_slider_crank([np.array([point[:2] for point in path.get_points()]) for path in paths], 1e-4)
