@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.study.sweep.chunks import members_to_compute
-from udkjax.study.sweep.executors import run
+from udkjax.study.sweep.executors import other_redundant_rows, run
 from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, make_plan
 
@@ -80,6 +80,15 @@ def test_rows_that_become_independent_count_again(cart):
         assert_allclose(data.q[k], alone.q, rtol=0, atol=1e-12)
     assert np.all(data.result == 0)
     assert abs(data.q.values[0, -1, 0, 0]) > 0.1 and abs(data.q.values[1, -1, 0, 0]) < 1e-12  # the cart moves, and is held
+
+
+def test_members_that_drift_are_asked_for_their_own_redundant_rows(cart):
+    """Before any of them runs: of three that are said to have drifted, the guides of one are not parallel."""
+    plan = make_plan(cart, {"axis": udk.Axis([0.0, 0.3, 0.0], of="joint.c.axis")}, [0.0, 0.5])
+    drifted = np.full(3, udk.Result.drift)
+    (rows, which), *others = other_redundant_rows(group_run(plan, 0), np.arange(3), drifted).items()
+    assert (rows, which.tolist(), others) == ((), [1], [])
+    assert not other_redundant_rows(group_run(plan, 0), np.arange(3), np.full(3, udk.Result.step_limit))
 
 
 @pytest.mark.slow

@@ -38,13 +38,13 @@ def run(plan: SweepPlan, chunk: Chunk) -> Done:
     begun = time.perf_counter()
     found = group.compute(chunk.members)
     if group.redundant and group.varied:
-        for rows, which in _other_redundant_rows(group, chunk.members, found[RESULT]).items():
+        for rows, which in other_redundant_rows(group, chunk.members, found[RESULT]).items():
             for name, values in group_run(plan, chunk.group, rows).compute(chunk.members[which]).items():
                 found[name][which] = values
     return chunk, found, time.perf_counter() - begun
 
 
-def _other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
     """Return members that drifted despite projection because other rows are redundant in them, by these rows."""
     found: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
