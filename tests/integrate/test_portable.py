@@ -107,7 +107,7 @@ def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated,
 
 
 def test_a_pull_is_a_spring_to_a_place_and_a_damper():
-    from udkjax.integrate.portable.pull import PREFIX, with_pulls
+    from udkjax.integrate.portable.pull import PREFIX, Pull, with_pulls
 
     mechanism = udk.Mechanism({"ball": udk.Body(mass=2.0, inertia=1.0)}, gravity=(0.0, 0.0))
     held = with_pulls(mechanism).with_parameters(
@@ -118,6 +118,13 @@ def test_a_pull_is_a_spring_to_a_place_and_a_damper():
     expected = 1.0 - np.exp(-decay * ts) * (np.cos(rate * ts) + decay / rate * np.sin(rate * ts))
     assert_allclose(udk.simulate(held, ts, rtol=1e-10, atol=1e-10).q[:, 0, 0], expected, atol=1e-8)
     assert_array_equal(udk.simulate(with_pulls(mechanism), ts).q, udk.simulate(mechanism, ts).q)
+    # At a point off the centre the power of the damper, by force and torque, is -damping |dp/dt|^2.
+    frame = udk.Frame.at((0.3, -0.2), 0.7)._replace(vx=0.4, vy=-1.1, omega=2.3)
+    (x, y, torque), (vx, vy) = (
+        Pull(("ball",), [0.5, -0.2], [1.0, 0.0], 8.0, 1.5).loads(0.0, frame)[0],
+        frame.velocity((0.5, -0.2)),
+    )
+    assert_allclose(x * frame.vx + y * frame.vy + torque * frame.omega, -1.5 * (vx**2 + vy**2))
 
 
 def test_numbers_of_conditions_follow_those_of_the_mechanism():

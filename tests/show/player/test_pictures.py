@@ -116,7 +116,8 @@ def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
     space = drawing.modelspace()
     places = sorted((c.dxf.center.x, c.dxf.center.y) for c in space.query('CIRCLE[layer=="joints"]'))
     np.testing.assert_allclose(places, sorted(closed_form.pins(0.3).values()), atol=2e-5)
-    text, scale = animation.save(tmp_path / "pose.svg", t=0.3, width=1000).read_text(), view_of(animation.data["bounds"], 1000).scale
+    scale = view_of(animation.data["bounds"], 1000).scale
+    text = animation.save(tmp_path / "pose.svg", t=0.3, width=1000).read_text()
     sizes = sorted(float(r) / scale for r in re.findall(r'<circle class="pin" [^>]*?\br="([\d.]+)"', text))
     np.testing.assert_allclose(sorted(c.dxf.radius for c in space.query('CIRCLE[layer=="joints"]')), sizes, rtol=1e-3)
     assert {"links", "joints", "ground", "motors", "blocks"} <= {layer.dxf.name for layer in drawing.layers}
