@@ -177,7 +177,7 @@ def test_projection_is_the_smallest_change(nearby, name):
 
 
 def test_the_tangential_part_is_what_projection_leaves(nearby):
-    """Of small changes of a closed state; against the projection itself, which is linear in velocities."""
+    """Compare small changes of a closed state with the projection itself, which is linear in velocities."""
     mech, (q, *_), (v, *_) = nearby("parallelogram")
     dq, dv = 1e-7 * np.random.default_rng(3).standard_normal((2, len(q)))
 

@@ -1,4 +1,4 @@
-"""What `analyse` says of a mechanism, whatever was imported or analysed before."""
+"""Results of `analyse`, independent of earlier imports and analyses."""
 
 import subprocess
 import sys
@@ -82,7 +82,7 @@ def assert_scales(found, mechanism):
 
 @pytest.mark.parametrize("count", [1, 30])
 def test_bodies_that_nothing_holds_have_scales(count):
-    """Those of their inertia and of gravity; by NumPy, whatever their number, and by machine code."""
+    """The scales follow from inertia and gravity, by NumPy for any number of bodies, and by machine code."""
     falling = udk.Mechanism({f"b{k}": udk.Body(2.0, 0.5, [float(k), 0.0]) for k in range(count)}, {})
     found = udk.analyse(falling)
     assert_allclose([found.length, found.mass, found.time], [0.5, 2.0, np.pi * np.sqrt(0.5 / 9.81)], rtol=1e-14)
@@ -91,7 +91,7 @@ def test_bodies_that_nothing_holds_have_scales(count):
 
 @pytest.mark.parametrize("make", [udk.library.planetary_gear, udk.library.driven_pendulum, udk.library.elliptic_trammel])
 def test_scales_by_arrays_of_jax_and_by_machine_code_are_those_of_numpy(make):
-    """Of drivers, gears and force elements; JAX's own operations are for other devices."""
+    """Scenes with drivers, gears and force elements; JAX operations are for other devices."""
     mechanism = make()
     programs, numbers = scene_programs(mechanism), np.array([*numbers_as_vector(mechanism.numbers), 0.0, 0.0])
     known = scales.evaluate_scales(numbers, programs)
@@ -178,7 +178,7 @@ DENSE = [
     "NEGLIGIBLE_SHARE",
     "HEADING_NOISE",
     "RANK_TOL",
-    "ORDINARY_MASS_RATIO",
+    "MAX_MASS_RATIO",
 ]
 SPARSE = ["DEPENDENT_PIVOT", "CLEAR_TOL", "NEGLIGIBLE_SHARE"]
 

@@ -131,7 +131,7 @@ def test_systems_of_the_users_own():
 def test_what_partitioning_refuses():
     with pytest.raises(ValueError, match="nonholonomic constraints"):
         equations_of(Ball().system(), None, None, udk.CoordinatePartitioning())
-    with pytest.raises(ValueError, match="Baumgarte has nothing to feed back"):
+    with pytest.raises(ValueError, match="takes no Baumgarte stabilization"):
         equations_of(mechanism("four_bar"), None, udk.Baumgarte(), udk.CoordinatePartitioning())
 
 

@@ -59,7 +59,7 @@ def test_redundancy():
 
 
 def test_gains_feed_violations_back():
-    """Of Psi by both, of a velocity constraint by the first: off the manifold, by hand."""
+    """Psi is fed back with both gains, a velocity constraint with the first: off the manifold, computed by hand."""
     t, q, v = 0.3, jnp.array([0.7, 0.2, -0.8]), jnp.array([0.3, 1.0, 0.5])
     system = udk.ConstrainedSystem(BALL.mass, BALL.force, BALL.constraint, lambda t, q, v: v[0] - 0.2 * v[1] - t)
     a = udk.accelerations(system, t, q, v, stabilization=udk.Baumgarte(3.0, 7.0))
@@ -68,7 +68,7 @@ def test_gains_feed_violations_back():
 
 
 def test_the_tangential_part_is_what_projection_leaves():
-    """On a sphere: of changes of position and velocity what is orthogonal to the radius."""
+    """On a sphere: the part of changes of position and velocity that is orthogonal to the radius."""
     equations = equations_of(Ball(BALL.weight, BALL.radius, 3).system())
     q, v = BALL_START
     dq, dv = jnp.array([0.3, -0.2, 0.5]), jnp.array([1.0, 2.0, -1.0])
@@ -180,7 +180,7 @@ def test_each_kind_of_constraint_along_a_motion(stabilization):
     v = np.concatenate([BALL_START[1], BEAD[1], [0.6, 0.8], [2.0, 0.0, 0.0], rates, [rates.sum()]])
     sol = udk.simulate(system, TS, udk.State(q, v), stabilization=stabilization, **CHOICES)
     assert sol.q.shape == (len(TS), 13)
-    assert jnp.abs(udk.violation(system, sol)).max() < (1e-14 if projected else 1e-8)  # of Psi alone: six rows
+    assert jnp.abs(udk.violation(system, sol)).max() < (1e-14 if projected else 1e-8)  # only Psi: six rows
     (ball, bead, moved, blade, angles), rates = (parts(x.T) for x in (np.asarray(sol.q), np.asarray(sol.v)))
     assert_allclose(ball.T, in_angles(), atol=1e-8)
     assert_allclose(ball[0] * rates[0][1] - ball[1] * rates[0][0], 0.9, atol=1e-8)  # its spin

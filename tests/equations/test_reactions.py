@@ -50,7 +50,7 @@ def test_tangential_parts_of_the_paper_s_linkage_are_unique_and_axial_ones_are_n
 
 
 def test_uniqueness_is_that_of_a_jacobian_written_by_hand(linkage):
-    """Of the linkage with the self-stress of its closed form, u = (f e, -f e), f = (1, -2, 1): NumPy, and the null vector."""
+    """The linkage with the self-stress of its closed form, u = (f e, -f e), f = (1, -2, 1): NumPy, and the null vector."""
     theta = 0.3
     mechanism = udk.library.parallelogram(theta)
     e, across = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
@@ -116,7 +116,7 @@ def test_a_joint_without_compliance_is_rigid():
 
 
 def test_the_split_does_not_depend_on_units():
-    """Of a beam of a micrometre the same shares."""
+    """A beam of a micrometre has the same shares."""
     unit = 1e-6
     big, rods = beam(), {}
     for name, joint in big.joints.items():

@@ -83,7 +83,7 @@ class Stop(udk.ForceElement):
 
 
 class Drag(udk.ForceElement):
-    """Quadratic drag, a gust that comes with time, and a potential beside them."""
+    """Quadratic drag, a gust that comes with time, and a potential as well."""
 
     coefficient: jax.Array
 
@@ -142,7 +142,7 @@ def states(mech):
 
 @pytest.fixture(scope="module")
 def terms(mech, states):
-    """What the programs say."""
+    """The terms by the programs."""
     arrays_at, (row, column, *_) = arrays_in_time(mech), scene_programs(mech).psi_q_entries
 
     def at(t, q, v):
@@ -257,11 +257,11 @@ def test_energies_along_a_motion(machine):
 
 
 def test_floats_and_arrays_find_the_same(monkeypatch):
-    """Scenes of few elements are evaluated by Python's floats, others, and what is not finite, by NumPy's arrays."""
+    """Scenes of few elements are evaluated by Python's floats, others, and non-finite numbers, by NumPy arrays."""
     names = ("revolute", "prismatic", "slot", "weld")
     mechanism = udk.Mechanism(BODIES, {name: JOINTS[name] for name in names}, forces={"push": FORCES["push"]})
     q, v = np.asarray(mechanism.q0).ravel(), np.linspace(-1.0, 1.0, mechanism.q0.size)
-    states = [(q, v)] * 25 + [(np.full_like(q, np.inf), v)]  # the first ones step by step, later ones by what was written of it
+    states = [(q, v)] * 25 + [(np.full_like(q, np.inf), v)]  # the first ones step by step, later ones by the written function
 
     def evaluate(few):
         monkeypatch.setattr(loop_program, "FEW_ROWS", few)

@@ -1,4 +1,4 @@
-"""Nothing is computed that a scene does not need: how many operations its programs hold."""
+"""Nothing is computed that a scene does not need: numbers of operations in its programs."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def unrolled(mechanism, name="accelerations", **choices) -> UnrolledProgram:
 
 
 def right_hand_side(mechanism, name="accelerations", **choices):
-    """How many operations of each kind the accelerations take, or another program."""
+    """Count the operations of each kind in the accelerations, or in another program."""
     return unrolled(mechanism, name, **choices).program.count()
 
 
@@ -130,7 +130,7 @@ def test_a_body_without_dampers_is_not_asked_for_its_velocity():
 
 
 def test_without_stabilization_psi_and_its_rate_are_not_evaluated(linkage, plain):
-    """Of hinges, only Psi holds positions of centres of mass, and only Psi_dot holds their velocities."""
+    """For hinges, only Psi contains positions of centres of mass, and only Psi_dot contains their velocities."""
     for baumgarte in (False, True):
         for x in "qv":
             assert any(k % 3 < 2 for k in uses(linkage, x, baumgarte=baumgarte)) == baumgarte
@@ -225,7 +225,7 @@ def test_numbers_that_change_make_no_other_code(linkage):
 
 
 def derivative(mechanism, name="accelerations", mode=FORWARD, numbers=()):
-    """How many operations of each kind an evaluation takes that derivatives follow, and these."""
+    """Count the operations of each kind in an evaluation with intermediate results, and in the derivative."""
     found = programs(mechanism)
     active = [k in numbers for k in range(found.number_count)]
     both = Unrolled(found, [], [name], active, mode).derivative(name)

@@ -88,7 +88,7 @@ def test_every_way_gives_the_same_slopes(run, slopes):
 
 @pytest.fixture
 def record_length(monkeypatch):
-    """A function that sets how many points a record may have; JAX keeps the shapes of what it has traced."""
+    """A function that sets the capacity of a record in points; JAX keeps the shapes of traced functions."""
 
     def change(points):
         monkeypatch.setattr(record, "STORED", points)

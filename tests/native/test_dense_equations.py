@@ -18,7 +18,7 @@ TIMES = np.linspace(0.0, 2.0, 11)
     ids=lambda x: type(x).__name__,
 )
 def test_the_exact_motion_of_a_redundant_linkage(method, stabilization):
-    """Of its links' angle: 3.05 theta'' = -3.5 g cos(theta), that of a pendulum released from rest."""
+    """The angle of its links: 3.05 theta'' = -3.5 g cos(theta), that of a pendulum released from rest."""
     start = np.deg2rad(-45)
     run = udk.simulate(
         udk.library.parallelogram(start), TIMES, rtol=1e-10, atol=1e-10, method=method, stabilization=stabilization

@@ -12,7 +12,7 @@ NUMBERS = np.array([-2.5, -1.0, -0.0, 0.0, 0.25, 1.0, 3.75, 1e300, -np.inf, np.i
 
 
 def binary(code, width, write, x, y, wholes=False):
-    """What `write(f, a, b)` makes of pairs of numbers, `width` at once."""
+    """The results of `write(f, a, b)` for pairs of numbers, `width` at a time."""
     f = Function("pairs", [(POINTER, "x"), (POINTER, "y"), (POINTER, "out")], width)
     base = INT if wholes else DOUBLE
     a, b = (f.load(f.given[name], 0, width, base) for name in "xy")
@@ -83,7 +83,7 @@ def test_a_number_is_written_to_its_last_bit(code, number):
 
 
 def test_the_larger_is_the_second_where_one_is_no_number(code, width):
-    """In that order a running maximum passes over what is none."""
+    """In that order a running maximum ignores NaN."""
     x, y = pairs()
     assert_array_equal(binary(code, width, lambda f, a, b: f.max(a, b), x, y), np.where(x > y, x, y))
     assert_array_equal(binary(code, width, lambda f, a, b: f.min(a, b), x, y), np.where(x < y, x, y))
@@ -169,7 +169,7 @@ def test_loops_and_branches(code):
 
 
 def test_functions_call_one_another_with_memory_of_their_own(code):
-    """What is reserved within a loop is reserved once: a thousand rounds take no more of the stack than one."""
+    """Memory reserved within a loop is reserved once: a thousand iterations take no more of the stack than one."""
     inner = Function("inner", [(POINTER, "x"), (INT, "k")])
     place = inner.reserve(DOUBLE, 100_000)
     inner.store(1.0, inner.at(place, 99_999))

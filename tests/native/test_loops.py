@@ -109,7 +109,7 @@ class At:
         return found
 
     def value(self, name, constants, q, v, steps):
-        """The results of a differentiable program; a projection takes so many steps."""
+        """The results of a differentiable program; a projection takes `steps` steps."""
         if name == "projection":
             for _ in range(steps):
                 q = self.run("newton_q", constants=constants, q=q)["q1"]
@@ -390,7 +390,7 @@ def test_a_large_scene_moves_as_its_parts_do(linkages, angle, bound):
 
 
 def test_derivatives_of_a_large_scene_are_those_of_its_parts(linkages):
-    """Of runs, and of closing what they start with, forward and reverse."""
+    """Derivatives of runs and of closing their initial states, in forward and reverse mode."""
     ts, slopes = np.linspace(0.0, 0.3, 4), []
     for mechanism, copies in zip(linkages(-50.0), (1, 8), strict=True):
         names = [f"body.{name}.mass" for name in mechanism.body_names if name.startswith("link1")]

@@ -1,4 +1,4 @@
-"""Programs as machine code compute what JAX does, also of what is not finite."""
+"""Programs as machine code compute the results of JAX, also for non-finite numbers."""
 
 import jax
 import jax.numpy as jnp

@@ -135,7 +135,7 @@ def test_transposed(m, n):
 
 
 def test_small_singular_values_are_exact_to_many_digits():
-    """Of rows of very different lengths, where what is found from D D^T would have none."""
+    """Rows have very different lengths, for which results from D D^T would have no correct digits."""
     (inner,), _ = random_matrices(3, 3, [3])
     D, x = np.diag([1.0, 1e-5, 1e-10]) @ inner, [1.0, 2.0, 3.0]
     assert_allclose(one(D, D @ x, 1e-14), x, rtol=1e-9)
@@ -148,7 +148,7 @@ def test_what_is_scaled_is_solved_alike(scale):
 
 
 def test_zeros_and_numbers_that_are_none():
-    """Zeros have no rank, and what is not finite comes to an end."""
+    """Zeros have rank zero, and non-finite matrices terminate."""
     assert_array_equal(one(np.zeros((3, 4)), np.ones(3), 1e-9), np.zeros(4))
     assert_allclose(one([[0.0, 0.0], [0.0, 2.0], [0.0, 0.0]], [5.0, 1.0, 7.0], 1e-9), [0.0, 0.5])
     for bad in (np.nan, np.inf):
@@ -176,7 +176,7 @@ def test_exact_matrices(name):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("relative", [True, False])
 def test_thresholds_meet_the_same_scale(name, relative):
-    """Of rows whose lengths fall by tenths: ranks as the plain form finds them, at thresholds between."""
+    """Rows have lengths that fall by tenths: the ranks at thresholds in between are those of the plain form."""
     lengths = 10.0 ** -np.arange(5)
     matrices = np.array([np.diag(lengths) * 3.0] * 7)
     right, tols = np.ones((7, 5)), np.array([3e-1, 0.05, 3e-2, 5e-3, 3e-4, 1e-5, 4.0]) * (1.0 if relative else 1.7)

@@ -48,7 +48,7 @@ def by_scipy(mechanism, ts, state=None, gains=(0.0, 0.0)):
 
 
 def agrees(mechanism, ts, atol=1e-6, **choices):
-    """Whether a run by machine code goes where SciPy's does."""
+    """Return whether a run by machine code agrees with SciPy."""
     state = choices.pop("state", None)
     solution = udk.simulate(mechanism, ts, state, rtol=TOL, atol=TOL, **choices)
     q, v = by_scipy(mechanism, ts, state)

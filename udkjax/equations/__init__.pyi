@@ -62,7 +62,7 @@ from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import violation as violation
 from udkjax.equations.reactions import reactions as reactions
 from udkjax.equations.reactions import unique_reactions as unique_reactions
-from udkjax.equations.redundancy import ORDINARY_TOL as ORDINARY_TOL
+from udkjax.equations.redundancy import GENERIC_TOL as GENERIC_TOL
 from udkjax.equations.redundancy import PositionRows as PositionRows
 from udkjax.equations.redundancy import choose_dispensable as choose_dispensable
 from udkjax.equations.redundancy import choose_redundant_rows as choose_redundant_rows

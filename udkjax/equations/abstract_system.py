@@ -13,7 +13,7 @@ from udkjax.equations.scales import Scales
 
 
 class PseudoinverseOperator(Protocol):
-    """A pseudoinverse that is known by its products: `D_plus @ b`, `D_plus.T @ x`, and its rank."""
+    """A pseudoinverse as an operator: its products `D_plus @ b` and `D_plus.T @ x`, and its rank."""
 
     @property
     def T(self) -> "PseudoinverseOperator": ...
@@ -54,7 +54,7 @@ class TangentPart(NamedTuple):
 
 
 class AbstractSystem(eqx.Module):
-    """The equations of motion of one system, ready to be evaluated. Coordinates and velocities are flat vectors (n,)."""
+    """The equations of motion of one system. Coordinates and velocities are flat vectors (n,)."""
 
     @property
     @abstractmethod
@@ -62,11 +62,11 @@ class AbstractSystem(eqx.Module):
         """True if there are any constraints."""
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """Return the largest of a change of coordinates, in units of the system's own. By default these are one."""
+        """Return the largest component of a change of coordinates, in the system's own units, by default one."""
         return jnp.max(jnp.abs(dq), initial=0.0)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
-        """Return the largest violation of any row of Psi, in units of the system's own. By default these are one."""
+        """Return the largest violation of any row of Psi, in the system's own units, by default one."""
         return jnp.max(jnp.abs(psi), initial=0.0)
 
     @abstractmethod
@@ -88,7 +88,7 @@ class AbstractSystem(eqx.Module):
         """Return q and v to the constraint manifold."""
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """Return the part of small changes of q and v that a projection at q does not remove. By default all of it."""
+        """Return the part of small changes of q and v that a projection at q leaves; by default all of it."""
         return TangentPart(dq, dv)
 
     @abstractmethod
@@ -99,29 +99,29 @@ class AbstractSystem(eqx.Module):
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Return whether all terms of the equations are finite."""
 
-    # For formulations that integrate some coordinates alone. By default all of them are integrated.
+    # For formulations that integrate only some of the coordinates. By default all are integrated.
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Return the rates of q and of v that an integrator integrates."""
+        """Return the time derivatives of q and v that are integrated."""
         return v, self.accelerations(t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> Self:
-        """Return the same system with the partition of this state, which is fixed until the end of a step."""
+        """Return the same system with the partition of this state, fixed for one step."""
         return self
 
     @property
     def independent(self) -> Bool[Array, "n"] | None:
-        """The coordinates and velocities that are integrated, and so under error control; None: all."""
+        """The coordinates and velocities that are integrated and under error control; None: all."""
         return None
 
 
 class MechanismSystem(AbstractSystem):
-    """The equations of motion of a mechanism, whose coordinates and velocities are x, y, angle of each body in turn."""
+    """The equations of motion of a mechanism; coordinates and velocities are x, y, angle of each body in turn."""
 
     scales: eqx.AbstractVar[Scales]
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """Return the largest of a change of coordinates: lengths over the characteristic length, angles in rad."""
+        """Return the largest component of a change of coordinates: lengths over the characteristic length, angles in rad."""
         return self.scales.size(dq)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
@@ -131,7 +131,7 @@ class MechanismSystem(AbstractSystem):
     @property
     @abstractmethod
     def row_names(self) -> list[tuple[str, int]]:
-        """The constraint that each row of Psi belongs to, and its number within it."""
+        """The constraint that each row of Psi belongs to, and the row's index within it."""
 
     @property
     @abstractmethod
@@ -148,12 +148,12 @@ class MechanismSystem(AbstractSystem):
 
     @abstractmethod
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """Return D and Psi, their rows weighted by `Scales.weights`, and M^(-1/2), of all rows."""
+        """Return D and Psi of all rows, weighted by `Scales.weights`, and M^(-1/2)."""
 
     @abstractmethod
     def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
-        """D^+ by the method and Psi, their rows weighted, and M^(-1/2)."""
+        """Return D^+ by the method and Psi, their rows weighted, and M^(-1/2)."""
 
     @abstractmethod
     def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
-        """D^+ by the method and Psi_dot, their rows weighted, and M^(-1/2)."""
+        """Return D^+ by the method and Psi_dot, their rows weighted, and M^(-1/2)."""

@@ -3,11 +3,10 @@
 Every threshold of the package that compares lengths, times or rows of unlike units takes its unit from here, so that a mechanism
 of a micrometre and one of a kilometre behave alike.
 
-The length L is the longest arm by which a constraint turns a body at the initial guess, which Psi_q tells by itself,
-|dPsi/dangle| / |dPsi/d(x, y)|, or a radius of gyration sqrt(I/m), if one is longer. It does not depend on where the origin is.
-T is the shortest time in which anything changes there: that in which a velocity moves a body by L, that of a swing of a pendulum
-of length L under a free acceleration a_F, pi sqrt(L / a_F), and the same of the drivers. A row's scale is what a displacement of
-L, or a turn of one radian, changes in it.
+The length L is the longest lever arm of a constraint at the initial guess, |dPsi/dangle| / |dPsi/d(x, y)|, or the largest radius
+of gyration sqrt(I/m) if that is longer. It does not depend on the origin. T is the shortest time in which anything changes at the
+guess: the time in which a velocity moves a body by L, the half period pi sqrt(L / a_F) of a pendulum of length L under a free
+acceleration a_F, and the same for the drivers. The scale of a row is its change by a displacement of L or a turn of one radian.
 """
 
 from collections import OrderedDict
@@ -32,23 +31,23 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
-ANALYSIS_CACHE_SIZE = 256  # analyses that are stored; the one that was asked for longest ago makes room
+ANALYSIS_CACHE_SIZE = 256  # stored analyses; the least recently used one is dropped
 
 
 class Analysis(PrintsTable):
     """The result of `analyse`. A pytree: its scales are arrays, everything else is static.
 
     Attributes:
-        scales: lengths, times and masses that thresholds are relative to.
-        coordinates: names of the coordinates.
+        scales: characteristic length, time and mass, to which thresholds are relative.
+        coordinates: number of coordinates.
         row_names: joint and number of each row of Psi.
-        redundant_rows: indices of the rows that depend on others; None: not known.
+        redundant_rows: indices of the rows that depend on others; None: unknown.
     """
 
     scales: Scales
     coordinates: int = eqx.field(static=True)
     row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # of Psi: the constraint and the row within it
-    # Rows of Psi to leave out; None where they are not known: the guess cannot be closed or moved, or all numbers are traced.
+    # Rows of Psi to leave out; None if unknown: the guess cannot be closed or moved, or all numbers are traced.
     redundant_rows: tuple[int, ...] | None = eqx.field(static=True)
 
     def _table(self) -> PrintedTable:
@@ -75,17 +74,17 @@ class Analysis(PrintsTable):
 
     @property
     def independent_rows(self) -> tuple[int, ...]:
-        """The rows that are not redundant, as far as that is known."""
+        """The rows that are not known to be redundant."""
         return tuple(i for i in range(len(self.row_names)) if i not in (self.redundant_rows or ()))
 
     @property
     def rank(self) -> int | None:
-        """The rank of Psi_q outside of singular configurations; None where it is not known."""
+        """The rank of Psi_q outside singular configurations; None if unknown."""
         return None if self.redundant_rows is None else len(self.row_names) - len(self.redundant_rows)
 
     @property
     def degrees_of_freedom(self) -> int | None:
-        """Coordinates less the rank; None where that is not known."""
+        """The number of coordinates minus the rank; None if unknown."""
         return None if self.rank is None else self.coordinates - self.rank
 
     @property
@@ -95,12 +94,12 @@ class Analysis(PrintsTable):
 
     @property
     def time(self) -> Float[Array, ""]:
-        """The characteristic time (s); infinite where nothing moves and nothing pulls."""
+        """The characteristic time (s); infinite without velocities and loads."""
         return 1 / self.scales.rate
 
     @property
     def mass(self) -> Float[Array, ""]:
-        """The characteristic mass (kg): that of the heaviest body."""
+        """The characteristic mass (kg), the mass of the heaviest body."""
         return self.scales.mass
 
 
@@ -108,16 +107,16 @@ class Analysis(PrintsTable):
 def analyse(mechanism: Mechanism) -> Analysis:
     """Find the rank, the redundant rows and the scales of a mechanism; results are cached by structure and numbers.
 
-    Which rows are redundant depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of
-    the known one that it was made from by `with_parameters`, and the scales of its own numbers: a run watches the rows that are
-    left out, and says so where numbers made one of them independent. A mechanism whose geometry is traced as an argument of a
-    function under `jit` has no origin: its redundant rows are not known here, and a run finds them when it begins.
+    Redundancy depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of the concrete one
+    that it was made from by `with_parameters`, and the scales of its own numbers; a run checks the rows that are left out and
+    reports if one of them has become independent. A mechanism whose geometry is traced as an argument of a function under `jit`
+    has no such origin: its redundant rows are unknown here, and a run finds them when it begins.
 
     Args:
         mechanism: The scene; its numbers may be traced.
 
     Returns:
-        The `Analysis`; `rank` and `redundant_rows` are None where they are not known.
+        The `Analysis`; `rank` and `redundant_rows` are None if unknown.
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:
@@ -139,7 +138,7 @@ Stored = TypeVar("Stored")
 
 
 class _Cache(Generic[Stored]):
-    """The `ANALYSIS_CACHE_SIZE` values that were asked for last, by their keys."""
+    """The `ANALYSIS_CACHE_SIZE` most recently used values, by their keys."""
 
     def __init__(self):
         self._found: OrderedDict[Hashable, Stored] = OrderedDict()
@@ -163,15 +162,15 @@ _redundant: _Cache[tuple[int, ...] | None] = _Cache()
 
 
 def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
-    with jax.ensure_compile_time_eval():  # while something else is traced, too
+    with jax.ensure_compile_time_eval():  # also during a trace
         scales = concrete_scales(mechanism)
-        # Masses and loads decide nothing about rows: mechanisms that differ in them alone share what was found.
+        # Redundancy does not depend on masses and loads: mechanisms that differ only in these share the result.
         rows = _redundant.get((kind, _bytes_of(_geometry(mechanism))), lambda: redundant_rows(mechanism))
         return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
 
 
 def _rows_of_concrete_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """Return the redundant rows of a mechanism whose masses or loads are traced; None where its geometry is, too."""
+    """Return the redundant rows of a mechanism with traced masses or loads; None if its geometry is traced as well."""
     with jax.ensure_compile_time_eval():
         if is_traced(_geometry(mechanism)):
             return None

@@ -1,8 +1,8 @@
 """Elimination of Psi_q M^(-1) Psi_q^T by loops: block by block, in an order of least fill that is chosen once.
 
-A diagonal block of it belongs to a constraint, another one to two constraints that hold the same body. A front is a block that
-is eliminated, with the later blocks that it meets: fronts of the same sizes are eliminated by the same kernel. A row whose pivot
-does not exceed `drop_tol` times its diagonal entry is left out, with zero for the reciprocal of its pivot.
+A diagonal block belongs to one constraint, an off-diagonal block to two constraints that share a body. A front is a block with
+the later blocks that its elimination changes; fronts of the same sizes are eliminated by the same kernel. A row whose pivot does
+not exceed `drop_tol` times its diagonal entry is left out: the reciprocal of its pivot is set to zero.
 
 """
 
@@ -30,21 +30,22 @@ from udkjax.pinv.elimination_order import Fronts, order_blocks
 
 
 def triangle(i: int, j: int) -> int:
-    """Return the place of an entry in a lower triangle that is stored row by row."""
+    """Return the index of entry (i, j) in a lower triangle that is stored row by row."""
     return i * (i + 1) // 2 + j
 
 
 class BlockElimination:
     """Loops that form Psi_q M^(-1) Psi_q^T, factorize it and solve with the factors, in arrays added to the layout of `terms`.
 
-    `gram` holds first the diagonal blocks, each with its diagonal as it was before elimination, then the others. `factors` lies
-    as `gram` does: of a diagonal block the reciprocals of the pivots and L, of another one its part of L. `nearness` is the
-    largest diagonal entry relative to its pivot, `trusted` whether all pivots exceed `safe_tol` times theirs.
+    `gram` holds the diagonal blocks, each followed by its diagonal before elimination, and then the off-diagonal blocks.
+    `factors` has the same layout: the reciprocals of the pivots and L for a diagonal block, a part of L for an off-diagonal one.
+    `nearness` is the largest ratio of a diagonal entry to its pivot; `trusted` is one if all pivots exceed `safe_tol` times their
+    diagonal entries.
     """
 
     def __init__(self, terms: SceneTerms):
         self.terms, layout = terms, terms.layout
-        # Of each block: its group, and which of the group's elements it belongs to.
+        # For each block: its group, and the index of its element within the group.
         self._elements = [(group, i) for group in layout.eliminated for i in range(len(group.members))]
         self._sizes = [len(group.rows) for group, _ in self._elements]
         bodies = [set(group.bodies[:, i].tolist()) for group, i in self._elements]
@@ -66,7 +67,7 @@ class BlockElimination:
     # --- programs
 
     def factorize(self, dropping: bool) -> ProgramParts:
-        """Form Psi_q M^(-1) Psi_q^T of the entries in `psi_q`, and factorize it, with or without rows that depend on others."""
+        """Form Psi_q M^(-1) Psi_q^T from the entries in `psi_q` and factorize it, with or without dependent rows."""
         if self._off_diagonal_size:
             yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
         yield from self._gram
@@ -105,23 +106,23 @@ class BlockElimination:
             yield KernelLoop(self.terms.kernel(("backward", e.size, e.later_sizes), backward), self._front_table(e)[::-1], names)
 
     def safe(self) -> KernelLoop:
-        """Write `safe`: one where all pivots exceed `safe_tol`, zero elsewhere."""
+        """Write `safe`: one if all pivots exceed `safe_tol`, else zero."""
 
         def write(w: KernelWriter):
             w.write(w.read("trusted", None), "safe", None)
 
-        return self.terms.single_round("safe", write)
+        return self.terms.single_iteration("safe", write)
 
     def distance(self) -> KernelLoop:
-        """Return the distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
+        """Write `distance`, the distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
 
         def write(w: KernelWriter):
             w.write(w.graph.constant(1.0) / w.graph.sqrt(w.read("nearness", None)), "distance", None)
 
-        return self.terms.single_round("distance", write)
+        return self.terms.single_iteration("distance", write)
 
     def rank(self) -> ProgramParts:
-        """Count the rows that the last factorization did not leave out."""
+        """Count the rows that the last factorization retained."""
         yield Reset("rank", 0, 1)
         for p in sorted(set(self._sizes)):
 
@@ -135,7 +136,7 @@ class BlockElimination:
             yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
 
     def independent(self) -> ProgramParts:
-        """Write `independent`: one for each row that the last factorization did not leave out, zero for the others."""
+        """Write `independent`: one for each row that the last factorization retained, zero for the others."""
         starts: dict[int, list[list[int]]] = {}
         for block, (start, size) in enumerate(zip(self._diagonals, self._sizes, strict=True)):
             starts.setdefault(size, []).append([start, self._place(block, ROW)])
@@ -176,8 +177,8 @@ class BlockElimination:
         return KernelLoop(self.terms.kernel(("diagonal", group), write), table)
 
     def _off_diagonal_blocks(self) -> list[KernelLoop]:
-        """Return the shares of bodies in the blocks of pairs of constraints that hold them, a loop for pairs that are alike."""
-        holders: dict[int, list[tuple[int, int]]] = {}  # of each body: blocks, and which of their bodies it is
+        """Return the loops over shared bodies that fill the blocks of pairs of constraints, one loop for each kind of pair."""
+        holders: dict[int, list[tuple[int, int]]] = {}  # for each body: blocks, and its index among their bodies
         for block, (group, i) in enumerate(self._elements):
             for slot, body in enumerate(group.bodies[:, i].tolist()):
                 holders.setdefault(body, []).append((block, slot))
@@ -207,8 +208,8 @@ class BlockElimination:
     def _front_table(self, e: Fronts) -> np.ndarray:
         """Return the table of fronts of the same sizes.
 
-        Its columns: where the block's factors and its right-hand side begin; of each later block that it meets, the block of both
-        and its right-hand side; then the lower triangle of the blocks of those, row by row.
+        Its columns: where the block's factors and its right-hand side begin; for each later block of the front, the off-diagonal
+        block of both and its right-hand side; then the lower triangle of the blocks of all later ones, row by row.
         """
         table = []
         for k, later in zip(e.blocks, e.later, strict=True):
@@ -222,11 +223,11 @@ class BlockElimination:
 
 
 def _scaled(w: KernelWriter, row: list[Scalar], base: Callable[[int], int]) -> list[Scalar]:
-    """Return a row of Psi_q times M^(-1); `base` is the column of the table for a body's constants."""
+    """Return a row of Psi_q times M^(-1); `base` returns the table column of a body's constants."""
     return [s * compliance(w, k % 3, base(k // 3)) for k, s in enumerate(row)]
 
 
-# Kernels of a front: a block of p rows, and the later blocks that it meets, of so many rows each.
+# Kernels of a front: a block of p rows, and its later blocks with their numbers of rows.
 
 
 def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool, first_mark: int | None) -> None:

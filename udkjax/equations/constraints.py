@@ -1,12 +1,11 @@
 """The constraints of a mechanism along a motion: Psi, Psi_q, Psi_dot and gamma (de Falco, Pennestri, Vita 2005, section 3).
 
-Each joint and driver defines its residual alone; JAX takes all derivatives of it. The functions are written as the paper has
-them, on arrays, without regard to which entries are zero; elements of the same structure are evaluated together (structure.py).
-The tests hold the faster forms of the same functions against these.
+Each joint and driver defines only its residual; JAX takes all derivatives. The functions are written as in the paper, on dense
+arrays; elements of the same structure are evaluated together (structure.py). The tests compare the faster forms with these.
 
 In all of them t is the time (s), and q and v are the coordinates and velocities of the n / 3 bodies, x, y (m) and angle (rad) of
-one after another: flat (n,), or (bodies, 3), which is made flat. The m rows are those of the joints in their order, then those
-of the drivers (`row_names`); a row is in m or in rad.
+each in turn, as (n,) or (bodies, 3). The m rows are those of the joints in their order, then those of the drivers (`row_names`);
+a row is in m or in rad.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +25,7 @@ BodyArray = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
 
 @traced_once
 def psi(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m"]:
-    """Psi(t, q), the residuals of all constraints, which are zero where all joints are closed.
+    """Return Psi(t, q), the residuals of all constraints, which are zero where all joints are closed.
 
     Args:
         mechanism: The scene.
@@ -92,7 +91,7 @@ def gamma(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Flo
 
 
 def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
-    """Return the constraint that each row of Psi belongs to, and its number within it."""
+    """Return the constraint that each row of Psi belongs to, and the row's index within it."""
     names, constraints = list(mechanism.constraints), [*mechanism.constraints.values()]
     residual = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
     rows = jax.eval_shape(lambda: [rows for _, rows in evaluate_by_kind(residual, mechanism, constraints, bodies(mechanism.q0))])
@@ -103,7 +102,7 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
 
 
 def _row_order(found: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
-    """Return the places of the rows, in the order of their constraints, among the rows ordered by kinds."""
+    """Return the permutation from rows ordered by kind to rows in the order of their constraints."""
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in found])
     return np.argsort(owner, kind="stable")
 

@@ -1,6 +1,6 @@
-"""Psi and D of a small mechanism with known numbers, by NumPy on the scene's programs: nothing is compiled for it.
+"""Psi and D of a small mechanism with concrete numbers, by NumPy on the scene's programs, without compilation.
 
-With them a mechanism is closed, and its redundant rows are found (redundancy.py).
+They serve to close a mechanism and to find its redundant rows (redundancy.py).
 """
 
 from typing import Any, NamedTuple
@@ -17,15 +17,15 @@ from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
 
-# Singular values of D with rows of length one at a closed position, relative to the largest. Up to the first one counts as zero:
-# redundant rows leave rounding errors in half of its digits. From the second on it does not; the rank of a position with one in
-# between, which is merely close to a singular configuration, is in doubt.
+# Thresholds for the singular values of D with unit rows at a closed position, relative to the largest. Up to the first one they
+# count as zero: redundant rows leave rounding errors in half of the digits. Above the second they are nonzero. In between, close
+# to a singular configuration, the rank is in doubt.
 DEPENDENT_TOL, CLEAR_TOL = float(np.sqrt(np.finfo(float).eps)), 1e-4
-NEGLIGIBLE_SHARE = 1e-6  # of a combination of rows of length one: a share of a row below it is rounding
+NEGLIGIBLE_SHARE = 1e-6  # coefficient in a combination of unit rows that counts as rounding
 
 
 class TruncatedPseudoinverse(NamedTuple):
-    """D^+ = V S^+ U^T by NumPy, as `pinv.SVD` has it."""
+    """D^+ = V S^+ U^T by NumPy, the counterpart of `pinv.SVD`."""
 
     u: np.ndarray
     inverse: np.ndarray
@@ -34,8 +34,8 @@ class TruncatedPseudoinverse(NamedTuple):
 
     @classmethod
     def of(cls, D: np.ndarray, tol: float) -> "TruncatedPseudoinverse":
-        """Return the pseudoinverse of a matrix; NaN of one that is not finite."""
-        if not np.all(np.isfinite(D)):  # NumPy refuses to decompose it
+        """Return the pseudoinverse of a matrix; NaN if the matrix is not finite."""
+        if not np.all(np.isfinite(D)):  # NumPy raises for it
             D, tol = np.zeros_like(D), np.nan
         u, sigma, vt = np.linalg.svd(D, full_matrices=False)
         counts = ~(sigma <= tol * sigma[0])
@@ -50,17 +50,17 @@ def _key(t: Time, q: np.ndarray) -> tuple[bytes, bytes]:
 
 
 class RowTerms:
-    """Psi of a mechanism with known numbers, Psi_dot and the entries of Psi_q, by NumPy on the scene's programs."""
+    """Psi, Psi_dot and the entries of Psi_q of a mechanism with concrete numbers, by NumPy on the scene's programs."""
 
     def __init__(self, mechanism: Mechanism):
         programs = scene_programs(mechanism)
         self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self._arrays_at = arrays_in_time(mechanism)
-        self._latest: tuple[Any, bytes, Any] = ((), b"", None)  # position, velocity, and what was found there
+        self._latest: tuple[Any, bytes, Any] = ((), b"", None)  # position, velocity and the result for them
 
     def geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q: of one state once, though several ask for it."""
+        """Return Psi (m,), Psi_dot (m,) and the entries of Psi_q; the result for the latest state is kept."""
         position, velocity = _key(t, q), v.tobytes()
         latest = self._latest
         if latest[:2] != (position, velocity):
@@ -74,7 +74,7 @@ class RowTerms:
 
 
 class DenseTerms(RowTerms):
-    """Psi of a mechanism with known numbers and its derivatives, as whole matrices."""
+    """Psi of a mechanism with concrete numbers and its derivatives, as dense matrices."""
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
@@ -90,7 +90,7 @@ class DenseTerms(RowTerms):
 
 
 class DenseRows(DenseTerms):
-    """The rows of a mechanism with known numbers, evaluated by NumPy on the scene's programs. The metric is M^(-1/2)."""
+    """The rows of a mechanism with concrete numbers, by NumPy on the scene's programs. The metric is M^(-1/2)."""
 
     def __init__(self, mechanism: Mechanism, scales: Scales):
         super().__init__(mechanism)
@@ -109,14 +109,14 @@ class DenseRows(DenseTerms):
         return self.slopes(t, q)[0]
 
     def plus(self, t: Time, q: np.ndarray) -> TruncatedPseudoinverse:
-        """D^+ of weighted rows in the metric."""
+        """Return D^+ of weighted rows in the metric."""
         return TruncatedPseudoinverse.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         return -self.metric * (self.plus(t, q) @ (self.scales.weights * self.psi(t, q)))
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
-        """Return q closed, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
+        """Return closed q, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, *self.violation(t, q, v), 0
         q = close_position(self, t, q, np)
@@ -127,7 +127,7 @@ class DenseRows(DenseTerms):
 
 
 class DensePosition(NamedTuple):
-    """A closed position as the analysis sees it: the singular value decomposition of D with rows of length one."""
+    """A closed position with the singular value decomposition of D with unit rows."""
 
     t: Time
     q: np.ndarray
@@ -141,12 +141,12 @@ class DensePosition(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """True if the rank is beyond doubt: near a singular configuration small residuals are large distances from closure."""
+        """True if the rank is certain: near a singular configuration, small residuals leave large errors of position."""
         return bool(np.all((self.sigma <= DEPENDENT_TOL * self.sigma[0]) | (self.sigma > CLEAR_TOL * self.sigma[0])))
 
     @property
     def smallest(self) -> float:
-        """The smallest singular value that counts, relative to the largest."""
+        """The smallest nonzero singular value, relative to the largest."""
         return float(self.sigma[self.rank - 1] / self.sigma[0])
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
@@ -156,12 +156,12 @@ class DensePosition(NamedTuple):
 
     @property
     def null_space(self) -> np.ndarray:
-        """The left null space of D: an orthonormal basis of the combinations of rows that vanish, (rows, redundant)."""
+        """An orthonormal basis of the left null space of D, (rows, redundant)."""
         return self.u[:, self.rank :]
 
 
 class KinematicRows(DenseRows):
-    """The rows of a mechanism with known numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
+    """The rows of a mechanism with concrete numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
 
     def __init__(self, mechanism: Mechanism):
         super().__init__(mechanism, concrete_scales(mechanism))
@@ -169,18 +169,18 @@ class KinematicRows(DenseRows):
         self.driver_time_step = driver_time_step(self.scales)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi, the lengths of the rows of D, and D with rows of length one, as solutions of consistent systems stay."""
+        """Return Psi, the lengths of the rows of D, and D with unit rows; scaling rows leaves consistent solutions unchanged."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
-        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
+        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rows of rounding errors stay small
         return self.psi(t, q), length, D / length[:, None]
 
     def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:
-        """Sets of rows that are decided about by themselves, and how each stands in the positions: here all rows are one."""
+        """Return independent sets of rows, each with its positions: here a single set of all rows."""
         return [(np.arange(self.count), positions)]
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> DensePosition | None:
-        """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
+        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
         q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         at_rest = np.zeros_like(q)

@@ -1,11 +1,11 @@
 """Uniqueness of multipliers by equilibrium alone (Wojtyra 2009), and the rank of the constraints in the scene's own units.
 
-lambda and lambda + N y give the same M a + Psi_q^T lambda = F for every y, where N spans the null space of Psi_q^T. So a number
-c^T lambda is the same for all of them, that is unique, if and only if c^T N = 0; of one multiplier, if its row of N is zero.
+If N spans the null space of Psi_q^T, lambda + N y satisfies M a + Psi_q^T lambda = F for every y as lambda does. So c^T lambda is
+unique if and only if c^T N = 0, and a single multiplier if its row of N is zero.
 
-Rank and null space are those of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (`Scales`): lengths in units
-of the characteristic one, angles in radians, each row in units of what moves it. Masses have no part in it. All functions are
-pure, and may be mapped over states (`jax.vmap`); without an `analysis` the scales are those of the mechanism.
+Rank and null space are those of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (`Scales`), with lengths in units
+of the characteristic length, angles in radians, and each row over its scale; masses do not enter. All functions are pure and may
+be mapped over states (`jax.vmap`); without an `analysis` the scales are those of the mechanism.
 """
 
 from typing import NamedTuple
@@ -21,31 +21,31 @@ from udkjax.equations.constraints import BodyArray
 from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
-# Relative to the largest singular value: the rank that decides what statics leaves open. That of motion, `RANK_TOL`, has to let
-# runs cross singular configurations, and is larger. At one, a residual of rounding, 1e-16, is a displacement of its root, 1e-8,
-# and so is the singular value that should vanish there: a hundred times that.
+# Rank tolerance of statics, relative to the largest singular value. The tolerance of motion, `RANK_TOL`, is larger because runs
+# have to cross singular configurations. There, a residual of rounding, 1e-16, is a displacement of its root, 1e-8, and the
+# singular value that should vanish is as large: the tolerance is a hundred times that.
 STATIC_RANK_TOL = 1e-6
-# The length of a row of N, whose columns are orthonormal: rounding leaves 1e-15 / STATIC_RANK_TOL at most.
+# Length up to which a row of N, whose columns are orthonormal, counts as zero: rounding leaves 1e-15 / STATIC_RANK_TOL at most.
 UNIQUE_TOL = 1e-6
 
 
 class Uniqueness(NamedTuple):
-    """Multipliers that are unique, the distance of the others from it, and the rank that was decided on the way."""
+    """Marks of unique multipliers, the degree of indeterminacy of each, and the rank."""
 
     unique: Bool[Array, "m"]
-    share: Float[Array, "m"]  # the length of each row of N, 0 (unique) to 1 (any number will do)
+    share: Float[Array, "m"]  # the length of each row of N, 0 (unique) to 1 (arbitrary)
     rank: Int[Array, ""]
 
 
 class LeftNullSpace(NamedTuple):
-    """N of the scaled rows, its columns orthonormal, (m, m): the columns beyond the nullity are zero."""
+    """N (m, m) of the scaled rows, with orthonormal columns; columns beyond the nullity are zero."""
 
     basis: Float[Array, "m m"]
     rank: Int[Array, ""]
 
 
 def scaled_jacobian(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None) -> Float[Array, "m n"]:
-    """Return J = diag(1 / rows) Psi_q diag(L, L, 1, ...), without a unit.
+    """Return the dimensionless J = diag(1 / rows) Psi_q diag(L, L, 1, ...).
 
     Args:
         mechanism: The scene.
@@ -61,7 +61,7 @@ def scaled_jacobian(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
 
 
 def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None) -> Float[Array, "k"]:
-    """Singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
+    """Return the singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
 
     Args:
         mechanism: The scene.
@@ -70,7 +70,7 @@ def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
         analysis: The mechanism's `Analysis`, for its scales; by default made here.
 
     Returns:
-        min(m, n) singular values, without a unit.
+        min(m, n) singular values, dimensionless.
     """
     J = scaled_jacobian(mechanism, t, q, analysis)
     return jnp.linalg.svd(J, compute_uv=False) if J.size else jnp.zeros(0)
@@ -79,7 +79,7 @@ def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
 def left_null_space(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> LeftNullSpace:
-    """Return N, J^T N = 0, its columns orthonormal; singular values up to `rank_tol` times the largest count as zero."""
+    """Return N, J^T N = 0, with orthonormal columns; singular values up to `rank_tol` times the largest count as zero."""
     J = scaled_jacobian(mechanism, t, q, analysis)
     rows, columns = J.shape
     if not J.size:
@@ -92,14 +92,14 @@ def left_null_space(
 def uniqueness(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> Uniqueness:
-    """Tell for each row of Psi whether its multiplier is unique: whether its row of N is zero.
+    """Find for each row of Psi whether its multiplier is unique, that is, whether its row of N is zero.
 
     Args:
         mechanism: its numbers may be traced.
         t: time (s).
         q: coordinates of a closed position, (bodies, 3) or flat.
         analysis: the mechanism's `Analysis`, for its scales; by default made here.
-        rank_tol: singular values of J up to so much of the largest count as zero.
+        rank_tol: singular values of J up to this fraction of the largest count as zero.
 
     Returns:
         `Uniqueness`, one entry for each row: joints in their order, then drivers.
@@ -113,9 +113,9 @@ def uniqueness(
 
 
 def unique_direction(null_rows: np.ndarray) -> float | None:
-    """Return the only direction (rad, 0 to pi) in which a force of two components is unique; None of one that all or none are.
+    """Return the only direction (rad, 0 to pi) in which a planar force is unique; None if all directions are, or none.
 
-    `null_rows` are the rows of N that belong to its components (2, k), in one unit.
+    `null_rows` are the rows of N of its components (2, k), in the same unit.
     """
     u, sigma, _ = np.linalg.svd(np.pad(null_rows, ((0, 0), (0, 2))))
     loose = int(np.sum(sigma > UNIQUE_TOL))

@@ -1,4 +1,4 @@
-"""Programs of a scene whose derivatives are taken: accelerations, Newton steps and the projection of a state."""
+"""The differentiable programs of a scene: accelerations, Newton steps and the projection of a state."""
 
 from collections.abc import Collection, Sequence
 from functools import cached_property
@@ -11,29 +11,29 @@ from udkjax.expressions import Scalar
 from udkjax.expressions.loop_derivative import REVERSE, TWICE, LoopDerivative
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, LoopProgram, Reset
 
-# Arrays that derivatives take as fixed. Sines and cosines are known functions of q to every kernel that reads them.
+# Arrays that are held fixed in derivatives. Kernels that read sines and cosines differentiate them as functions of q.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
 
-# Arrays of the second correction of a solution: the first has left no change of first order for it.
+# Arrays of the second correction of a solution, whose first-order changes vanish after the first.
 SETTLED = ("right2", "sum2", "y2", "x2")
 
 
 class DifferentiableProgram(NamedTuple):
-    """A program, and loops whose derivative is its own, with respect to all arrays but those `NOT_DIFFERENTIATED`.
+    """A program, and loops with the same derivative, with respect to all arrays except `NOT_DIFFERENTIATED`.
 
     No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations, and corrections such as q - C J^T x, are
 
         a = a_F + z,        z = C J^T x,        J C J^T x = b,
 
-    and along a change of the inputs, by the factors at hand,
+    and along a change of the inputs, with the same factors,
 
         dz = d(C J^T) x + C J^T dx,        J C J^T dx = db - dJ z - J d(C J^T) x.
 
-    The loops say so in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals vanish,
-    and with them whatever they multiply.
+    The loops express this in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals,
+    and hence all terms with residuals as factors, vanish.
 
-    Second derivatives are those of x corrected twice by the factors at hand, x + (J C J^T)^(-1) (b - J C J^T x): each correction
-    makes derivatives of one more order right.
+    Second derivatives are those of x after two corrections with the same factors, x + (J C J^T)^(-1) (b - J C J^T x): each
+    correction makes the derivatives of one more order exact.
     """
 
     program: LoopProgram
@@ -79,7 +79,7 @@ class DifferentiablePrograms:
 
     @cached_property
     def projection(self) -> DifferentiableProgram:
-        """q1 and v1, of a state on the manifold: where they are q and v."""
+        """q1 and v1 of a state on the manifold, where they equal q and v."""
         solver, terms = self._solver, self._solver.terms
         copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
         position = [*terms.element_terms(("psi",), "v", 1), *solver.solve(1), self._correction("q", 1)]
@@ -97,7 +97,7 @@ class DifferentiablePrograms:
         return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
 
     def _corrected(self, right: str, **names: str) -> ProgramParts:
-        """Compute x0, which is known and changes by what two corrections change by, and jt_x0."""
+        """Compute x0, whose value is given and whose derivatives are those of two corrections, and jt_x0."""
         terms, implicit = self._solver.terms, self._implicit_terms
         yield Reset("x0", 0, terms.layout.sizes["x0"])
         for solve in (1, 2):
@@ -123,13 +123,13 @@ class DifferentiablePrograms:
 
 
 class ImplicitTerms:
-    """Terms of Psi_q M^(-1) Psi_q^T x = b as functions of the state, with a solution that is known."""
+    """Terms of Psi_q M^(-1) Psi_q^T x = b as functions of the state at a given solution."""
 
     def __init__(self, terms: SceneTerms):
         self._terms = terms
 
     def residuals(self, output: str, v: str = "v") -> ProgramParts:
-        """Compute right1 = b - Psi_q z, and jt_x0 = Psi_q^T x0, as functions of all but z = M^(-1) Psi_q^T x0 and x0."""
+        """Compute right1 = b - Psi_q z and jt_x0 = Psi_q^T x0, with z = M^(-1) Psi_q^T x0 and x0 held fixed."""
         yield Reset("jt_x0", 0, self._terms.layout.coordinate_count)
         for group in self._terms.layout.eliminated:
 
@@ -163,7 +163,7 @@ class ImplicitTerms:
             yield self._terms.over_group(("difference", output), group, write, right=f"right{solve}", **names)
 
     def correct_solution(self, solve: int) -> ProgramParts:
-        """Compute x0 + x, with x of a linear system, in place of x0."""
+        """Replace x0 by x0 + x, with x of a linear system."""
         for group in self._terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

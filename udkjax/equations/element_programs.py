@@ -1,4 +1,4 @@
-"""Elements of equal structure as one program over scalars, which loops run for all of them (scene_programs.py)."""
+"""Elements of the same structure as one program over scalars, which loops run for each of them (scene_programs.py)."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -13,7 +13,7 @@ from udkjax.expressions import Graph, Scalar, frontier
 from udkjax.scene.mechanism import Mechanism
 
 POSITION_INPUTS, VELOCITY_INPUTS = ("x", "y", "angle"), ("vx", "vy", "omega")
-FREE_INPUTS = ("fx", "fy", "fangle")  # of a_F
+FREE_INPUTS = ("fx", "fy", "fangle")  # components of a_F
 
 
 class ElementPrograms:
@@ -40,7 +40,7 @@ class ElementPrograms:
         return found
 
     def _find_constants(self):
-        """Find the sines and cosines, which bodies share, and the constants, which depend on parameters alone."""
+        """Find the sines and cosines of the bodies' angles, and the constants, which depend only on parameters."""
         if has_pieces(jax.tree.unflatten(self.structure.tree, self.leaves)):
             self.outputs["piece"] = [trace_piece(self.graph, self.structure, self.leaves, self.t, self.q, self.v)]
         angles = {s.index: body for name, body, s in self.state if name == "angle"}
@@ -55,14 +55,14 @@ class ElementPrograms:
 
 
 class ConstraintPrograms(ElementPrograms):
-    """Outputs by rows: `psi_q`, 3 columns a body; `psi`, `psi_dot`, `gamma`, `b`."""
+    """Outputs by rows: `psi_q`, 3 columns for each body; `psi`, `psi_dot`, `gamma`, `b`."""
 
     def __init__(self, structure: ElementStructure, baumgarte: bool, loaded: bool):
         super().__init__(structure)
         graph = self.graph
         value, slopes, rate, gamma = differentiate_constraint(graph, structure, self.leaves, self.t, self.q, self.v)
         self.row_count = len(value)
-        # Without force elements every body falls freely.
+        # Without force elements a_F is gravity.
         self.gravity = [graph.input(name, "parameter") for name in ("gx", "gy")]
         falling = [*self.gravity, graph.constant(0.0)] * structure.body_count
         free = [s for k in range(structure.body_count) for s in self._inputs(FREE_INPUTS, k, "velocity")] if loaded else falling
@@ -79,7 +79,7 @@ class ConstraintPrograms(ElementPrograms):
 
 
 class ForcePrograms(ElementPrograms):
-    """Outputs: `loads`, 3 a body, and `potential`."""
+    """Outputs: `loads`, 3 for each body, and `potential`."""
 
     def __init__(self, structure: ElementStructure):
         super().__init__(structure)

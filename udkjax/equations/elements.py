@@ -1,11 +1,11 @@
 """One element, a constraint or a force, as scalars of a graph: traced once for all elements of the same structure.
 
-For a constraint with residual Psi(t, q) the graph gets, all by forward differentiation of the residual alone, along (1, v):
+For a constraint with residual Psi(t, q), forward differentiation of the residual along (1, v) gives
 
     Psi_dot = Psi_q v + Psi_t        gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt
 
-(or, where that is shorter, gamma from derivatives of the entries of Psi_q, which often are other entries of it)
-and Psi_q one column at a time, each along a unit vector whose zeros the graph folds away: a row is {column: scalar}.
+(or, if that is shorter, gamma from derivatives of the entries of Psi_q, which often are other entries of Psi_q), and along unit
+vectors, whose zeros the graph folds away, the columns of Psi_q: a row is {column: scalar}.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from udkjax.scene.bodies import GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 
-TraceFunction = Callable[..., list[np.ndarray]]  # of a traced function into a graph (`trace`)
+TraceFunction = Callable[..., list[np.ndarray]]  # evaluates a traced function in a graph (`trace`)
 
 
 def as_scalar(array: NumericArray) -> Scalar:
@@ -33,7 +33,7 @@ def as_scalar(array: NumericArray) -> Scalar:
 
 
 def _frames(ground: tuple[bool, ...], q: Sequence[Array], v: Sequence[Array] | None = None) -> list[Frame]:
-    """Make the frames of an element; the sine and cosine of a body are the same expressions for every element."""
+    """Make the frames of an element; all elements share the expressions of the sine and cosine of a body."""
     frames, k = [], 0
     for fixed in ground:
         if fixed:
@@ -69,7 +69,7 @@ def differentiate_constraint(
 
 
 def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
-    """Return (Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None where an opaque expression is in the way."""
+    """Return (Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None if an entry contains an opaque expression."""
     entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
     column = {s.index: j for j, s in enumerate(q)}
     total = []
@@ -86,7 +86,7 @@ def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: l
 
 
 def _choose_shorter(graph: Graph, known: list[SparseRow], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
-    """Return the one of two expressions of the same that takes fewer operations once the entries of the rows are known."""
+    """Return the one of two equal lists of expressions that takes fewer operations once the entries of the rows are computed."""
     if other is None:
         return one
     given = [entry for row in known for entry in row.values()]
@@ -104,14 +104,14 @@ def trace_force(
 
 
 def has_pieces(element: Element) -> bool:
-    """Return whether an element is smooth in pieces of the state, with a method `piece` of its own."""
+    """Return whether an element is piecewise smooth, that is, overrides the method `piece`."""
     return type(element).piece not in (Constraint.piece, ForceElement.piece)
 
 
 def trace_piece(
     graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
 ) -> Scalar:
-    """Return the number of the smooth piece in which an element is, on scalars."""
+    """Return the index of the smooth piece that contains the state of an element, on scalars."""
     (found,) = _trace_piece_number(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
     return as_scalar(found)
 
@@ -159,7 +159,7 @@ def _trace_residual(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...])
 
 @lru_cache(maxsize=256)
 def _trace_loads(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...]) -> tuple[TraceFunction, TraceFunction]:
-    """Trace a force element's generalized loads, -dV/dq of its potential plus what it states itself, and its potential."""
+    """Trace a force element's generalized loads, -dV/dq plus the result of its method `loads`, and its potential V."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))

@@ -1,7 +1,7 @@
-"""Quantities of the equations of motion at a state, each as one compiled program: what `udkjax.equations` offers to its users.
+"""Quantities of the equations of motion at a state, each compiled as one program: the public functions of `udkjax.equations`.
 
-Operation by operation each would be dozens of small ones. Inside the package the plain functions are called, within larger
-programs.
+Without compilation, JAX would dispatch dozens of operations one by one. Inside the package the plain functions are called within
+larger programs.
 """
 
 from collections.abc import Callable
@@ -22,12 +22,12 @@ Result = TypeVar("Result")
 
 
 def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a function of a mechanism and of numbers as one program for all mechanisms of a structure.
+    """Compile a function of a mechanism and of numbers once for all mechanisms of a structure.
 
-    It may be transformed like the function itself. Its `analysis`, if it takes one, is made before the numbers are traced.
+    The result can be transformed like the function itself. An `analysis` argument is computed before the numbers are traced.
 
     Args:
-        function: Its first argument is the `mechanism`; of the others, all but an `analysis` are numbers or arrays.
+        function: Its first argument is the `mechanism`; all others except `analysis` are numbers or arrays.
 
     Returns:
         A function with the same arguments and the same result.
@@ -43,7 +43,7 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
             found["analysis"] = analyse(mechanism)
         for name, value in found.items():
             if not isinstance(value, Mechanism | Analysis):
-                found[name] = jnp.asarray(value, jnp.result_type(float))  # a plain number would be part of the program
+                found[name] = jnp.asarray(value, jnp.result_type(float))  # a Python number would be static
         found["mechanism"] = mechanism.without_origin
         return program(*given.args, **given.kwargs)
 

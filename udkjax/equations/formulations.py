@@ -4,8 +4,8 @@ All of them solve, with A = Psi_q and c = gamma - 2 alpha Psi_dot - beta^2 Psi,
 
     M a + A^T lambda = F,        A a = c,
 
-and where the rows of A are independent they all find the same a. Where rows are redundant, and in singular configurations, they
-differ in what they need to get by, and in whether they do.
+and find the same a if the rows of A are independent. With redundant rows, and in singular configurations, they need different
+assumptions, and some of them fail.
 """
 
 from abc import abstractmethod
@@ -26,7 +26,7 @@ from udkjax.printing import PrintsLine
 
 
 class Formulation(PrintsLine):
-    """A method to find the accelerations of a system, for `simulate(..., formulation=...)`."""
+    """A way to compute the accelerations of a system, for `simulate(..., formulation=...)`."""
 
     @abstractmethod
     def formulate(self, equations: AbstractSystem) -> AbstractSystem:
@@ -34,7 +34,7 @@ class Formulation(PrintsLine):
 
 
 class PointwiseFormulation(Formulation):
-    """A formulation that solves for a at a given state, and changes nothing else."""
+    """A formulation that only changes how a is computed at a given state."""
 
     def formulate(self, equations: AbstractSystem) -> "FormulatedSystem":
         return FormulatedSystem(equations, self)
@@ -50,14 +50,13 @@ class Augmented(PointwiseFormulation):
         [ M  A^T ] [   a    ]   [ F ]
         [ A   0  ] [ lambda ] = [ c ].
 
-    Without a `method` by LU with partial pivoting, as is usual. Then the rows must be independent. Where they are not, the matrix
-    is singular, and LU does not notice: it divides by a pivot that is a rounding error. If that is exactly zero, as of a joint
-    that is given twice, nothing is a number, and a run ends at once with `Result.not_finite`. In the paper's linkage (rank 11 of
-    12) it depends on rounding whether it is. Where it is not, what the rows disagree by at a stage is divided by the pivot: steps
-    become ever smaller. With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are the solution of
-    minimum norm: redundant multipliers are shared, and the accelerations are right, also in singular configurations where the
-    right-hand side is consistent. Its default `rank_tol` is the square of the others': a singular value sigma of D = A M^(-1/2)
-    is one of about sigma^2 here.
+    By default solved by LU with partial pivoting, as is usual, which requires independent rows. With redundant rows the matrix is
+    singular, and LU divides by a pivot that is a rounding error. If the pivot is exactly zero, as for a duplicated joint, the
+    result is NaN and a run ends at once with `Result.not_finite`; in the paper's linkage (rank 11 of 12) rounding decides this.
+    If it is not, the inconsistency of the rows at a stage is divided by the pivot, and steps become ever smaller. With a
+    pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm: redundant
+    multipliers are shared, and the accelerations are right, also in singular configurations with a consistent right-hand side.
+    Its default `rank_tol` is the square of the usual one: a singular value sigma of D = A M^(-1/2) is about sigma^2 here.
 
     Args:
         method: a pseudoinverse, such as `SVD()`; None: LU with partial pivoting.
@@ -80,11 +79,11 @@ class NullSpaceQR(PointwiseFormulation):
 
         a_p = Q_1 R_1^(-T) c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
 
-    Q_1 has as many columns as A has independent rows: those that pivoting takes before the remainders fall to `rank_tol` of the
-    longest row. Redundant rows are left out; which ones may change with the position, and while they are satisfied that changes
-    nothing. So their drift does not grow by itself: the paper's linkage is right to 5e-9 after 20 s at 1e-9 without any
-    stabilization. In a singular configuration the rank falls and N gains a column: with `Projection` the run crosses, but where
-    the choice of rows jumps near it, in up to nine times the steps of `NullSpaceSVD`.
+    Q_1 has as many columns as A has independent rows: pivoting stops when the remainders fall to `rank_tol` of the longest row.
+    Redundant rows are left out; the choice may change with the position, which has no effect while they are satisfied. So drift
+    is not amplified: the paper's linkage is right to 5e-9 after 20 s at 1e-9 without any stabilization. In a singular
+    configuration the rank falls and N gains a column. With `Projection` the run crosses, but if the choice of rows changes near
+    it, in up to nine times the steps of `NullSpaceSVD`.
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
@@ -110,9 +109,9 @@ class NullSpaceSVD(PointwiseFormulation):
 
         a_p = V_1 S_1^(-1) U_1^T c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
 
-    Singular values up to `rank_tol` of the largest count as zero. Redundant rows that disagree are satisfied in the sense of
-    least squares, and so, not stabilized, their drift grows as it does with a truncated pseudoinverse: the paper's linkage is
-    lost after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses. It differs from the
+    Singular values up to `rank_tol` of the largest count as zero. Inconsistent redundant rows are satisfied in the sense of least
+    squares, so without stabilization their drift grows as it does with a truncated pseudoinverse: the paper's linkage is lost
+    after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses. It differs from the
     Udwadia-Kalaba equation by singular values in the metric of rank and least squares: A is not weighted by the masses.
 
     Args:
@@ -133,7 +132,7 @@ class NullSpaceSVD(PointwiseFormulation):
 
 
 def null_space_accelerations(M: Float[Array, "n n"], F: Vector, N: Float[Array, "n k"], a_p: Vector) -> Vector:
-    """Return a = a_p + N z with N^T M N z = N^T (F - M a_p), of independent columns of N; zero ones do not count."""
+    """Return a = a_p + N z with N^T M N z = N^T (F - M a_p); the nonzero columns of N are independent."""
     projected = N.T @ M @ N
     missing = jnp.all(N == 0, axis=0)
     z = jnp.linalg.solve(projected + jnp.diag(jnp.where(missing, 1.0, 0.0)), N.T @ (F - M @ a_p))
@@ -141,9 +140,9 @@ def null_space_accelerations(M: Float[Array, "n n"], F: Vector, N: Float[Array, 
 
 
 class WrappedSystem(AbstractSystem):
-    """Equations of motion around others, with the accelerations found in another way.
+    """Equations of motion that wrap others and compute the accelerations in another way.
 
-    At constant rank they are the same function, so their derivatives are those of the equations inside.
+    At constant rank both are the same function, so the derivatives are those of the wrapped equations.
     """
 
     equations: eqx.AbstractVar[AbstractSystem]
@@ -172,7 +171,7 @@ class WrappedSystem(AbstractSystem):
 
 
 class FormulatedSystem(WrappedSystem):
-    """A formulation for given states. Projection, and the rows that it leaves out, are those of the equations inside."""
+    """Accelerations by a formulation; projection, and the rows left out in it, are those of the wrapped equations."""
 
     equations: AbstractSystem
     formulation: PointwiseFormulation
@@ -189,7 +188,7 @@ class FormulatedSystem(WrappedSystem):
 
 @eqx.filter_custom_jvp
 def _accelerations(formulated: FormulatedSystem, t: Time, q: Vector, v: Vector) -> Vector:
-    """In the scene's own units, in which coordinates, rows and masses are of order one: thresholds of the rank are relative."""
+    """Solve in the scene's own units, in which coordinates, rows and masses are of order one: rank tolerances are relative."""
     M, F, A, c = formulated.matrices(t, q, v)
     scales = getattr(formulated.equations, "scales", None)
     if scales is None:

@@ -1,4 +1,4 @@
-"""A constrained system of the user's own, by the same equation: any coordinates and masses, nonholonomic rows too."""
+"""User-defined constrained systems by the same equation: any coordinates and masses, also nonholonomic rows."""
 
 from collections.abc import Callable
 
@@ -21,8 +21,8 @@ class ConstrainedSystem(PrintsLine):
 
     `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,),
     or is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
-    write them in jax.numpy. Numbers to be traced or differentiated belong into an equinox module whose methods these are.
-    `breakpoints` are the times (s) where force or constraints are not smooth. Simulate it from a `State` with q and v (n,).
+    write them in jax.numpy. To trace or differentiate numbers, keep them in an equinox module with these functions as methods.
+    Simulate it from a `State` with q and v (n,).
 
     Args:
         mass: q -> M (n, n).
@@ -40,9 +40,9 @@ class ConstrainedSystem(PrintsLine):
 
 
 class GeneralEquations(AbstractSystem):
-    """The equations of a `ConstrainedSystem` by one method, with the interface that the integrator knows from a mechanism's.
+    """The equations of a `ConstrainedSystem` by one method, with the interface of a mechanism's equations.
 
-    Rows of Psi come first, those of phi after them. With M = L L^T, D = A L^(-T) for the rows A = (Psi_q; phi_v):
+    The rows of Psi come first, then those of phi. With M = L L^T and D = A L^(-T) for the rows A = (Psi_q; phi_v):
     a = a_F + L^(-T) D^+ b, which is a_F + M^(-1/2) D^+ b in other coordinates of the same metric.
     """
 
@@ -59,7 +59,7 @@ class GeneralEquations(AbstractSystem):
         return jnp.zeros(0) if plus is None else -(plus.T @ (plus @ b))
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take two Newton steps in position and two in velocity, where phi need not be linear."""
+        """Take two Newton steps in position and two in velocity, as phi need not be linear."""
         for _ in range(2 if self.system.constraint is not None else 0):
             plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
             q = q - weight(plus @ self._psi(t, q))
@@ -118,7 +118,7 @@ class GeneralEquations(AbstractSystem):
         return free, weight, plus, c - slopes @ free
 
     def _plus(self, q: Vector, slopes: Float[Array, "m n"]) -> tuple[Plus, Callable[[Vector], Vector]]:
-        """D^+ and x -> L^(-T) x."""
+        """Return D^+ and x -> L^(-T) x."""
         L = jnp.linalg.cholesky(jnp.asarray(self.system.mass(q)))
         D = jax.scipy.linalg.solve_triangular(L, slopes.T, lower=True).T
         return self.method.plus(D), lambda x: jax.scipy.linalg.solve_triangular(L, x, lower=True, trans=1)
@@ -142,7 +142,7 @@ class GeneralEquations(AbstractSystem):
 
 
 def prepare_general(system: ConstrainedSystem, method: Pseudoinverse | None, baumgarte: Baumgarte | None) -> GeneralEquations:
-    """Choose a method on dense rows: nothing is known of their structure, so `Auto` is by singular values."""
+    """Choose a method on dense rows: their structure is unknown, so `Auto` is `SVD`."""
     method = SVD() if method is None or type(method) is Auto else method
     tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
     return GeneralEquations(system, eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None), baumgarte)

@@ -1,6 +1,6 @@
 """Masses, loads and energies of a mechanism: M, F, T and V (de Falco, Pennestri, Vita 2005, section 3).
 
-The functions are written as the paper has them, on arrays; JAX differentiates the potential energies of the force elements.
+The functions are written as in the paper, on arrays; JAX differentiates the potential energies of the force elements.
 t, q and v are those of constraints.py.
 """
 
@@ -42,7 +42,7 @@ def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
 
 @traced_once
 def force(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
-    """Return F, -V_q and the loads of force elements.
+    """Return F = -V_q + the loads of force elements.
 
     Args:
         mechanism: The scene.
@@ -77,7 +77,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyAr
         mechanism: The scene.
         t: Time (s).
         q: Coordinates (m, rad), (n,) or (bodies, 3).
-        v: Velocities, which the frames of force elements hold; V does not depend on them.
+        v: Velocities (m/s, rad/s), in the shape of q; V does not depend on them.
 
     Returns:
         V (J).
@@ -89,7 +89,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyAr
 
 @traced_once
 def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
-    """Return the sum of the loads that force elements return by their method `loads`, without those of potentials."""
+    """Return the sum of the loads that the method `loads` of force elements returns, without those of potentials."""
 
     time = jnp.asarray(t, jnp.result_type(float))
 

@@ -1,13 +1,13 @@
-"""Measures of a motion of a driven mechanism, such as torques, as expressions, with their derivatives by adjoint equations.
+"""Measures of the motion of a driven mechanism, such as torques, as expressions, with derivatives by adjoint equations.
 
-Along the value s of the driver, from Psi(x, s, q) = 0,
+With the value s of the driver, from Psi(x, s, q) = 0,
 
     F_1 = Psi_q u + Psi_s = 0,      u = dq/ds,
     F_2 = Psi_q w + D^2 Psi = 0,    w = d^2q/ds^2, D the derivative along (s, q) = (1, u),
-    F_3 = Psi_q^T y - b = 0,        b(x, s, q, u, w), such as M a - F, of which y are the forces of the joints.
+    F_3 = Psi_q^T y - b = 0,        b(x, s, q, u, w), such as M a - F, for which y are the joint forces.
 
 The derivatives of a measure g(x, s, q, u, w, y, d) are those of L = g - z_0 Psi - z_1 F_1 - z_2 F_2 - z_3 F_3 by x and s, with
-multipliers by which L does not change with y, w, u and q, one after another: each by one solution with Psi_q or its transpose.
+multipliers that make L stationary in y, w, u and q, in this order: each by one solution with Psi_q or its transpose.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ Scalars = Sequence[Scalar] | np.ndarray
 
 
 class MotionModel(NamedTuple):
-    """The functions of a motion, by JAX.
+    """The functions of a motion, written in JAX.
 
     Attributes:
         psi: Psi (m,) of x, s and q.
@@ -39,10 +39,10 @@ class MotionModel(NamedTuple):
 
 
 class MotionMeasures:
-    """The measures of a model in a graph: `values`, and by `slopes` their derivatives by s and x.
+    """The measures of a model in a graph: their `values`, and their derivatives by s and x, `slopes()`.
 
-    Everything is written first in a graph of its own, in which x, s, q, u, w, y and the multipliers are inputs, so that it can be
-    differentiated by each; then it is copied with what they are.
+    Everything is first written in a separate graph, with x, s, q, u, w, y and the multipliers as inputs, so that it can be
+    differentiated by each; then the expressions of these inputs are substituted.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class MotionMeasures:
         self._known |= {v.index: value for v, value in zip(variables, values, strict=True)}
 
     def _solved(self, rows: Sequence[Scalar], variables: np.ndarray) -> list[Scalar]:
-        """Return the values of variables for which rows vanish, which are Psi_q times them and more."""
+        """Return the values of variables for which rows, linear in them with coefficients Psi_q, vanish."""
         self._set(variables, [self._graph.constant(0.0)] * len(variables))
         return [-v for v in self._factors.solve(self._copy(rows))]
 
@@ -137,10 +137,10 @@ def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar |
 
 
 def _along(row: SparseRow, variables: Scalars, tangents: Scalars, zero: Scalar) -> Scalar:
-    """Return a row times tangents of some of its variables."""
+    """Return the product of a row of derivatives with the tangents of some variables."""
     return sum((row[v.index] * t for v, t in zip(variables, tangents, strict=True) if v.index in row), zero)
 
 
 def _column(moved: Differential, rows: Scalars, y: Scalars, variable: Scalar, zero: Scalar) -> Scalar:
-    """Return the derivative of rows times y by one variable."""
+    """Return the derivative of y^T rows by one variable."""
     return sum((moved.row(r)[variable.index] * k for r, k in zip(rows, y, strict=True) if variable.index in moved.row(r)), zero)

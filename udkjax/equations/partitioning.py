@@ -5,8 +5,8 @@ independent q_i and v_i as they are, the dependent ones follow from the constrai
 
     Psi(t, q_d, q_i) = 0 by Newton's method,        Psi_dot(t, q, v_d, v_i) = 0, which is linear in v_d,
 
-and the equations of motion are those along the columns of N, one for each independent coordinate: the motion that the mechanism
-makes when this one moves with rate one and the other independent ones stay.
+and the equations of motion are projected onto the columns of N, one for each independent coordinate: the velocities of the
+mechanism when this coordinate has rate one and the other independent ones rate zero.
 """
 
 import equinox as eqx
@@ -22,27 +22,25 @@ from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 
-PARTITION_NEWTON_STEPS = 10  # from the prediction of a step; three or four are usual
+PARTITION_NEWTON_STEPS = 10  # maximum, from the predicted state; three or four are usual
 
 
 class CoordinatePartitioning(Formulation):
-    """Integrate the independent coordinates and velocities alone; solve the constraints for the dependent ones at each stage.
+    """Integrate only the independent coordinates and velocities; solve the constraints for the dependent ones at each stage.
 
-    The choice is made at the start of every step, by QR of D with column pivoting, and held until the step's end: so it is never
-    worse conditioned than the mechanism is. Dependent coordinates are carried along only as the first guess of Newton's method:
-    they do not enter the error estimate. A stage at which Newton's method does not converge, or ends farther than 0.3 rad, or 0.3
-    of the characteristic length, from that guess, is not a number: the step is tried shorter. So the constraints hold wherever
-    the equations are evaluated. There is nothing for `Baumgarte` to feed back (refused), and nothing for `Projection` to do: with
-    it and without, a step ends with the dependent coordinates solved for.
+    The partition is chosen at the start of every step, by QR of D with column pivoting, and held for that step: it is never
+    worse conditioned than the mechanism. Dependent coordinates serve only as the initial guess of Newton's method and do not
+    enter the error estimate. If Newton's method does not converge at a stage, or ends farther than 0.3 rad, or 0.3 of the
+    characteristic length, from that guess, the stage is NaN and a shorter step is taken. So the constraints hold wherever the
+    equations are evaluated: `Baumgarte` is refused, and `Projection` changes nothing.
 
-    Redundant rows are satisfied in the sense of least squares. In a singular configuration, where less than `rank_tol` of the
-    longest column of D is left, there are more independent coordinates for a step, which the next ones constrain again: the
-    paper's linkage crosses (20 s at 1e-9 from each of the starts in tests/integrate/test_accuracy.py: errors up to 9e-7).
-    Mechanisms only, since the rows of a `ConstrainedSystem` may be nonholonomic.
+    Redundant rows are satisfied in the sense of least squares. In a singular configuration, where the remaining columns of D are
+    shorter than `rank_tol` times the longest, there are more independent coordinates for a step, which later steps constrain
+    again: the paper's linkage crosses (20 s at 1e-9 from each of the starts in tests/integrate/test_accuracy.py: errors up to
+    9e-7). Only for mechanisms, since the rows of a `ConstrainedSystem` may be nonholonomic.
 
     Args:
-        rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: that of D, less where
-            masses are far apart.
+        rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: `Scales.rank_tol`.
     """
 
     rank_tol: Float[Array, ""] | None = eqx.field(converter=number_called("rank_tol", optional=True), default=None)
@@ -52,8 +50,8 @@ class CoordinatePartitioning(Formulation):
             raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
         if equations.stabilized:
             raise ValueError(
-                "with CoordinatePartitioning the constraints hold at every stage: Baumgarte has nothing to feed back. "
-                "Take stabilization=None or Projection()"
+                "CoordinatePartitioning satisfies the constraints at every stage and takes no Baumgarte stabilization; "
+                "use stabilization=None or Projection()"
             )
         return PartitionedSystem(equations, self)
 
@@ -61,7 +59,7 @@ class CoordinatePartitioning(Formulation):
 class PartitionedSystem(WrappedSystem):
     """The equations of motion of the independent coordinates of a mechanism.
 
-    Without a partition fixed, it is chosen at each state anew.
+    Unless a partition is fixed, it is chosen anew at each state.
     """
 
     equations: MechanismSystem
@@ -69,14 +67,14 @@ class PartitionedSystem(WrappedSystem):
     dependent: Bool[Array, "n"] | None = None  # the dependent coordinates, if the partition is fixed
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
-        """Return a = a_p + N z at the state as it is."""
+        """Return a = a_p + N z at the state, without solving for dependent coordinates."""
         return _accelerations(self.fix_partition(t, q, v), t, q, v)
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return v and a at the state that the independent coordinates and velocities determine."""
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
-        # Farther from where the step predicts it, it might be another assembly of the mechanism: a shorter step is taken.
+        # Farther from the predicted state, the solution might be another assembly mode: NaN makes the step shorter.
         near = self.equations.size(closed - q) <= LONGEST_STEP
         return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
@@ -101,7 +99,7 @@ class PartitionedSystem(WrappedSystem):
 
     @property
     def dependent_columns(self) -> Bool[Array, "n"]:
-        """The partition; only for equations that have one (`fix_partition`)."""
+        """The dependent coordinates of the fixed partition."""
         if self.dependent is None:
             raise ValueError("no partition is fixed: call fix_partition first")
         return self.dependent
@@ -112,19 +110,19 @@ class PartitionedSystem(WrappedSystem):
         return self.equations.scales.rank_tol if given is None else given
 
     def _plus(self, D: Float[Array, "m n"]) -> Plus:
-        """D^+ of the dependent columns: zero for the others."""
+        """Return D^+ of the dependent columns, zero for the others."""
         return SVD(self._tol).plus(jnp.where(self.dependent_columns, D, 0))
 
 
-# Derivatives. Where the partition is fixed, Psi(t, q_d, q_i) = 0 makes q_d a function of the rest. One Newton step from a state
-# that is closed changes nothing but the tangents, and gives those of that function.
+# Derivatives. For a fixed partition, Psi(t, q_d, q_i) = 0 defines q_d as a function of t and q_i. One Newton step from a closed
+# state leaves the values and has the tangents of that function.
 
 
 @jax.custom_jvp
 def _solve_dependent(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     if not fixed.constrained:
         return q, v
-    tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # Newton's method squares it in the step that it does not take any more
+    tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # the error after this step is of the order of tol^2
 
     def goes_on(state):
         _, change, k = state
@@ -155,7 +153,7 @@ def _(primals, tangents):
 
 def _newton(fixed: PartitionedSystem, t: Time, q: Vector) -> Vector:
     D, psi, root = fixed.equations.weighted_rows(t, q)
-    return jnp.where(fixed.dependent_columns, q - root * (fixed._plus(D) @ psi), q)  # the rest stays to the bit
+    return jnp.where(fixed.dependent_columns, q - root * (fixed._plus(D) @ psi), q)  # independent coordinates stay bit for bit
 
 
 def _velocity(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> Vector:
@@ -178,6 +176,6 @@ def _accelerations(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> V
 
 @_accelerations.defjvp
 def _(primals, tangents):
-    """At constant rank the accelerations are those of the Udwadia-Kalaba equation."""
+    """Differentiate the Udwadia-Kalaba equation, which has the same accelerations at constant rank."""
     plain = lambda fixed, *state: fixed.equations.accelerations(*state)  # noqa: E731
     return _accelerations(*primals), jax.jvp(plain, primals, tangents)[1]

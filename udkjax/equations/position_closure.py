@@ -1,10 +1,10 @@
-"""The one loop that closes a mechanism: damped Gauss-Newton steps, on either array library and with either linear solver.
+"""The loop that closes a mechanism: damped Gauss-Newton steps, by NumPy or JAX and with a dense or sparse solver.
 
     q <- q - s W D^+ Psi,        D = Psi_q W,
 
 with W the metric (M^(-1/2) in assembly) and D^+ truncated for small scenes, damped for large, sparse ones. s limits the length
-of a step, so that the branch of the guess is kept, and is halved until the residual falls: no step makes a state worse. Numbers
-that are known are closed by NumPy: nothing is compiled for it. Numbers that are traced take the same steps in JAX.
+of a step, so that the branch of the guess is kept, and is halved until the residual falls: no step makes a state worse. Concrete
+numbers are closed by NumPy, without compilation; traced numbers take the same steps in JAX.
 """
 
 from collections.abc import Callable
@@ -21,21 +21,21 @@ from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.scales import Scales
 from udkjax.programs.control_flow import control_flow
 
-# Psi in units of the scene's scales, at or below which a position counts as closed. Rounding leaves 1e-15; a scene that cannot be
+# Largest Psi, in units of the scene's scales, at which a position counts as closed. Rounding leaves 1e-15; a scene that cannot be
 # closed leaves the error of its lengths.
 CLOSED_TOL = 1e-9
-ROUNDING_UNITS = 32.0  # of eps and of the largest coordinate: a residual below is rounding, and takes no step
-LONGEST_STEP = 0.3  # rad, and characteristic lengths: the longest change of a coordinate in one step, so that the branch stays
-CLOSURE_ITERATIONS = 40  # of Gauss-Newton: near a solution it doubles the digits, and five or six are usual
-PACE_STEPS = 4  # steps by which the pace of a closure is measured: see `try_to_close`
+ROUNDING_UNITS = 32.0  # multiple of eps and the largest coordinate; a smaller residual is rounding and takes no step
+LONGEST_STEP = 0.3  # largest change of a coordinate in one step, in rad or characteristic lengths, to stay on the branch
+CLOSURE_ITERATIONS = 40  # maximum of Gauss-Newton steps; five or six are usual, as convergence is quadratic near a solution
+PACE_STEPS = 4  # steps over which the rate of convergence is measured: see `try_to_close`
 VELOCITIES = 2  # corrections of v: the second removes the rounding errors of the first
-STEP_HALVINGS = 12  # of one step: 2^-12 of it has to lower the residual, or the position cannot be closed
+STEP_HALVINGS = 12  # maximum for one step: if 2^-12 of it does not lower the residual, the position cannot be closed
 
 Assembly = tuple[AnyArray, AnyArray, AnyArray, AnyArray, ArrayLike]  # q, v, Psi, Psi_dot and the rank of D
 
 
 class Rows(Protocol[AnyArray]):
-    """The rows of Psi, as the loop that closes a mechanism evaluates them."""
+    """The rows of Psi as functions for closing a mechanism."""
 
     @property
     def scales(self) -> Scales:
@@ -52,12 +52,12 @@ class Rows(Protocol[AnyArray]):
 
 
 def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return the residual that rounding errors of the coordinates leave."""
+    """Return the residual that rounding of the coordinates causes."""
     return ROUNDING_UNITS * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
 
 
 def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return whether Psi and Psi_dot are within `CLOSED_TOL` of the scene's scales, or rounding."""
+    """Return whether Psi and Psi_dot are within `CLOSED_TOL` in units of the scene's scales, or at rounding level."""
     open_by = xp.maximum(CLOSED_TOL, rounding(scales, q, xp))
     rate = xp.maximum(scales.rate, scales.size(v, xp))
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)
@@ -71,7 +71,7 @@ def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -
 
 
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
-    """Take one step, halved until the residual falls; return whether it does. A residual of rounding takes no step."""
+    """Take one step, halved until the residual falls; return whether it does. A residual at rounding level takes no step."""
     step = limited_step(rows, t, q, xp)
     fixed, current, fixed_step = (rows, q, step) if xp is np else jax.lax.stop_gradient((rows, q, step))
     size = xp.linalg.norm(fixed.residual(t, current))
@@ -87,7 +87,7 @@ def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = j
 
 
 def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-    """Take steps until the residual is rounding, or no step makes it smaller."""
+    """Take steps until the residual is at rounding level, or no step lowers it."""
 
     def goes_on(state: tuple[AnyArray, Any, int]) -> ArrayLike:
         _, improves, k = state
@@ -101,10 +101,10 @@ def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary 
 
 
 def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
-    """Close a position that may not exist, by NumPy: give up where at the present pace the steps that are left do not suffice.
+    """Close a position that may not exist, by NumPy: give up when the remaining steps do not suffice at the present rate.
 
-    The last steps of a closure that succeeds are its fastest. Where drivers ask for the impossible, the residual falls by ever
-    less, but does fall, up to the last step.
+    A successful closure converges fastest in its last steps. If the position does not exist, the residual falls ever more slowly,
+    but up to the last step.
     """
     sizes, improves = [float(np.linalg.norm(rows.residual(t, q)))], True
     while improves and len(sizes) <= CLOSURE_ITERATIONS:
@@ -117,12 +117,12 @@ def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
 
 
 def driver_time_step(scales: Scales) -> float:
-    """Return the time (s) by which drivers move on from one position to the next: they turn about as far as the random motion."""
+    """Return the time (s) between positions of the random motion, in which drivers move about as far as the other coordinates."""
     return LONGEST_STEP / float(scales.rate) if scales.rate > 0.0 else 0.0
 
 
 class TracedRows(NamedTuple):
-    """The rows of the equations of motion of a mechanism with traced numbers."""
+    """The `Rows` of a mechanism with traced numbers, by its equations of motion."""
 
     equations: MechanismSystem
 
@@ -138,7 +138,7 @@ class TracedRows(NamedTuple):
         return -root * (plus @ psi)
 
     def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
-        """Return q closed by `close`, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
+        """Return q closed by `close`, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
         if not self.equations.constrained:
             return q, v, *self.equations.violation(t, q, v), 0
         q, rank = close(self, t, q), 0

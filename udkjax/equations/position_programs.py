@@ -1,12 +1,12 @@
-"""The positions of a driven mechanism as programs of its free numbers: for whole batches of mechanisms in machine code.
+"""The positions of a driven mechanism as programs of its free numbers, for batches of mechanisms in machine code.
 
-A model gives Psi(x, s, q), the free numbers x and the driver's value s, and measures g(x, s, q, d) of a position, with data d.
+A model gives Psi(x, s, q), with free numbers x and the driver's value s, and measures g(x, s, q, d) of a position, with data d.
 At Psi = 0, by one elimination of Psi_q (expressions/elimination.py),
 
     q <- q - Psi_q^+ Psi,      dq/ds = -Psi_q^+ Psi_s,      dq/dx = -Psi_q^+ Psi_x,
     dg/dx = g_x - y^T Psi_x,   dg/ds = g_s - y^T Psi_s,     Psi_q^T y = g_q^T.
 
-Numbers that depend on x alone are computed once a mechanism: the `constants`.
+The `constants`, which depend only on x, are computed once for each mechanism.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ TracedModel = Callable[..., list[np.ndarray]]
 
 
 class Sizes(NamedTuple):
-    """The counts of numbers that a model takes and gives."""
+    """The sizes of the inputs and outputs of a model."""
 
     parameters: int  # x
     coordinates: int  # q
@@ -35,7 +35,7 @@ class Sizes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The places of a measure, its derivative by s and its first derivative by x among the outputs."""
+    """The indices of a measure, its derivative by s and its derivatives by x among the outputs."""
 
     value: int
     by_value: int
@@ -46,19 +46,19 @@ class PositionPrograms:
     """Programs of a driven mechanism.
 
     Args:
-        model: A model, traced by `trace_model`: `model(x, s, q, d)` returns "psi" (m,), "q0" (n,) and "s0" (), a closed
-            position of the numbers x and the value there, and "measures" (G,), by JAX.
+        model: A model, traced by `trace_model`: `model(x, s, q, d)`, written in JAX, returns "psi" (m,), "q0" (n,) and "s0" (), a
+            closed position for the numbers x and its value s, and "measures" (G,).
         parameters: The number of free numbers x.
         coordinates: The number n of coordinates.
         data: The number of data d of a position.
         transmission: Whether the last measure is the transmission of the position: det(B) over the product of the lengths of
-            its columns, where B is what known numbers leave of Psi_q. Of a four-bar it is the sine of the transmission angle;
-            it vanishes, and changes its sign, where branches meet.
+            its columns, where B is Psi_q after elimination of its constant entries. For a four-bar it is the sine of the
+            transmission angle; it vanishes, and changes its sign, where branches meet.
         positions: Whether the first n measures are q itself.
         derivatives: Whether measures have derivatives.
-        rows: The scales of the m rows of Psi, by which what redundant rows leave is judged; by default one.
-        chosen: Chosen measures of the model; by default all.
-        motion: Measures of the motion, after those of the position.
+        rows: The scales of the m rows of Psi, relative to which residuals of redundant rows are measured; by default one.
+        chosen: Selected measures of the model; by default all.
+        motion: Measures of the motion, appended to those of the position.
 
     Raises:
         ValueError: The positions do not follow from the driver's value.
@@ -111,13 +111,13 @@ class PositionPrograms:
         self.constant_count = len(constants)
         state = [*constants, self._s, *self._q]
         self.prologue = ScalarProgram(self._graph, self._x, [*constants, *self._q0, self._s0])
-        """x; the constants, q0 and s0."""
+        """From x: the constants, q0 and s0."""
         self.drawn_value = ScalarProgram(self._graph, self._x, [self._s0])
-        """x; s0."""
+        """From x: s0."""
         self.newton = ScalarProgram(self._graph, state, newton)
-        """The constants, s and q; q after a Newton step, dq/ds, what changes its sign where branches meet, and the violation."""
+        """From the constants, s and q: q after a Newton step, dq/ds, the sign of the branch (`_sign`), and the violation."""
         self.measure = ScalarProgram(self._graph, [*state, *self._d], outputs)
-        """The constants, s, q and d; the outputs."""
+        """From the constants, s, q and d: the outputs."""
 
     def _outputs(self, derivatives: bool) -> list[Scalar]:
         of_motion = self._motion.values if self._motion else []
@@ -128,7 +128,7 @@ class PositionPrograms:
         return [x for value, slope in zip(values, slopes, strict=True) for x in (value, *slope)]
 
     def _slopes(self) -> list[list[Scalar]]:
-        """Return the derivatives of measures by s and x: by as many solutions as there are measures, or as there are numbers."""
+        """Return the derivatives of measures by s and x, by one solution for each measure or, if fewer, each number."""
         graph, moved = self._graph, [self._s, *self._x]
         differential = Differential(graph, self._measures, [*moved, *self._q])
         zero = graph.constant(0.0)
@@ -147,7 +147,7 @@ class PositionPrograms:
         return [*found[:place], *(self._motion.slopes() if self._motion else []), *found[place:]]
 
     def _column(self, variable: Scalar) -> list[Scalar]:
-        """Return the derivatives of Psi by one number."""
+        """Return the derivatives of Psi by one variable."""
         zero = self._graph.constant(0.0)
         return [self._differential.row(r).get(variable.index, zero) for r in self._psi]
 
@@ -156,7 +156,7 @@ class PositionPrograms:
         return len(self._factors.block) == len(self._factors.open_columns)
 
     def _violation(self) -> Scalar:
-        """Return the sum of squares of Psi, each row over its scale; zero where no row is redundant: then steps say it all."""
+        """Return the sum of squares of Psi, each row over its scale; zero without redundant rows: Newton steps then suffice."""
         zero = self._graph.constant(0.0)
         if self._is_square:
             return zero
@@ -164,7 +164,7 @@ class PositionPrograms:
         return _dot(rows, rows, zero)
 
     def _sign(self) -> Scalar:
-        """Return the determinant of B where it is square: what changes its sign where branches meet; one otherwise."""
+        """Return the determinant of B, which changes its sign where branches meet; one if B is not square."""
         R, found = self._factors.triangle, self._graph.constant(1.0)
         if not self._is_square:
             return found
@@ -173,7 +173,7 @@ class PositionPrograms:
         return found
 
     def _find_transmission(self) -> tuple[Scalar, list[Scalar]]:
-        """Transmission tau, and its partial derivatives by s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
+        """Return the transmission tau and its derivatives by s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
         graph, factors = self._graph, self._factors
         B, R, count = factors.block, factors.triangle, len(factors.open_columns)
         zero, tau = graph.constant(0.0), graph.constant(1.0)
@@ -192,7 +192,7 @@ class PositionPrograms:
 
 
 def trace_model(model: Model, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
-    """Trace a model once, for any number of programs; the arguments are those of `PositionPrograms`."""
+    """Trace a model for any number of programs; the arguments are those of `PositionPrograms`."""
     examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
     return trace(lambda *given: [model(*given)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
 

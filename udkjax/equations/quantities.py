@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 @prints_table
 class Energy(NamedTuple):
-    """Energies (J) at each time. Potential: of gravity, zero at the origin, and of the force elements that have one."""
+    """Energies (J) at each time; the potential energy is that of gravity, zero at the origin, and of force elements."""
 
     kinetic: Float[Array, "T"]
     potential: Float[Array, "T"]
@@ -104,17 +104,17 @@ def accelerations(
     formulation: Formulation | None = None,
     analysis: Analysis | None = None,
 ) -> Float[Array, "bodies 3"] | tuple[Float[Array, "bodies 3"], Float[Array, "m"]]:
-    """Return a = a_F + M^(-1/2) D^+ b, and lambda = -(D^+)^T D^+ b where asked for. The state need not be closed.
+    """Return a = a_F + M^(-1/2) D^+ b, and on request lambda = -(D^+)^T D^+ b. The state need not be closed.
 
     Args:
         mechanism: The mechanism, or a `ConstrainedSystem`.
         t: Time (s).
-        q: Coordinates (m, rad), (bodies, 3); of a `ConstrainedSystem` (n,), and so are v and a.
+        q: Coordinates (m, rad), (bodies, 3); for a `ConstrainedSystem`, q, v and a are (n,).
         v: Velocities (m/s, rad/s), in the shape of q.
-        method: The pseudoinverse; `Auto`, the default, takes singular values.
+        method: The pseudoinverse; by default `Auto`, which is `SVD` here.
         stabilization: `Baumgarte`, or None.
-        multipliers: Whether to return lambda, too.
-        formulation: Another formulation, which finds a but not lambda; None: the Udwadia-Kalaba equation.
+        multipliers: Whether to return lambda as well.
+        formulation: Another formulation, which gives a but not lambda; None: the Udwadia-Kalaba equation.
         analysis: The mechanism's `Analysis`; by default made here.
 
     Returns:
@@ -164,11 +164,11 @@ def efforts(
     Args:
         mechanism: The scene.
         solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
-        method: Decides the rank; by default `SVD`. Where a driver is redundant, the share of least norm is returned.
-        stabilization: The run's `Baumgarte`, to include what it adds.
+        method: The pseudoinverse; by default `SVD`. A redundant driver gets its part of the minimum-norm multipliers.
+        stabilization: The run's `Baumgarte`, to include its terms.
 
     Returns:
-        By driver a torque (N m) along an angle, a force (N) along a length (T,); not a number where the states are not.
+        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are.
     """
     if not mechanism.driver_names:
         return {}
@@ -179,7 +179,7 @@ def efforts(
     return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
 
 
-# Functions of their own: what is compiled for one call serves the next.
+# Top-level functions, so that compiled programs are reused by later calls.
 
 
 @deferred
@@ -193,7 +193,7 @@ def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation,
 def _multipliers(mechanism, analysis, ts, q, v, method, baumgarte):
     equations, finite = equations_of(mechanism, method, baumgarte, analysis=analysis), jnp.isfinite(q) & jnp.isfinite(v)
     reached = jnp.all(finite, axis=(1, 2))
-    # Where a run has failed the guess stands in, for the sake of the derivatives elsewhere.
+    # After a run has failed its states are replaced by the guess, as NaN would spoil the derivatives of the others.
     q, v = (jnp.where(reached[:, None, None], x, x0).reshape(len(ts), -1) for x, x0 in ((q, mechanism.q0), (v, mechanism.v0)))
     return jnp.where(reached[:, None], jax.vmap(equations.multipliers)(ts, q, v), jnp.nan)
 

@@ -1,14 +1,14 @@
-"""Loads of joints on their bodies, -Psi_q^T lambda: in chosen axes, about a chosen point, by a chosen split.
+"""Loads of joints on their bodies, -Psi_q^T lambda: in chosen axes, about a chosen point, with a chosen rule for sharing.
 
-Of redundant constraints only some components are decided by equilibrium (determinacy.py). How the others are shared takes an
-assumption: by default the least norm, each row in units of its scale; or, with the compliances c of joints (m/N, rad/(N m)),
-the least elastic energy,
+With redundant constraints, equilibrium determines only some components (determinacy.py). The others take an assumption: by
+default the least norm, each row in units of its scale; or, with the compliances c of joints (m/N, rad/(N m)), the least elastic
+energy,
 
     minimize sum(c_i lambda_i^2) / 2  over all lambda with M a + Psi_q^T lambda = F,
 
-what bodies that are stiff beside their joints do. With mu = lambda / w in units of the rows, P = I - D D^+ the projector on the
-null space of D^T, and K = diag(w c w), the minimum over mu + P z is at z = -(P K P)^+ P K mu. Joints of no compliance carry what
-the others leave; shares still open among these alone are those of least norm.
+which holds for bodies that are stiff compared with their joints. With mu = lambda / w in units of the rows, P = I - D D^+ the
+projector on the null space of D^T, and K = diag(w c w), the minimum over mu + P z is at z = -(P K P)^+ P K mu. Among joints
+without compliance, loads that remain undetermined are those of least norm.
 """
 
 from collections.abc import Callable, Mapping
@@ -39,9 +39,9 @@ from udkjax.wording import quote, suggestion
 
 Axes = Literal["ground", "body", "joint"]
 About = Literal["centre", "joint"]
-ByBody = dict[str, dict[str, Array]]  # of a joint or driver, of a body
+ByBody = dict[str, dict[str, Array]]  # by joint or driver, then by body
 
-# Of P K P relative to its largest eigenvalue: joints that are stiffer than the softest by more count as rigid.
+# Threshold for eigenvalues of P K P, relative to the largest: joints that are stiffer than the softest by more count as rigid.
 COMPLIANCE_TOL = 1e-10
 
 
@@ -60,22 +60,22 @@ def reactions(
     Args:
         mechanism: the mechanism.
         solution: anything with ts (T,), q and v (T, bodies, 3).
-        method: decides the rank; by default `SVD`.
-        stabilization: the run's `Baumgarte`, to include what it adds.
-        frame: the axes of the force. "ground"; "body": those of the body that is loaded; "joint": along x the `axis` of a
-            prismatic joint, slot, rack or driver of x or y, or the line of a distance; of all others the axes of the last body
-            that they hold.
-        about: the point of the torque: the "centre" of mass, or the "joint": the pin that two bodies share (in a slot or a
-            prismatic joint body 2's point), each body's own of a distance; without points the centre of mass.
-        compliances: of joints by their names, one number a row (m/N for rows in metres, rad/(N m) for rows in radians), or one
-            for both of a revolute. Redundant forces are shared with the least elastic energy; a joint without one is rigid.
+        method: the pseudoinverse; by default `SVD`.
+        stabilization: the run's `Baumgarte`, to include its terms.
+        frame: the axes of the force. "ground"; "body": those of the loaded body; "joint": x along the `axis` of a prismatic
+            joint, slot, rack or driver of x or y, or along the line of a distance; for all others the axes of the last body of
+            the joint.
+        about: the reference point of the torque: the "centre" of mass, or the "joint": the pin that two bodies share (in a slot
+            or prismatic joint the point of body 2), each body's own point for a distance; without points the centre of mass.
+        compliances: compliances by joint name, one for each row (m/N for rows in metres, rad/(N m) for rows in radians), or one
+            for both rows of a revolute. Redundant forces are shared with the least elastic energy; all other joints are rigid.
 
     Returns:
-        The load (T, 3): force x, force y (N) and torque (N m), -Psi_q^T lambda of the constraint's rows. Of redundant constraints
-        it is one of many, the others differ in what `unique_reactions` says; the accelerations do not depend on it.
+        The load (T, 3): force x, force y (N) and torque (N m), -Psi_q^T lambda of the constraint's rows. With redundant
+        constraints only the components marked by `unique_reactions` are determined; the accelerations are always unique.
 
     Raises:
-        ValueError: a compliance of a joint that does not exist, negative, or not one for each row.
+        ValueError: a compliance is negative, is for an unknown joint, or the number of compliances of a joint is wrong.
     """
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
@@ -91,17 +91,16 @@ def unique_reactions(
     about: About = "centre",
     rank_tol: NumberLike = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
-    """Decide the components of `reactions` that equilibrium alone determines: those with c^T N = 0.
+    """Mark the components of `reactions` that equilibrium determines, c^T lambda with c^T N = 0.
 
-    A component is c^T lambda, and N the null space of Psi_q^T: a unique component does not depend on how redundant forces are
-    shared.
+    N spans the null space of Psi_q^T: these components do not depend on how redundant forces are shared.
 
     Args:
         mechanism: The scene.
         solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
         frame: The axes of the force, as in `reactions`.
         about: The point of the torque, as in `reactions`.
-        rank_tol: Singular values up to so much of the largest count as zero, as in `uniqueness`.
+        rank_tol: Singular values up to this fraction of the largest count as zero, as in `uniqueness`.
 
     Returns:
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
@@ -112,7 +111,7 @@ def unique_reactions(
 
 
 def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:
-    """Return values under the names of their constraints and bodies; in order, which a dictionary loses under `jit`."""
+    """Return values by the names of their constraints and bodies, in order, which dictionaries lose under `jit`."""
     bodies = {name: dict.fromkeys(mechanism.frames_of(element)) for name, element in mechanism.constraints.items()}
     return {
         name: dict(zip([body for body in bodies[name] if body != GROUND], own, strict=True))
@@ -129,7 +128,7 @@ def _split_by_body(
     frame: Axes,
     about: About,
 ) -> ByBody:
-    """Split the loads of rows by joints and bodies, (rows, T, 3) each, in other axes and about another point."""
+    """Split the loads of rows by joint and body, (rows, T, 3) each, in the chosen axes and about the chosen point."""
     places = {name: k for k, name in enumerate(mechanism.body_names)}
     seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: GROUND_FRAME}
     found: ByBody = {}
@@ -150,7 +149,7 @@ def _split_by_body(
 
 
 def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Number) -> Float[Array, "... 3"]:
-    """Return a load about a centre of mass, in ground axes, about another point and in axes at an `angle` (rad) to these."""
+    """Transform a load about a centre of mass in ground axes to another point and to axes at an `angle` (rad)."""
     fx, fy, torque = load[..., 0], load[..., 1], load[..., 2]
     if point is not None:
         torque = torque - (point.x - body.x) * fy + (point.y - body.y) * fx
@@ -164,7 +163,7 @@ def _frame(q: Float[Array, "T n"], place: int) -> Frame:
 
 
 def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
-    """Return the angle (rad) of a joint's own axes to the ground."""
+    """Return the angle (rad) of a joint's own axes relative to the ground."""
     if isinstance(element, Prismatic | Slot | Rack):
         return frames[0].angle + element.axis
     if isinstance(element, Driver) and element.coordinate in ("x", "y"):
@@ -181,7 +180,7 @@ def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | No
     if points is None or (isinstance(element, Driver) and element.coordinate == "angle"):
         return None
     has_two_points = isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance")
-    holder = k if has_two_points else len(points) - 1  # of a slot, the pin
+    holder = k if has_two_points else len(points) - 1  # for a slot, the pin
     return frames[holder].point(points[holder])
 
 
@@ -194,9 +193,9 @@ def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, NumberLike]
             raise ValueError(f"compliances: no joint named {quote(name)}{suggestion(name, known)}")
         shape, alike = np.shape(given), isinstance(known[name], Revolute) or counts[name] == 1
         if shape != (counts[name],) and not (shape == () and alike):
-            raise ValueError(f"compliances: {quote(name)} takes {counts[name]} numbers, one for each of its rows, not {given!r}")
+            raise ValueError(f"compliances: {quote(name)} takes {counts[name]} numbers, one for each row, not {given!r}")
         if not isinstance(given, Tracer) and not np.all(np.asarray(given) >= 0):
-            raise ValueError(f"compliances: those of {quote(name)} must not be negative, as {given!r}")
+            raise ValueError(f"compliances: {quote(name)} has a negative compliance: {given!r}")
     rows = [jnp.broadcast_to(jnp.asarray(compliances.get(name, 0.0), float), (count,)) for name, count in counts.items()]
     return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
@@ -209,7 +208,7 @@ def _states(solution: HistoryLike) -> tuple[Array, Array, Array]:
 def split_by_compliance(
     mechanism: Mechanism, t: Time, q: Array, multipliers: Float[Array, "m"], soft: Float[Array, "m"], w: Float[Array, "m"]
 ) -> Float[Array, "m"]:
-    """Return the multipliers of the least elastic energy among all that do the same; `w` are the weights of rows."""
+    """Return the equivalent multipliers of least elastic energy; `w` are the weights of the rows."""
     if not len(soft):
         return multipliers
     D = uk.D(mechanism, t, q, w)
@@ -238,17 +237,17 @@ def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about)
 
 @deferred
 def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
-    """Return whether equilibrium determines each component of `_loads`, by Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
+    """Return whether equilibrium determines each component of `_loads`, from Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
 
     def one(t, q):
         return psi_q(mechanism, t, q), left_null_space(mechanism, t, q, analysis, rank_tol).basis
 
     Psi_q, N = jax.vmap(one)(ts, q)
     rows = [name for name, _ in analysis.row_names]
-    unit = jnp.stack([1.0, 1.0, analysis.length])  # of a force, and of a torque in forces
+    unit = jnp.stack([1.0, 1.0, analysis.length])  # units of the components: a torque over the length is a force
 
     def unique(part: Array, N: Array) -> Array:
-        """Of a component's map c (rows, T, 3) and the rows (T, rows, m) of N that it has: whether c^T N = 0."""
+        """Return whether c^T N = 0, from the coefficients c (rows, T, 3) of a component and its rows (T, rows, m) of N."""
         size = jnp.max(jnp.linalg.norm(part, axis=0) / unit, axis=-1, keepdims=True)
         return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", part, N), axis=-1) <= UNIQUE_TOL * unit * size
 

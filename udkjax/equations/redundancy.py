@@ -1,11 +1,11 @@
-"""Redundant rows of Psi, which `analyse` finds once, so that no run computes them.
+"""Redundant rows of Psi, which `analyse` finds once for all runs.
 
-Redundancy is a matter of numbers (three equal cranks), not of topology alone, and a single position does not show it: at a
-singular configuration more rows are dependent than elsewhere. So the mechanism is closed and led along a random motion, and rows
-are chosen whose absence never makes the others dependent. For a left null space N of D (N^T D = 0), the rows outside S are
-independent exactly where N[S] is invertible: of an x and a y row that depend on each other as cos and sin of an angle, the one is
-the right choice where the other vanishes, and the motion tells which. All of it is NumPy on the graph's programs: nothing is
-compiled for it.
+Redundancy depends on numbers (three equal cranks) as well as on topology, and a single position does not show it: in a singular
+configuration more rows are dependent than elsewhere. So the mechanism is closed and moved along a random motion, and rows are
+chosen without which the others stay independent. For a left null space N of D (N^T D = 0), the rows outside S are independent
+exactly where N[S] is invertible: if an x row and a y row depend on each other with coefficients cos and sin of an angle, one is
+the right choice where the other coefficient vanishes, and the motion shows which. Everything is NumPy on the scene's programs,
+without compilation.
 """
 
 from collections.abc import Sequence
@@ -20,21 +20,21 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
 
-POSITION_SAMPLES = 24  # positions of the random motion, where the first one shows rows that depend on each other
-FEWER_SAMPLES_FROM = 300  # rows of Psi: a scene of more takes a third of the positions, each of which takes long
-FAILURES = 3  # positions in a row that cannot be closed: drivers ask for the impossible, and will go on to do so
-CREEP = 1e-3  # of the drivers' step in time, where they ask for it from the first on: contradictions of drivers stay impossible
-HEADING_NOISE = 0.3  # share of the direction of the random motion that is new at each position
-ORDINARY_TOL = 0.05  # of the largest singular value: a position whose smallest one is above decides on the rows
+POSITION_SAMPLES = 24  # positions of the random motion, if the first one has dependent rows
+MANY_ROWS = 300  # rows of Psi above which a third of the positions is used, as each takes long
+FAILURES = 3  # successive positions that cannot be closed, after which the drivers are taken to be contradictory
+CREEP = 1e-3  # fraction of the drivers' time step for another try if already the first positions cannot be closed
+HEADING_NOISE = 0.3  # fraction of the direction of the random motion that is new at each position
+GENERIC_TOL = 0.05  # smallest singular value, relative to the largest, of positions that are used to choose rows
 
 
 def dense(matrix: Any) -> np.ndarray:
-    """Return a matrix of NumPy or of SciPy as one of NumPy."""
+    """Return a matrix of NumPy or SciPy as a NumPy array."""
     return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
 class ClosedPosition(Protocol):
-    """A closed position, with the rank of D there: a `DensePosition` or a `SparsePosition`."""
+    """A closed position and its rank of D: a `DensePosition` or a `SparsePosition`."""
 
     @property
     def q(self) -> np.ndarray:
@@ -48,7 +48,7 @@ class ClosedPosition(Protocol):
 
     @property
     def is_clear(self) -> bool:
-        """True if the rank is beyond doubt."""
+        """True if the rank is certain."""
         ...
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ Position = TypeVar("Position", bound=ClosedPosition)
 
 
 class PositionRows(Protocol[Position]):
-    """Psi and D of a mechanism with known numbers: `KinematicRows` or `SparseRows`."""
+    """Psi and D of a mechanism with concrete numbers: `KinematicRows` or `SparseRows`."""
 
     count: int
     size: int
@@ -70,7 +70,7 @@ class PositionRows(Protocol[Position]):
     driver_time_step: float
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Return Psi, the lengths of the rows of D, and D with rows of length one."""
+        """Return Psi, the lengths of the rows of D, and D with unit rows."""
         ...
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
@@ -82,17 +82,17 @@ class PositionRows(Protocol[Position]):
         ...
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> Position | None:
-        """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
+        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
         ...
 
     def split_rows(self, positions: list[Position]) -> Sequence[tuple[np.ndarray, Sequence[Any]]]:
-        """Sets of rows that depend on each other; of each set at each position `smallest`, a singular value, and `null_space`."""
+        """Return sets of dependent rows, each with its `smallest` singular value and its `null_space` at each position."""
         ...
 
 
-@np.errstate(all="ignore")  # coordinates that are not finite do not close
+@np.errstate(all="ignore")  # non-finite coordinates are not closed
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """Return the rows of Psi to leave out, or None: the guess cannot be closed or moved. All numbers are known."""
+    """Return the rows of Psi to leave out; None if the guess cannot be closed or moved. All numbers are concrete."""
     rows = kinematic_rows(mechanism)
     if not rows.count:
         return ()
@@ -102,9 +102,9 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
 
 @np.errstate(all="ignore")
 def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Position]:
-    """Closed positions of the highest rank along a random motion from a guess q: one is enough where no row is redundant.
+    """Return closed positions of maximum rank along a random motion from a guess q; a single one if no row is redundant.
 
-    None at all where the guess cannot be closed or moved.
+    The list is empty if the guess cannot be closed or moved.
     """
     first = rows.close(0.0, q)
     if first is None:
@@ -112,7 +112,7 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
     found, failures, time_step = [first], 0, rows.driver_time_step
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
-    for k in range(POSITION_SAMPLES if rows.count <= FEWER_SAMPLES_FROM else POSITION_SAMPLES // 3):
+    for k in range(POSITION_SAMPLES if rows.count <= MANY_ROWS else POSITION_SAMPLES // 3):
         full = [p for p in found if p.is_clear and p.rank == rows.count]
         if full:
             return full[:1]
@@ -122,7 +122,7 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
             time_step = CREEP * rows.driver_time_step
         last = found[-1]
         heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(rows.size) / np.sqrt(rows.size)
-        heading = last.tangent_part(heading)  # onward, so that the motion gets around
+        heading = last.tangent_part(heading)  # keep the direction, so that the motion covers the range
         step = rows.metric * heading
         moved = last.q + LONGEST_STEP * step / max(rows.scales.size(step, np), 1e-300)
         position = rows.close(time_step * (k + 1), moved, give_up=True)
@@ -139,18 +139,18 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
 
 
 def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position]) -> tuple[int, ...]:
-    """Return the rows to leave out, of positions of ordinary rank: those whose absence never makes the others dependent."""
+    """Return the rows without which the others stay independent at all positions of full rank."""
     if positions[0].rank == rows.count:
         return ()
     chosen = []
     for members, found in rows.split_rows(positions):
-        ordinary = [part for part in found if part.smallest > ORDINARY_TOL] or found
+        ordinary = [part for part in found if part.smallest > GENERIC_TOL] or found
         chosen += members[list(choose_dispensable([part.null_space for part in ordinary]))].tolist()
     return tuple(sorted(chosen))
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
-    """Return the names of the constraints whose rows depend on each other at a closed position: those in the left null space."""
+    """Return the names of the constraints in the left null space of D at a closed position, whose rows are dependent."""
     rows = kinematic_rows(mechanism)
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:
@@ -161,9 +161,9 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
 
 
 def generic_position(mechanism: Mechanism) -> np.ndarray | None:
-    """Return a closed position beside the initial guess, which may be singular; None where that cannot be closed.
+    """Return a closed position near the initial guess, which may be singular; None if it cannot be closed.
 
-    All numbers are known. The step is random, so that what holds there holds in general.
+    All numbers are concrete. The step from the guess is random, so that the position is generic.
     """
     rows = kinematic_rows(mechanism)
     q = np.asarray(mechanism.q0, float).ravel()
@@ -180,19 +180,19 @@ def generic_position(mechanism: Mechanism) -> np.ndarray | None:
 
 
 def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:
-    """Return Psi and D of a mechanism with known numbers: `KinematicRows`, or for large scenes `SparseRows`."""
+    """Return Psi and D of a mechanism with concrete numbers: `KinematicRows`, or for large scenes `SparseRows`."""
     if not (large or (large is None and not scene_programs(mechanism).is_small)):
         return KinematicRows(mechanism)
-    from udkjax.equations.sparse_rows import SparseRows  # and with it SciPy, which small scenes do without
+    from udkjax.equations.sparse_rows import SparseRows  # imports SciPy, which small scenes do not need
 
     return SparseRows(mechanism, kinematic=True)
 
 
 def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
-    """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as it goes for every N.
+    """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as possible for every N.
 
-    Greedy: the row whose smallest length over all N is largest; then each N gives up the direction of that row. Of rows that do
-    equally well the last is left out, so that a copy goes and its original stays.
+    Greedy: take the row whose smallest length over all N is largest; then project the direction of that row out of each N. Among
+    equal rows the last is chosen, so that a copy is left out and its original stays.
     """
     chosen: list[int] = []
     while null_spaces[0].shape[1]:
@@ -205,8 +205,8 @@ def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
 
 
 def owners_of_row(rows: PositionRows, t: Time, q: np.ndarray, name: str) -> set[str] | None:
-    """Return the constraints of whose rows the first one of a constraint is made at a position; None where it is independent."""
-    D, owners = dense(rows.at(t, q)[2]), np.array([owner for owner, _ in rows.names])  # D has rows of length one
+    """Return the constraints on whose rows the first row of constraint `name` depends; None if it is independent."""
+    D, owners = dense(rows.at(t, q)[2]), np.array([owner for owner, _ in rows.names])  # D has unit rows
     own, others = D[owners == name][0], D[owners != name]
     shares = np.linalg.lstsq(others.T, own, rcond=NEGLIGIBLE_SHARE)[0]
     if np.linalg.norm(own - others.T @ shares) > NEGLIGIBLE_SHARE:

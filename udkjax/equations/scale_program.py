@@ -1,8 +1,8 @@
-"""The scales of a scene (scales.py) as loops over its bodies, its rows of Psi, and the pairs of a row and a body that it meets.
+"""The scales of a scene (scales.py) as loops over its bodies, its rows of Psi, and the pairs of a row and a body in it.
 
-    scales    length, arm, rate, mass, rank_tol, and then the scale of each row; of the array `numbers` alone
+    scales    length, arm, rate, mass, rank_tol, and then the scale of each row, computed from the array `numbers`
 
-A row changes by `moved` as a body moves by a metre, and by `turned` as it turns by a radian.
+A row changes by `moved` if a body moves by a metre, and by `turned` if it turns by a radian.
 """
 
 import math
@@ -21,18 +21,18 @@ from udkjax.expressions.loop_program import MAXIMUM, Kernel, KernelLoop, KernelW
 from udkjax.expressions.selection import absolute, greater, maximum, where
 from udkjax.scene.mechanism import Mechanism
 
-# Relative to the largest singular value of D: far above rounding and drift, far below the singular values of a mechanism in
-# ordinary positions. With the states returned to the constraint manifold, 1e-2 to 1e-5 cross the same singular configurations.
+# Rank tolerance relative to the largest singular value of D: far above rounding and drift, far below the singular values in
+# generic configurations. With projection, values from 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
-ORDINARY_MASS_RATIO = 100.0  # up to which that holds: see `Scales.rank_tol`
+MAX_MASS_RATIO = 100.0  # for larger ratios the tolerance is lowered: see `Scales`
 
-LENGTH, ARM, RATE, MASS, THRESHOLD, ROWS = range(6)  # places in the array `scales`
-RADIUS, MOVED, CHANGE, YIELD, LARGEST = range(5)  # places of maxima, and their number
+LENGTH, ARM, RATE, MASS, THRESHOLD, ROWS = range(6)  # indices in the array `scales`
+RADIUS, MOVED, CHANGE, YIELD, LARGEST = range(5)  # indices in the array `largest`, and its size
 PAIR, PAIR_ROW, PAIR_MASS, PAIR_INERTIA = range(4)  # columns of the table of pairs
 
 
 class ScaleProgram(NamedTuple):
-    """The program, and the sizes of its arrays besides those of the scene."""
+    """The program, and the sizes of its own arrays."""
 
     program: LoopProgram
     sizes: dict[str, int]
@@ -43,7 +43,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
 
     Args:
         terms: The terms of the scene.
-        places: The scene, with the place of each number in `numbers` instead of the number.
+        places: The scene, with each number replaced by its index in `numbers`.
         number_count: Number of numbers of the scene.
         prologue: The program of the constants.
     """
@@ -54,7 +54,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
     row_table, pair_table = np.arange(layout.row_count)[:, None], np.zeros((0, 4), int)
     elements = []
     for group in layout.constraints:
-        meets = _meets(group)
+        meets = _row_body_pairs(group)
         first = len(pair_table) + len(meets) * np.arange(len(group.table))
         elements.append(_over_elements(terms, group, meets, first))
         for k, (row, body) in enumerate(meets):
@@ -80,8 +80,8 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
     return ScaleProgram(LoopProgram(parts), sizes | dict.fromkeys("qv", layout.coordinate_count))
 
 
-def _meets(group: ConstraintGroup) -> list[tuple[int, int]]:
-    """Return the rows of an element, each with the bodies that it meets."""
+def _row_body_pairs(group: ConstraintGroup) -> list[tuple[int, int]]:
+    """Return the pairs of a row and a body of an element with nonzero entries in Psi_q."""
     entries = _entries(group)
     return [(r, b) for r, b in np.ndindex(entries.shape[:2]) if not all(s.is_zero for s in entries[r, b])]
 
@@ -92,7 +92,7 @@ def _entries(group: ConstraintGroup) -> np.ndarray:
 
 
 def _over_elements(terms: SceneTerms, group: ConstraintGroup, meets: list[tuple[int, int]], first: np.ndarray) -> KernelLoop:
-    """Compute `moved` and `turned` of the pairs, the first of which are given, and psi_t and gamma of the rows."""
+    """Compute `moved` and `turned` of the pairs, and psi_t and gamma of the rows; `first` is each element's first pair."""
     programs, base = group.programs, group.table.shape[1]
 
     def write(w: KernelWriter):
@@ -120,7 +120,7 @@ def _psi_t(group: ConstraintGroup) -> list[Scalar]:
     return graph.copy(rate, known)
 
 
-# --- kernels, of numbers that may be no finite ones
+# --- kernels; numbers may be non-finite
 
 
 @lru_cache(maxsize=64)
@@ -136,17 +136,17 @@ def _is_finite(x: Scalar) -> Scalar:
 
 
 def _finite(x: Scalar) -> Scalar:
-    """Return a number that is finite, and zero for others."""
+    """Return x, or zero if it is not finite."""
     return where(_is_finite(x), x, x.graph.constant(0.0))
 
 
 def _swing(acceleration: Scalar) -> Scalar:
-    """Return the rate that belongs to an acceleration, over a length: a pendulum swings to and fro in pi sqrt(L / a) each."""
+    """Return the rate of an acceleration over a length: half a period of a pendulum is pi sqrt(L / a)."""
     return acceleration.graph.sqrt(absolute(_finite(acceleration))) / math.pi
 
 
 def _write_finite(w: KernelWriter) -> None:
-    """Leave NaN as the mass where a number is not finite."""
+    """Set the mass to NaN if a number is not finite."""
     w.write(
         where(_is_finite(w.read("numbers", 0)), w.graph.constant(0.0), w.graph.constant(math.nan)), "scales", None, MASS, MAXIMUM
     )
@@ -163,7 +163,7 @@ def _write_guess(w: KernelWriter) -> None:
 
 
 def _write_arm(w: KernelWriter) -> None:
-    """Compute the longest arm of all pairs, 0 where none of them has one."""
+    """Compute the longest lever arm of all pairs, 0 if there is none."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
     by_place = greater(moved, w.read("largest", None, MOVED) * ROUNDING)
     arm = where(by_place, turned / where(by_place, moved, w.graph.constant(1.0)), w.graph.constant(0.0))
@@ -178,7 +178,7 @@ def _write_length(w: KernelWriter) -> None:
 
 
 def _write_change(w: KernelWriter) -> None:
-    """Compute what a displacement of L or a turn of one radian changes in each row."""
+    """Compute the change of each row by a displacement of L or a turn of one radian."""
     moved = w.read("moved", PAIR) * w.read("scales", None, LENGTH)
     w.write(maximum(moved, w.read("turned", PAIR)), "change", PAIR_ROW, 0, MAXIMUM)
 
@@ -191,14 +191,14 @@ def _write_row(w: KernelWriter) -> None:
     """Compute the scale of each row, and the rates at which rows change."""
     change = _finite(w.read("change", 0))
     moves = greater(change, w.read("largest", None, CHANGE) * ROUNDING)
-    scale = where(moves, change, w.read("scales", None, LENGTH))  # a row that nothing moves here: as if in metres
+    scale = where(moves, change, w.read("scales", None, LENGTH))  # no body moves this row at the guess
     w.write(scale, "scales", 0, ROWS)
     for rate in (absolute(_finite(w.read("psi_t", 0) / scale)), _swing(w.read("gamma", 0) / scale)):
         w.write(rate, "scales", None, RATE, MAXIMUM)
 
 
 def _write_yield(w: KernelWriter) -> None:
-    """Compute the largest entry (1/kg) of a weighted row of D D^T of one body."""
+    """Compute the largest diagonal entry (1/kg) of the weighted D D^T that a single body contributes."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
     weight = w.read("scales", None, LENGTH) / w.read("scales", PAIR_ROW, ROWS)
     entry = moved * moved / w.read("numbers", PAIR_MASS) + turned * turned / w.read("numbers", PAIR_INERTIA)
@@ -214,5 +214,5 @@ def _write_rate(w: KernelWriter, free: list[Scalar]) -> None:
 
 
 def _write_threshold(w: KernelWriter) -> None:
-    ratio = w.read("largest", None, YIELD) * w.read("scales", None, MASS) / ORDINARY_MASS_RATIO
+    ratio = w.read("largest", None, YIELD) * w.read("scales", None, MASS) / MAX_MASS_RATIO
     w.write(RANK_TOL / w.graph.sqrt(maximum(w.graph.constant(1.0), ratio)), "scales", None, THRESHOLD)

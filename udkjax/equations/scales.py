@@ -1,7 +1,7 @@
 """The characteristic length, rate and mass of a mechanism, the units of every threshold.
 
-See analysis.py for what they mean. They are one program (scale_program.py), which NumPy runs where all numbers are known, machine
-code in a trace, and JAX on other devices.
+analysis.py defines them. They are one program (scale_program.py), run by NumPy if all numbers are concrete, by machine code in a
+trace, and by JAX on other devices.
 """
 
 from functools import lru_cache
@@ -26,31 +26,31 @@ from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 from udkjax.scene.mechanism import Mechanism
 
-NO_THRESHOLDS = 0.0, 0.0  # of pivots, which the prologue takes behind the numbers of a scene
+NO_THRESHOLDS = 0.0, 0.0  # thresholds of pivots, which the prologue takes after the numbers of a scene
 
 
 @prints_table
 class Scales(NamedTuple):
     """The units of lengths, rates, masses and rows of Psi, and the rank threshold of D; arrays without derivatives.
 
-    `rank_tol` is `RANK_TOL`, less where masses are far apart. Where a light body carries a heavy one the singular values of
-    D = Psi_q M^(-1/2) are as far apart as the roots of the masses, in any position: a ratio of 1e8 brings a constraint between
-    them down to 1e-4 of the largest. So does a body that hardly resists turning, such as a point mass at the end of a rod: to a
-    row with an arm r it is as light as 1 / (1 / m + r^2 / I).
+    `rank_tol` is `RANK_TOL`, or less for large mass ratios. If a light body carries a heavy one, the singular values of
+    D = Psi_q M^(-1/2) differ by the root of the mass ratio in any position: a ratio of 1e8 lowers the singular value of a
+    constraint between them to 1e-4 of the largest. The same holds for a body with small inertia, such as a point mass at the end
+    of a rod: its effective mass in a row with an arm r is 1 / (1 / m + r^2 / I).
     """
 
     length: Float[Array, ""]  # m
-    arm: Float[Array, ""]  # m; the longest of a constraint, masses aside; `length` where there is none
-    rate: Float[Array, ""]  # 1/s; 0 where nothing moves and nothing pulls
-    mass: Float[Array, ""]  # kg; not a number where any number of the mechanism is none
+    arm: Float[Array, ""]  # m; the longest lever arm of a constraint; `length` if there is none
+    rate: Float[Array, ""]  # 1/s; 0 without velocities and loads
+    mass: Float[Array, ""]  # kg; NaN if any number of the mechanism is not finite
     rows: Float[Array, "m"]  # m, rad or whatever the row is in
-    rank_tol: Float[Array, ""]  # of D, its rows weighted, relative to its largest singular value
+    rank_tol: Float[Array, ""]  # rank tolerance of the weighted D, relative to its largest singular value
 
     _units = units(length="m", arm="m", rate="1/s", mass="kg")
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """The weights of the rows of D with which one rank threshold serves them all: 1 for rows in metres, L for radians."""
+        """The weights that make the rows of D comparable, for a single rank tolerance: 1 for rows in metres, L for radians."""
         if isinstance(self.rows, np.ndarray) or library_for(self) is jnp:
             return self.length / self.rows
         return number(np.asarray(self.length) / np.asarray(self.rows))
@@ -62,23 +62,23 @@ class Scales(NamedTuple):
         return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)
 
     def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        """Return the largest of a change of coordinates (n,): lengths over L, angles in rad."""
+        """Return the largest component of a change of coordinates (n,): lengths over L, angles in rad."""
         x = xp.abs(q.reshape(-1, 3))
         return xp.maximum(xp.max(x[:, :2], initial=0.0) / self.length, xp.max(x[:, 2], initial=0.0))
 
     def violation(self, psi: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        """Return the largest of a violation (m,) of the rows of Psi, each over its scale."""
+        """Return the largest component of a violation (m,) of Psi, each row over its scale."""
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
 
 def concrete_scales(mechanism: Mechanism) -> Scales:
-    """Return the scales of a mechanism whose numbers are known, by NumPy."""
+    """Return the scales of a mechanism with concrete numbers, by NumPy."""
     numbers = np.asarray(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))
     return jax.tree.map(number, _unpack(_evaluate(scene_programs(mechanism), numbers, np)))
 
 
 def traced_scales(mechanism: Mechanism) -> Scales:
-    """Return the same in a trace; without derivatives."""
+    """Return the scales of a mechanism with traced numbers, without derivatives."""
     numbers = join_concrete_numbers([*mechanism.at(0.0).numbers, *NO_THRESHOLDS])
     return _traced_scales(jax.lax.stop_gradient(numbers), scene_programs(mechanism))
 
@@ -95,7 +95,7 @@ def _unpack(found: Any) -> Scales:
 def _evaluate(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the array `scales`."""
     arrays = {name: xp.zeros(size) for name, size in (programs.scratch | programs.scales.sizes).items()}
-    with np.errstate(all="ignore"):  # numbers that are not finite are no scales
+    with np.errstate(all="ignore"):  # non-finite numbers are checked later
         return _loops(programs, xp)(arrays | {"numbers": numbers})["scales"]
 
 
@@ -104,17 +104,17 @@ def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
     return ArrayLoops(programs.scales.program, xp)
 
 
-# --- as one operation of JAX, of vectors of numbers (..., numbers): machine code of it is in native/run/state_functions.py
+# --- as one JAX operation on vectors of numbers (..., numbers), which native lowers to machine code
 
 
 def evaluate_scales(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
-    """Return the arrays `scales` of some vectors of numbers, by NumPy."""
+    """Return the array `scales` for each of some vectors of numbers, by NumPy."""
     found = [_evaluate(programs, x, np) for x in numbers.reshape(-1, numbers.shape[-1])]
     return np.array(found, numbers.dtype).reshape(*numbers.shape[:-1], -1)
 
 
 def scales_by_jax(numbers: Array, programs: ScenePrograms) -> Array:
-    """Return the same, as operations of JAX."""
+    """Return the array `scales` for each of some vectors of numbers, by JAX."""
     return jnp.vectorize(lambda x: _evaluate(programs, x, jnp), signature="(n)->(m)")(numbers)
 
 

@@ -1,4 +1,4 @@
-"""The programs of a scene by arrays, without machine code: by NumPy, where nothing is compiled for it, or by JAX."""
+"""The programs of a scene on arrays, without machine code: by NumPy, without compilation, or by JAX."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -34,7 +34,7 @@ class SceneArrays(Generic[AnyArray]):
         return self._run("psi", t, q, q)["psi"]
 
     def geometry(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
-        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q, as `ScenePrograms.psi_q_entries` has them."""
+        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
         found = self._run("geometry", t, q, v)
         _, _, places, factors = self.programs.psi_q_entries
         return found["psi"], found["psi_dot"], found["psi_q"][places] * factors
@@ -45,7 +45,7 @@ class SceneArrays(Generic[AnyArray]):
         return terms[: self.programs.coordinate_count], terms[self.programs.coordinate_count :]
 
     def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
-        """Run a program in which no round of a loop takes anything from another."""
+        """Run a program whose loops have independent iterations."""
         p, xp = self.programs, self._xp
         evaluate, arrays = _evaluator(p, name, xp)
         sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count}
@@ -54,7 +54,7 @@ class SceneArrays(Generic[AnyArray]):
 
 
 def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndarray]]:
-    """Return the arrays of a mechanism with known numbers as a function of time (s), with which what has samples changes."""
+    """Return the arrays of a mechanism with concrete numbers as a function of time (s), on which sampled numbers depend."""
     programs, is_sampled = scene_programs(mechanism), bool(mechanism.samples)
 
     def at(t: Time) -> SceneArrays[np.ndarray]:
@@ -65,7 +65,7 @@ def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndar
 
 
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return the constants of the loops, of the numbers of a scene and the gains."""
+    """Return the constants of the loops from the numbers of a scene and the gains."""
     evaluate, _ = _evaluator(programs, "prologue", xp)
     given = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
     return evaluate(given)["constants"]
@@ -73,6 +73,6 @@ def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -
 
 @lru_cache(maxsize=256)
 def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[ArrayLoops, set[str]]:
-    """Return a program as a function of its arrays, and the names of those: made once."""
+    """Return a program as a function of its arrays, and the names of these arrays."""
     program = getattr(programs, name)
     return ArrayLoops(program, xp), program.arrays | set(ROWS_AND_LOADS)

@@ -1,7 +1,7 @@
 """The layout of a scene's numbers in the arrays of its programs.
 
-A loop runs one kernel for every element of a group, or for every body. Its table has one row for each of them, with the places in
-the arrays at which begins what belongs to it: its coordinates, its constants, its rows of Psi, its entries of Psi_q.
+A loop runs one kernel for every element of a group, or for every body. Its table has one row for each element or body: the
+indices at which its coordinates, constants, rows of Psi and entries of Psi_q begin in their arrays.
 """
 
 from collections.abc import Hashable, Sequence
@@ -30,19 +30,19 @@ BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
 # Columns of the table of a group, before three for each of its bodies as above: where the constants of each element, its entries
 # of Psi_q, its eliminated rows and all of its rows begin.
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
-# Constants of the scene, then of each body: M^(-1), of x and y, and of the angle.
+# Constants of the scene, then of each body: its entries of M^(-1) for x and y, and for the angle.
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
-PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # entries of a body; the places of x, y and the angle among them
+PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # number of entries of a body; indices for x, y and the angle
 
 AnyIndex = TypeVar("AnyIndex", int, np.ndarray)
 
-SOLVES = 4  # linear systems in one program, at most
-# Arrays of each: Psi_q M^(-1) Psi_q^T x = right, and jt_x = Psi_q^T x; y = right - sum, where L y = right.
+SOLVES = 4  # maximum number of linear systems in one program
+# Arrays of each system: Psi_q M^(-1) Psi_q^T x = right, and jt_x = Psi_q^T x; y = right - sum, where L y = right.
 SOLVE_ARRAYS = ("right", "sum", "y", "x", "jt_x")
 
 
 def arrays_of_solve(solve: int) -> dict[str, str]:
-    """Return the names that the arrays of one of the linear systems have in a program."""
+    """Return the names in a program of the arrays of one linear system."""
     return {name: f"{name}{solve}" for name in SOLVE_ARRAYS}
 
 
@@ -51,8 +51,8 @@ class ElementGroup:
     """Elements of one structure, with the table of their loops."""
 
     programs: ElementPrograms
-    members: np.ndarray  # (elements,) their indices among the constraints or force elements
-    bodies: np.ndarray  # (bodies of each, elements)
+    members: np.ndarray  # (elements,) indices among the constraints or force elements
+    bodies: np.ndarray  # (bodies of an element, elements)
     table: np.ndarray  # (elements, columns)
 
     @property
@@ -63,16 +63,14 @@ class ElementGroup:
 
 @dataclass(eq=False, frozen=True)
 class ConstraintGroup(ElementGroup):
-    """Constraints of one structure, of which the same rows are eliminated."""
+    """Constraints of one structure with the same eliminated rows."""
 
     programs: ConstraintPrograms
-    rows: tuple[int, ...] = ()  # the rows of each that are eliminated
-    entry_index: dict[int, int] = field(
-        default_factory=dict
-    )  # of the nodes of Psi_q that are no constants: which number of `psi_q`
+    rows: tuple[int, ...] = ()  # the eliminated rows of each constraint
+    entry_index: dict[int, int] = field(default_factory=dict)  # index in `psi_q` of each node of Psi_q that is not constant
 
     def entry(self, w: KernelWriter, row: int, k: int, base: int = ENTRIES) -> Scalar:
-        """Read an entry of Psi_q from where the elements wrote it; `base` is the column of a table."""
+        """Read an entry of Psi_q that the elements wrote; `base` is the column of a table."""
         s = self.programs.outputs["psi_q"][row * self.coordinates + k]
         if s.constant is not None:
             return w.graph.constant(s.constant)
@@ -92,7 +90,7 @@ class ForceGroup(ElementGroup):
 
 
 class SceneLayout:
-    """The groups of a scene's elements, and the sizes of all arrays, for one choice of rows that are eliminated."""
+    """The groups of a scene's elements, and the sizes of all arrays, for one choice of eliminated rows."""
 
     def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...] | None, baumgarte: bool, every_row: bool):
         self.gains, self.baumgarte = 2 if baumgarte else 0, baumgarte
@@ -104,7 +102,7 @@ class SceneLayout:
         n = self.coordinate_count
         self.sizes = {
             "sines": 2 * self.body_count,
-            "sines1": 2 * self.body_count,  # of positions after a correction
+            "sines1": 2 * self.body_count,  # of corrected positions
             "free": n,
             "load": n,
             "z": n,
@@ -117,7 +115,7 @@ class SceneLayout:
         self._eliminated = 0  # rows so far
         self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
         rows = self._find_rows(redundant_rows or ())
-        # Where redundant rows are numbers, too: which rows are independent, in the order of their elimination.
+        # If numbers mark redundant rows: the marks of independent rows, in the order of elimination.
         self.marks, self.first_mark = self.row_count if redundant_rows is None else 0, self.constant_count
         self.constant_count += self.marks
         self.leaves_out_marked = bool(self.marks) and not every_row
@@ -181,23 +179,23 @@ class SceneLayout:
         return np.stack([np.broadcast_to(c, (len(kind.members),)) for c in (*columns, *of_bodies)], 1)
 
     def of_body(self, body: AnyIndex) -> AnyIndex:
-        """Return the place at which the constants of a body begin, or of several bodies."""
+        """Return the index at which the constants of a body, or of several bodies, begin."""
         return self.first_body + PER_BODY * body
 
     def reserve(self, name: str, count: int) -> int:
-        """Make room for so many more numbers in an array; return where they begin."""
+        """Reserve room for `count` more numbers in an array; return where they begin."""
         self.sizes[name] += count
         return self.sizes[name] - count
 
     def add_solves(self) -> None:
-        """Add the arrays of linear systems, once the factors have their size."""
+        """Add the arrays of linear systems, after the number of eliminated rows is final."""
         self.sizes["factors"] = self.sizes["gram"]
         for k in range(SOLVES):
             self.sizes |= {f"{name}{k}": self.coordinate_count if name == "jt_x" else self._eliminated for name in SOLVE_ARRAYS}
 
     @cached_property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The entries of Psi_q: their rows, columns, places in the array `psi_q`, and factors."""
+        """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and factors."""
         found = [np.zeros((4, 0))]
         for group in self.constraints:
             for place, s in enumerate(group.programs.outputs["psi_q"]):

@@ -1,4 +1,4 @@
-"""The programs of a scene: each computes its results, and nothing else.
+"""The programs of a scene: each computes only its results.
 
 Terms come from loops over elements of the same structure (scene_terms.py), linear systems from elimination by blocks
 (block_elimination.py, scene_solver.py), and derivatives from loops, too (differentiable_programs.py). The programs of small
@@ -32,12 +32,12 @@ RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces roo
 
 
 class ScenePrograms:
-    """Programs over arrays of numbers: the results `RESULTS` from constants, t, q, v, dq and dv, as each needs them.
+    """Programs over arrays of numbers: they compute `RESULTS` from constants, t, q, v, dq and dv.
 
-    Intermediate results of a program stay in arrays of its own, of the sizes `scratch`: no number is written again once it has
-    been read. `safe` is whether all pivots exceed `safe_tol`, `distance` the root of the smallest pivot relative to its diagonal
-    entry: the distance from dependence. The `policy` for small pivots concerns the accelerations; corrections leave
-    out the rows whose pivots do not exceed `drop_tol`.
+    Intermediate results are kept in arrays of the sizes `scratch`; no number is overwritten after it has been read. `safe` is
+    one if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is the
+    distance from dependence. The `policy` for small pivots concerns the accelerations; corrections leave out the rows whose
+    pivots do not exceed `drop_tol`.
     """
 
     def __init__(
@@ -62,11 +62,11 @@ class ScenePrograms:
         starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
         places = [np.arange(a, b).reshape(s) for a, b, (s, _) in zip(starts, starts[1:], shapes, strict=False)]
         self._number_count = int(starts[-1])
-        self._places: Mechanism = jax.tree.unflatten(tree, places)  # where each number of the scene is among all of them
+        self._places: Mechanism = jax.tree.unflatten(tree, places)  # the index of each number of the scene
 
     @property
     def stored_sizes(self) -> dict[str, int]:
-        """The sizes of all arrays that derivatives may need of a state."""
+        """The sizes of all arrays of a state that derivatives may need."""
         n = self.coordinate_count
         return self.scratch | {"q1": n, "v1": n}
 
@@ -82,7 +82,7 @@ class ScenePrograms:
 
     @property
     def piece_count(self) -> int:
-        """The number of elements that are smooth in pieces of the state."""
+        """The number of piecewise smooth elements."""
         return self.scratch["pieces"]
 
     @cached_property
@@ -103,19 +103,19 @@ class ScenePrograms:
 
     @property
     def marks_rows(self) -> bool:
-        """True if numbers mark redundant rows: a mark for each row of Psi, one where it is independent."""
+        """True if numbers mark redundant rows: one mark for each row of Psi, which is one if the row is independent."""
         return self._layout.marks > 0
 
     @cached_property
     def for_derivatives(self) -> "ScenePrograms":
-        """The programs whose derivatives are taken: those of the rows that are left where dependent ones are dropped."""
+        """The programs whose derivatives are taken: these if the policy drops rows, else those that fall back."""
         if self.policy.drops:
             return self
         return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, kernels=self._kernels)
 
     @cached_property
     def with_all_rows(self) -> "ScenePrograms":
-        """The same programs, of the same constants, on all rows: redundant ones may be independent in singular configurations."""
+        """The same programs with the same constants on all rows: redundant ones may be independent in singular configurations."""
         return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, every_row=True, kernels=self._kernels)
 
     # --- programs
@@ -129,7 +129,7 @@ class ScenePrograms:
 
     @cached_property
     def multipliers(self) -> LoopProgram:
-        """lambda as multipliers, of all rows; a; safe."""
+        """multipliers: lambda of all rows; a; safe."""
         return program(self.accelerations.parts, self._terms.multipliers(0))
 
     @cached_property
@@ -139,12 +139,12 @@ class ScenePrograms:
 
     @cached_property
     def newton_v_and_psi(self) -> LoopProgram:
-        """v1, v after the Newton step to Psi_dot = 0; and psi, of all rows."""
+        """v1, v after the Newton step to Psi_dot = 0; psi of all rows."""
         return program(self._solver.newton("psi_dot", "v"), self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def corrections_and_accelerations(self) -> LoopProgram:
-        """q1 and v1, corrected by a Newton step each, and a: the three of one state, by the same factors."""
+        """q1 and v1, each after a Newton step, and a, all from one factorization."""
         terms, solver, right = self._terms, self._solver, ("b", "psi", "psi_dot")
         system = [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("psi_q", *right))]
         solves = [part for k in range(3) for part in solver.refined_solve(k, 3)]
@@ -153,15 +153,15 @@ class ScenePrograms:
 
     @cached_property
     def project(self) -> LoopProgram:
-        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0 with the factors of Psi_q at the q before it; psi at q1.
+        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0, both with the factors of Psi_q at q; psi at q1.
 
-        Where the step in q is small, what it turns Psi_q by is a small part of the step in v, which is as small.
+        If the step in q is small, the change of Psi_q by it is negligible in the step in v, which is small as well.
         """
         return program(self._solver.project, self._terms.row_terms("psi", "psi", q="q1", sines="sines1"))
 
     @cached_property
     def project_and_accelerate(self) -> LoopProgram:
-        """v1, and a there; safe."""
+        """v1, and a at v1; safe."""
         return program(self._solver.project_and_accelerate)
 
     @cached_property
@@ -171,7 +171,7 @@ class ScenePrograms:
 
     @cached_property
     def end_of_step(self) -> LoopProgram:
-        """The results of `project_and_accelerate` and `tangent_part`, by the same factors."""
+        """The results of `project_and_accelerate` and `tangent_part`, from one factorization."""
         return program(self._solver.project_and_accelerate, self._solver.tangent_parts(2))
 
     @cached_property
@@ -200,17 +200,17 @@ class ScenePrograms:
 
     @property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The entries of Psi_q: their rows, columns, places in the array `psi_q`, and factors."""
+        """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and factors."""
         return self._layout.psi_q_entries
 
     @property
     def constant_entry(self) -> int:
-        """The place in `psi_q` of the one that entries refer to which are constants."""
+        """The index in `psi_q` of a one, to which constant entries refer."""
         return self._layout.one
 
     @property
     def eliminated_rows(self) -> dict[int, int]:
-        """The places of the rows of Psi in the linear systems, of those that are not left out."""
+        """The index in the linear systems of each retained row of Psi."""
         found = {}
         for group in self._layout.eliminated:
             for start, right in zip(group.table[:, ROW].tolist(), group.table[:, RIGHT].tolist(), strict=True):
@@ -219,7 +219,7 @@ class ScenePrograms:
 
     @cached_property
     def rows_and_loads(self) -> LoopProgram:
-        """Inputs of rank-revealing methods, of all rows: psi_q, psi, psi_dot, terms; and root, M^(-1/2)."""
+        """Inputs of rank-revealing methods: psi_q, psi, psi_dot and terms of all rows, and root, M^(-1/2)."""
         psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
         return program(self.equation_terms.parts, self.rows("psi"), psi_dot)
 
@@ -244,7 +244,7 @@ class ScenePrograms:
         return self._terms.sincos()
 
     def rows(self, residual: str) -> list[KernelLoop | Reset]:
-        """Return Psi_q, Psi or Psi_dot as psi, of all rows, and root, M^(-1/2); of a state whose sines are known."""
+        """Return Psi_q and, as psi, Psi or Psi_dot of all rows, and root, M^(-1/2), after the sines have been computed."""
         return [*self._terms.every_entry(), *self._terms.row_terms(residual, "psi"), self._root]
 
     @property
@@ -259,30 +259,30 @@ class ScenePrograms:
 
     @cached_property
     def pieces(self) -> LoopProgram:
-        """pieces: the number of the smooth piece of each element that has several."""
+        """pieces: the index of the smooth piece of each piecewise smooth element."""
         return program([self._terms.sincos()], self._terms.pieces())
 
     @cached_property
     def energy(self) -> LoopProgram:
-        """energy: kinetic and potential energy (J); that of gravity is zero at the origin."""
+        """energy: kinetic and potential energy (J); the potential of gravity is zero at the origin."""
         return program([self._terms.sincos()], self._terms.energy())
 
     @cached_property
     def rank(self) -> LoopProgram:
-        """rank: how many rows the last factorization did not leave out."""
+        """rank: the number of rows that the last factorization retained."""
         return program(self._solver.elimination.rank())
 
     @cached_property
     def independent_rows(self) -> LoopProgram:
-        """independent: one for each row of Psi that elimination does not leave out, zero for those that depend on others."""
+        """independent: one for each row of Psi that elimination retains, zero for dependent ones."""
         solver = self._solver
         return program(solver.position_terms("psi_q"), solver.factorize_dropping, solver.elimination.independent())
 
     @cached_property
     def value_derivatives(self) -> LoopProgram:
-        """Of a mechanism whose time is a driver's value: q' and q'' as dq1 and dv1; psi of all rows; distance.
+        """dq1 = q' and dv1 = q'', derivatives by a driver's value that takes the place of time; psi of all rows; distance.
 
-        They solve Psi_q q' = -Psi_t and Psi_q q'' = gamma, which is of the velocities q'.
+        They solve Psi_q q' = -Psi_t and Psi_q q'' = gamma, with gamma at the velocities q'.
         """
         terms, solver, solve, count = self._terms, self._solver, self._solver.solve, self.coordinate_count
         at_rest = [Reset("rest", 0, count), *solver.position_terms("psi_q", "psi_dot", v="rest"), *solver.factorize]
@@ -292,12 +292,12 @@ class ScenePrograms:
 
     @cached_property
     def prologue(self) -> LoopProgram:
-        """`constants`, from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
+        """constants, from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
         return write_prologue(self._layout, self._places, self._number_count)
 
     @cached_property
     def scales(self) -> ScaleProgram:
-        """scales, from `numbers`, those of the scene and the two thresholds: the characteristic scales of the guess."""
+        """scales: the characteristic scales of the guess, from `numbers`, those of the scene and the two thresholds."""
         return write_scales(self._terms, self._places, self._number_count, self.prologue)
 
     @cached_property
@@ -320,14 +320,14 @@ def scene_programs(
     policy: RankPolicy = RankPolicy.DROP,
     in_pieces: bool = True,
 ) -> ScenePrograms:
-    """Return the programs of a mechanism's structure, whatever its numbers are.
+    """Return the programs of a mechanism's structure, for any numbers.
 
     Args:
         mechanism: The scene; its numbers may be traced.
-        redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`); None: marks among the numbers tell which.
+        redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`); None: chosen by marks among the numbers.
         baumgarte: Whether the gains alpha and beta are fed back.
         policy: Policy for small pivots.
-        in_pieces: Whether the numbers are those of `Mechanism.at` a time, or all samples and knots.
+        in_pieces: Whether sampled numbers are given by `Mechanism.at` for each time, or as all samples and knots.
 
     Returns:
         The programs; the same object for the same structure and settings.

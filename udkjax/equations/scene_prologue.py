@@ -1,4 +1,4 @@
-"""The prologue of a scene: the constants that depend on its numbers alone, computed once a run."""
+"""The prologue of a scene: the constants that depend only on its numbers, computed once for each run."""
 
 from collections.abc import Sequence
 
@@ -27,8 +27,8 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
 
     Args:
         layout: Layout of the constants.
-        places: The scene, with the place of each number in `numbers` instead of the number.
-        number_count: Number of numbers of the scene; behind them are the gains, the marks of rows, `drop_tol` and `safe_tol`.
+        places: The scene, with each number replaced by its index in `numbers`.
+        number_count: Number of numbers of the scene; the gains, the marks of rows, `drop_tol` and `safe_tol` follow them.
 
     Returns:
         Loops over the bodies and over the elements of each group.

@@ -1,4 +1,4 @@
-"""Sequences of loops that the programs of a scene have in common: linear systems, Newton steps, parts within the manifold."""
+"""Sequences of loops that the programs of a scene share: linear systems, Newton steps, tangent parts."""
 
 from collections.abc import Iterable
 
@@ -7,8 +7,8 @@ from udkjax.equations.scene_terms import ProgramParts, SceneTerms
 from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
 
-# Corrections of a solution by its residual: each takes back what the rounding of the factors left, as long as eps times the
-# square of the condition number of the rows is below one.
+# Corrections of a solution by its residual: each removes the rounding errors of the factors, as long as eps times the square of
+# the condition number of the rows is below one.
 REFINEMENTS = 2
 
 
@@ -35,11 +35,11 @@ class SceneSolver:
 
     @property
     def safe(self) -> KernelLoop | Reset:
-        """The loop of `safe`, which says if all pivots exceed `safe_tol`; it is set where the policy does not ask."""
+        """The loop that sets `safe`: one if all pivots exceed `safe_tol`, or if the policy does not check them."""
         return self.elimination.safe() if self.policy.reports else Reset("safe", 0, 1, 1.0)
 
     def position_terms(self, *outputs: str, v: str = "v") -> list[KernelLoop | Reset]:
-        """Sines and cosines, and terms that no force enters."""
+        """Return the loops of sines and cosines and of terms that do not depend on forces."""
         return [self.terms.sincos(), *self.terms.element_terms(outputs, v)]
 
     @property
@@ -48,13 +48,13 @@ class SceneSolver:
         return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
 
     def newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
-        """Compute x - M^(-1) Psi_q^T y, of q or v, so that a residual vanishes."""
+        """Compute x - M^(-1) Psi_q^T y for x = q or v, so that a residual vanishes."""
         factorize = self.factorize_dropping if dropping else self.factorize
         step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
         return [*self.position_terms("psi_q", residual), *factorize, *step]
 
     def refined_solve(self, solve: int, further: int) -> ProgramParts:
-        """Solve a linear system, refined by the solution of `further` ones (corrected seminormal equations, Bjorck 1987)."""
+        """Solve a linear system with iterative refinement (corrected seminormal equations, Bjorck 1987)."""
         yield from self.solve(solve)
         for _ in range(REFINEMENTS):
             yield from self.terms.remainder(solve, further)
@@ -63,7 +63,7 @@ class SceneSolver:
 
     @property
     def project(self) -> list[KernelLoop | Reset]:
-        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0, by the same factors."""
+        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0, from one factorization."""
         terms = self.terms
         at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
         velocity = [*at_q1, *self.solve(1), terms.add("v1", start="v", solution=1, sign=-1)]
@@ -71,14 +71,14 @@ class SceneSolver:
 
     @property
     def project_and_accelerate(self) -> list[KernelLoop | Reset]:
-        """v1 after a Newton step to Psi_dot = 0, and a there, by the same factors."""
+        """v1 after a Newton step to Psi_dot = 0, and a at v1, from one factorization."""
         terms = self.terms
         system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
         solve = [*self.solve(1), terms.add("a", start="free", solution=1), self.safe]
         return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
 
     def tangent_parts(self, solve: int) -> ProgramParts:
-        """Compute dq1 and dv1, the parts of dq and dv within the manifold, by the systems `solve` and `solve` + 1; distance."""
+        """Compute dq1 and dv1, the tangent parts of dq and dv, by the systems `solve` and `solve` + 1; distance."""
         for k, change in enumerate(("dq", "dv"), solve):
             yield from self.terms.rates(change, k)
             yield from self.solve(k)
@@ -87,5 +87,5 @@ class SceneSolver:
 
 
 def program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
-    """Return the program of several sequences of loops, one after another."""
+    """Concatenate sequences of loops to a program."""
     return LoopProgram([part for some in parts for part in some])

@@ -1,4 +1,4 @@
-"""Loops over the bodies and the elements of a scene: the terms of its equations, and products with Psi_q and its transpose."""
+"""Loops over the bodies and elements of a scene: the terms of its equations, and products with Psi_q and its transpose."""
 
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 
@@ -34,7 +34,7 @@ def dot(graph: Graph, a: list[Scalar], b: list[Scalar]) -> Scalar:
 
 
 class SceneTerms:
-    """Loops that read and write the arrays of a `SceneLayout`. Their kernels are made once, and shared."""
+    """Loops that read and write the arrays of a `SceneLayout`. Kernels are made once and shared."""
 
     def __init__(self, layout: SceneLayout, kernels: dict[Hashable, Kernel]):
         self.layout, self.kernels = layout, kernels
@@ -42,19 +42,19 @@ class SceneTerms:
     # --- kinds of loops
 
     def kernel(self, key: Hashable, write: Write, graph: Graph | None = None) -> Kernel:
-        """Return the kernel of this key, made by `write` where there is none yet."""
+        """Return the kernel of this key, made by `write` on first use."""
         if key not in self.kernels:
             writer = KernelWriter(graph)
             write(writer)
             self.kernels[key] = writer.kernel()
         return self.kernels[key]
 
-    def single_round(self, key: Hashable, write: Write) -> KernelLoop:
-        """Return a loop of one round."""
+    def single_iteration(self, key: Hashable, write: Write) -> KernelLoop:
+        """Return a loop of one iteration."""
         return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int))
 
     def over_bodies(self, key: Hashable, write: Write, fixed: Collection[str] = (), **names: str) -> KernelLoop:
-        """Return a loop over all bodies; `names` are those of its arrays in the program, where they differ from the kernel's."""
+        """Return a loop over all bodies; `names` map arrays of the kernel to arrays of the program, if they differ."""
         return KernelLoop(self.kernel(key, write), self.layout.body_table, names, fixed)
 
     def over_group(
@@ -95,7 +95,7 @@ class SceneTerms:
         return self.over_bodies("sincos", write, q=q, sines=sines)
 
     def free_accelerations(self, v: str) -> ProgramParts:
-        """Compute a_F, where there are force elements: without them it is gravity."""
+        """Compute a_F if there are force elements; without them it is gravity."""
         if not self.layout.forces:
             return
         yield Reset("load", 0, self.layout.coordinate_count)
@@ -118,7 +118,7 @@ class SceneTerms:
         return w.read("constants", None, self.layout.gravity + k) if k < 2 else w.graph.constant(0.0)
 
     def read_free(self, w: KernelWriter, k: int) -> Scalar:
-        """Read a coordinate of a_F of a body."""
+        """Read component k of a_F of a body."""
         return w.read("free", BODY_COORDINATES, k) if self.layout.forces else self._gravity(w, k)
 
     def element_terms(
@@ -129,9 +129,9 @@ class SceneTerms:
         groups: Sequence[ConstraintGroup] | None = None,
         **names: str,
     ) -> ProgramParts:
-        """Compute Psi_q, where `outputs` has it, and others as right-hand sides of the linear system `solve` and those after it.
+        """Compute Psi_q, if among `outputs`, and the other outputs as right-hand sides of the systems `solve`, `solve` + 1, ...
 
-        `groups` are those whose rows are eliminated, unless others are given.
+        `groups` are by default those with eliminated rows.
         """
         rights = [name for name in outputs if name != "psi_q"]
         for group in self.layout.eliminated if groups is None else groups:
@@ -148,12 +148,12 @@ class SceneTerms:
             yield self.over_group(outputs, group, write, v=v, **named, **names)
 
     def every_entry(self) -> ProgramParts:
-        """Compute Psi_q of all rows; behind its entries a one, for those that are constants."""
+        """Compute Psi_q of all rows, followed by a one, to which constant entries refer."""
         yield Reset("psi_q", self.layout.one, 1, 1.0)
         yield from self.element_terms(("psi_q",), groups=self.layout.constraints)
 
     def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> ProgramParts:
-        """Compute Psi, Psi_dot or b of all rows in their order, into an array."""
+        """Write Psi, Psi_dot or b of all rows, in their order, to an array."""
         for group in self.layout.constraints:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -184,7 +184,7 @@ class SceneTerms:
             yield self.over_group("potential", group, write_potential)
 
     def pieces(self) -> ProgramParts:
-        """Return the number of the smooth piece of each element that has several."""
+        """Compute the index of the smooth piece of each piecewise smooth element."""
         for group, places in self.layout.pieces:
             base = group.table.shape[1]
 
@@ -194,10 +194,10 @@ class SceneTerms:
             part = self.over_group("piece", group, write)
             yield part._replace(table=np.concatenate([group.table, places[:, None]], 1))
 
-    # --- products with Psi_q and its transpose, of the eliminated rows
+    # --- products with the eliminated rows of Psi_q and their transpose
 
     def rates(self, change: str, solve: int, subtract: bool = False) -> ProgramParts:
-        """Compute Psi_q times a change of coordinates, as the right-hand side of a linear system, or subtracted from that."""
+        """Set the right-hand side of a linear system to Psi_q times a change of coordinates, or subtract that from it."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -221,7 +221,7 @@ class SceneTerms:
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
     def remainder(self, solve: int, to: int) -> ProgramParts:
-        """Return the remainder right - Psi_q M^(-1) Psi_q^T x of a linear system, as the right-hand side of another one."""
+        """Compute the residual right - Psi_q M^(-1) Psi_q^T x of a linear system as the right-hand side of another one."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -243,7 +243,7 @@ class SceneTerms:
         update: str = SET,
         fixed: Collection[str] = (),
     ) -> KernelLoop:
-        """Set to = start + change, of each body, or start - change, with zero for what is not given.
+        """Set `to` to start + sign * change for each body; the default of both is zero.
 
         `start` is an array, or `free`; `change` an array, or M^(-1) Psi_q^T y with the solution y of a linear system.
         """
@@ -268,7 +268,7 @@ class SceneTerms:
         )
 
     def multipliers(self, solution: int) -> ProgramParts:
-        """Compute multipliers, lambda = -x of a linear system, by rows of Psi; zero of those that are left out."""
+        """Compute the multipliers lambda = -x of a linear system in the order of Psi, zero for rows that are left out."""
         yield Reset("multipliers", 0, self.layout.row_count)
         for group in self.layout.eliminated:
 
@@ -280,17 +280,17 @@ class SceneTerms:
 
 
 def read_bodies(w: KernelWriter, group: ElementGroup, array: str) -> list[Scalar]:
-    """Read what an array of coordinates holds of the bodies of an element."""
+    """Read the elements of an array of coordinates that belong to the bodies of an element."""
     return [w.read(array, BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
 
 
 def rows(group: ConstraintGroup) -> range:
-    """Return the numbers of a group's eliminated rows."""
+    """Return the indices of a group's eliminated rows."""
     return range(len(group.rows))
 
 
 def compliance(w: KernelWriter, k: int, base: int = BODY_CONSTANTS) -> Scalar:
-    """Read the entry of M^(-1) of one of the coordinates of a body."""
+    """Read the diagonal entry of M^(-1) for coordinate k of a body."""
     return w.read("constants", base, MASS_OR_INERTIA[k])
 
 

@@ -1,10 +1,9 @@
 """Dependent rows of a large scene by sparse elimination, in place of the singular values of dense_rows.py.
 
-D has rows of length one here, and D D^T is eliminated in an order of least fill. A pivot is the square of what remains of its
-row when the rows before it are taken out; a row of which nothing remains depends on those before it, is left out of the
-elimination, and gives one vector of the left null space: itself, minus the combination of rows that it is. These vectors are
-sparse. Rows that share none of them have nothing to do with each other: each set of rows that depend on each other, of a few
-dozen in most scenes, is decided about by itself, by singular values.
+D has unit rows here, and D D^T is eliminated in an order of least fill. A pivot is the square of the distance of its row from the
+span of the rows before it. A row with zero pivot depends on those before it, is left out of the elimination, and gives one vector
+of the left null space: the row minus the combination of others that equals it. These vectors are sparse. Rows connected by them
+form sets, of a few dozen rows in most scenes; each set is decided separately, by singular values.
 """
 
 from collections.abc import Sequence
@@ -28,17 +27,17 @@ from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
 from udkjax.scene.mechanism import Mechanism
 
-# Pivots of rows of length one, which are squares of lengths: at or below it a row depends on those before it.
+# Largest pivot of a unit row, the square of a length, that counts as zero.
 DEPENDENT_PIVOT = default_rank_tol(np.dtype(float)) ** 2
-DAMPING = RANK_TOL**2  # added to D D^T in closing, as the truncation of singular values at `RANK_TOL` is for small scenes
-NULL_SPACE_BATCH = 64  # columns of a null space that are solved for at a time, which bounds the memory of their dense form
+DAMPING = RANK_TOL**2  # added to D D^T in closing; counterpart of the truncation at `RANK_TOL` for small scenes
+NULL_SPACE_BATCH = 64  # columns of a null space that are solved for at a time, to bound the memory of their dense form
 
 
-SparseMatrix: TypeAlias = Any  # of SciPy, whose annotations leave the shape open
+SparseMatrix: TypeAlias = Any  # SciPy's type stubs lack the shape
 
 
 class SparsePosition(NamedTuple):
-    """A closed position, with the elimination of its rows."""
+    """A closed position with the pivots of its rows."""
 
     t: Time
     q: np.ndarray
@@ -53,12 +52,12 @@ class SparsePosition(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """True if the rank is beyond doubt."""
+        """True if the rank is certain."""
         return bool(np.all(self.pivots[self.independent] > CLEAR_TOL**2))
 
     @property
     def smallest(self) -> float:
-        """The shortest remainder of an independent row."""
+        """The smallest distance of an independent row from the span of the rows before it."""
         return float(np.sqrt(self.pivots[self.independent].min(initial=1.0)))
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
@@ -70,7 +69,7 @@ class SparsePosition(NamedTuple):
 
     @property
     def null_space(self) -> SparseMatrix:
-        """The left null space of D: combinations of rows that vanish, (rows, redundant)."""
+        """A basis of the left null space of D, (rows, redundant)."""
         rows, count = self.D.shape[0], len(self.dependent)
         if not count:
             return csc_array((rows, 0))
@@ -101,7 +100,7 @@ def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
 
 
 class SparseRows(RowTerms):
-    """Psi and D of a mechanism with known numbers; D sparse. The metric is M^(-1/2), or, to look for redundant rows, (A, A, 1).
+    """Psi and sparse D of a mechanism with concrete numbers, in the metric M^(-1/2), or (A, A, 1) to find redundant rows.
 
     The interface is that of `DenseRows` and of `KinematicRows`.
     """
@@ -121,7 +120,7 @@ class SparseRows(RowTerms):
         return minimum_degree(rows)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
-        """Return Psi, the lengths of the rows of D, and D with rows of length one, as solutions of consistent systems stay."""
+        """Return Psi, the lengths of the rows of D, and D with unit rows; scaling rows leaves consistent solutions unchanged."""
         psi, _, values = self.geometry(t, q, q)
         D, length = self._normalize_rows(values)
         return psi, length, D
@@ -129,7 +128,7 @@ class SparseRows(RowTerms):
     def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
         D = csr_array((values * self.metric[self.entries[1]], self.entries), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
-        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # a row of rounding errors has no direction
+        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rows of rounding errors stay small
         return csr_array(D.multiply(1 / length[:, None])), length
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
@@ -140,14 +139,14 @@ class SparseRows(RowTerms):
         return self._solve(D, psi / length)
 
     def _solve(self, D: SparseMatrix, residual: np.ndarray) -> np.ndarray:
-        """Return -W D^T (D D^T + damping)^(-1) of a residual."""
+        """Return -W D^T (D D^T + damping)^(-1) residual."""
         if not np.all(np.isfinite(D.data)):
             return np.full(self.size, np.nan)
         system = csc_array(D @ D.T + DAMPING * eye_array(self.count))
         return -self.metric * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> SparsePosition | None:
-        """Return a closed position near q, or None; `give_up` early where it seems not to exist."""
+        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
         q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         if not np.all(np.isfinite(D.data)) or not is_closed(self.scales, q, 0 * q, psi, 0 * psi, np):
@@ -155,7 +154,7 @@ class SparseRows(RowTerms):
         return self._position(t, q, D)
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
-        """Return q closed, v as the constraints allow it, the remaining Psi and Psi_dot, and the rank of D."""
+        """Return closed q, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
         if not self.count:
             return q, v, np.zeros(0), np.zeros(0), 0
         q = close_position(self, t, q, np)
@@ -163,12 +162,12 @@ class SparseRows(RowTerms):
         if not np.all(np.isfinite(D.data)):
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
-        for _ in range(VELOCITIES + 1):  # the damped first correction leaves a rest
+        for _ in range(VELOCITIES + 1):  # the damped first correction is not exact
             v = v + self._solve(D, self.geometry(t, q, v)[1] / length)
         return q, v, psi, self.geometry(t, q, v)[1], rank
 
     def split_rows(self, positions: list[SparsePosition]) -> Sequence[tuple[np.ndarray, Sequence["RowSubset"]]]:
-        """Sets of rows that depend on each other, and how each stands in the positions."""
+        """Return sets of rows that depend on each other, each with its null space at each position."""
         return split_dependent_rows(positions)
 
     def _position(self, t: Time, q: np.ndarray, D: SparseMatrix) -> SparsePosition:
@@ -178,7 +177,7 @@ class SparseRows(RowTerms):
 
 
 def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
-    """Return the pivots of D D^T in the order of elimination, for rows of length one; dependent rows are passed over."""
+    """Return the pivots of D D^T in the order of elimination, for unit rows; dependent rows are skipped."""
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
     column: list[dict[int, float]] = [{} for _ in order]
@@ -202,14 +201,14 @@ def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
 
 
 class RowSubset(NamedTuple):
-    """Some rows at one position, by themselves: an orthonormal basis of their left null space."""
+    """Some rows at one position, with an orthonormal basis of their left null space."""
 
-    smallest: Time  # singular value that counts, relative to the largest
+    smallest: Time  # smallest nonzero singular value, relative to the largest
     null_space: np.ndarray
 
 
 def split_dependent_rows(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[RowSubset]]]:
-    """Split the rows into sets that depend on each other, and look at each set by itself."""
+    """Split the rows into sets that depend on each other, and find the null space of each set."""
     every = _stack_columns([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
     rows, columns = every.shape
     links = coo_array((np.ones(every.nnz), (every.row, rows + every.col)), shape=(rows + columns, rows + columns))

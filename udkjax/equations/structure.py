@@ -1,6 +1,6 @@
-"""The structure of a scene and of its elements: all that programs depend on but the values of numbers.
+"""The structure of a scene and of its elements: everything except the values of numbers.
 
-Elements of the same structure, such as all revolute joints, are traced once and evaluated together, whatever bodies they hold.
+Elements of the same structure, such as all revolute joints, are traced once and evaluated together, for any bodies.
 """
 
 import dataclasses
@@ -22,14 +22,14 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
-LeafShapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # the shape and the type of each number of a tree
+LeafShapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shape and dtype of each leaf of a tree
 Element: TypeAlias = Constraint | ForceElement
 Result = TypeVar("Result")
 
 
-@cached_by_identity  # also of traced numbers: what is stored holds none of them
+@cached_by_identity  # also for traced numbers: the result contains no numbers
 def structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
-    """Return the tree of a mechanism, and the shape and the type of each of its numbers: the same for any number of samples."""
+    """Return the tree of a mechanism and the shape and dtype of each of its numbers; equal for any number of samples."""
     return _structure(mechanism.without_origin.without_samples)
 
 
@@ -39,12 +39,12 @@ def _structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
 
 
 def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
-    """Return the same of a mechanism with all of its samples, whose programs are functions of time throughout."""
+    """Return the structure of a mechanism with all of its samples, whose programs are functions of time throughout."""
     return _structure(mechanism.without_origin)
 
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
-    """Return numbers and arrays as one vector, in order: by NumPy where they are known."""
+    """Return numbers and arrays as one vector, in order; by NumPy if they are concrete."""
     parts = [jnp.ravel(jnp.asarray(x, float)) if isinstance(x, Tracer) else np.asarray(x) for x in join_concrete_numbers(numbers)]
     if len(parts) < 2:
         return parts[0] if parts else np.zeros(0)
@@ -52,7 +52,7 @@ def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
 
 
 def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
-    """Return the same numbers and arrays, with one vector of NumPy for all that are known in a row."""
+    """Join each run of successive concrete numbers and arrays into one NumPy vector."""
     parts = []
     for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
         if traced:
@@ -63,20 +63,20 @@ def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
 
 
 class ElementStructure(NamedTuple):
-    """The part of an element that is traced once for many: all but the names of its bodies and the values of its numbers."""
+    """An element without the names of its bodies and the values of its numbers: elements that share it are traced once."""
 
     tree: TreeDef
     shapes: LeafShapes
-    ground: tuple[bool, ...]  # of each of its frames: whether it is the ground's
+    ground: tuple[bool, ...]  # for each of its frames, whether it is the ground
 
     @property
     def body_count(self) -> int:
-        """The number of its frames that are not the ground's."""
+        """The number of frames that are not the ground."""
         return len(self.ground) - sum(self.ground)
 
 
 def element_structure(element: Element, frames: Sequence[str]) -> ElementStructure:
-    """Return the structure of a constraint or force element that is attached to `frames`, names of bodies or the ground."""
+    """Return the structure of a constraint or force element attached to `frames`, names of bodies or the ground."""
     numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
     nameless = object.__new__(type(element))
     for name, value in vars(element).items():
@@ -95,18 +95,18 @@ class ElementKind(NamedTuple):
     """All elements of one structure."""
 
     structure: ElementStructure
-    members: Int[np.ndarray, "elements"]  # their indices among the elements that were sorted
+    members: Int[np.ndarray, "elements"]  # indices among the sorted elements
     bodies: Int[np.ndarray, "bodies_of_each elements"]  # indices of their bodies
 
 
 def element_kinds(
     mechanism: Mechanism, elements: Sequence[Element], labels: Sequence[Hashable] | None = None
 ) -> list[ElementKind]:
-    """Sort elements by their structure, and by their `labels` where there are any."""
+    """Sort elements by their structure and, if given, by their `labels`."""
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     found: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
-        frames = attached_bodies(element, joints)  # a method of a large module takes a look at all of its leaves
+        frames = attached_bodies(element, joints)  # once: a method call on a large module visits all of its leaves
         key = element_structure(element, frames), labels[i] if labels else None
         found.setdefault(key, []).append((i, [body_index[name] for name in frames if name in body_index]))
     result = []
@@ -128,7 +128,7 @@ def evaluate_by_kind(
         states: q and, where the elements depend on velocities, v, each (bodies, 3).
 
     Returns:
-        The kinds, each with the results, the elements first.
+        The kinds, each with its results; the first axis is that of the elements.
     """
     q, found = states[0], []
     cos, sin = jnp.cos(q[:, 2:]), jnp.sin(q[:, 2:])

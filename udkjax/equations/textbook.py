@@ -1,4 +1,4 @@
-"""The equations of motion of a mechanism by the textbook (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
+"""The equations of motion of a mechanism in textbook form (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ class TextbookEquations(MechanismSystem):
     method: Pseudoinverse
     baumgarte: Baumgarte | None
     scales: Scales
-    redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: they are not known
+    redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: unknown
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_F + M^(-1/2) D^+ b."""
@@ -39,15 +39,15 @@ class TextbookEquations(MechanismSystem):
         return uk.multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Return q and v to Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
+        """Project q and v onto Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
         return _project(self, t, q, v)
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take a Newton step in position and one in velocity: at a state on the manifold it has the tangents of a projection."""
+        """Take a Newton step in position and one in velocity; on the manifold it has the derivatives of a projection."""
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """Return (I - M^(-1/2) D^+ D M^(1/2)) of two vectors: the parts of small changes within the manifold at q."""
+        """Return (I - M^(-1/2) D^+ D M^(1/2)) times dq and dv, the tangent parts of small changes at q."""
         mechanism, w = self.mechanism, self.weights
         of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return TangentPart(*of(jnp.stack([dq, dv])))
@@ -94,7 +94,7 @@ class TextbookEquations(MechanismSystem):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """The weights of the rows; zero for redundant ones with elimination, which cannot tell small pivots from rounding."""
+        """The weights of the rows; with elimination, which cannot tell small pivots from rounding, zero for redundant rows."""
         if not isinstance(self.method, Elimination) or not self.redundant:
             return self.scales.weights
         return self.scales.weights.at[np.array(self.redundant)].set(0.0)
@@ -122,7 +122,7 @@ def prepare(
 
     Args:
         mechanism: The scene; its numbers may be traced.
-        method: The pseudoinverse, by default `Auto`; without a `rank_tol` it gets that of the scales.
+        method: The pseudoinverse, by default `Auto`; the default of its `rank_tol` is that of the scales.
         baumgarte: Gains to feed violations back; None: no stabilization.
         analysis: The mechanism's `Analysis`; by default made here.
 
@@ -138,13 +138,13 @@ def prepare(
     tol = analysis.scales.rank_tol if chosen.rank_tol is None else chosen.rank_tol
     chosen = eqx.tree_at(lambda m: m.rank_tol, chosen, tol, is_leaf=lambda x: x is None)
     if isinstance(chosen, Elimination) and not chosen.relative:
-        raise ValueError("Elimination compares each row with what remains of it: here its rank_tol must be relative")
+        raise ValueError("the rank_tol of Elimination must be relative here: it is compared with the remaining part of each row")
     return TextbookEquations(
         mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales, redundant=analysis.redundant_rows
     )
 
 
-# A projection is differentiated at the state that it returns, where all residuals vanish.
+# A projection is differentiated at its result, where all residuals vanish.
 
 
 @jax.custom_jvp
@@ -160,7 +160,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _at_projection(equations: TextbookEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """Return a state on the manifold, with the derivatives that `project` has where it returns it."""
+    """Return a state on the manifold unchanged, with the derivatives of `project` at its result."""
     del equations, t
     return q, v
 

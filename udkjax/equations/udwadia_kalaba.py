@@ -6,17 +6,17 @@ A mechanism's constraints Psi(t, q) = 0, masses M and loads F give, with
 
     a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b,        M a + Psi_q^T lambda = F,
 
-whatever the rank of D. These are the accelerations that satisfy the constraints, or violate them least, and that are nearest to
-a_F in the metric of M (Gauss's principle); the multipliers are those of least norm. Each symbol is a function on arrays,
-differentiable to any order, and the tests hold every faster form against it; `method` is any pseudoinverse.
+for any rank of D. Of all accelerations that satisfy the constraints, or violate them least, these are nearest to a_F in the
+metric of M (Gauss's principle); the multipliers are those of least norm. Each symbol is a function on arrays, differentiable to
+any order, and the tests compare every faster form with it; `method` is any pseudoinverse.
 
-Rows of Psi in metres and rows in radians have singular values of different units. Weights w (m,) of the rows make them comparable
-to one another, so that one threshold of the rank serves all (`Scales.weights`: 1 for metres, a length for radians): D and b stand
-for diag(w) D and diag(w) b, which changes no solution of consistent rows, and lambda = -w (D^+)^T D^+ b, in N and N m. A weight
-of zero leaves its row out.
+Rows of Psi in metres and in radians have singular values of different units. Weights w (m,) of the rows make them comparable, so
+that one rank tolerance suffices (`Scales.weights`: 1 for metres, a length for radians): D and b stand for diag(w) D and
+diag(w) b, which has the same solutions if the rows are consistent, and lambda = -w (D^+)^T D^+ b, in N and N m. A weight of zero
+leaves its row out.
 
-Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` are the gains alpha and
-beta, or None: no stabilization; `w` are the weights (m,), or None: all one.
+Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` holds the gains alpha and
+beta; None: no stabilization. `w` are the weights (m,); None: all one.
 """
 
 import equinox as eqx
@@ -36,9 +36,9 @@ Weights = Float[ArrayLike, "m"] | None
 
 
 class Baumgarte(PrintsLine):
-    """Feed the violation back: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0, alpha and beta in 1/s.
+    """Baumgarte stabilization: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0.
 
-    Gains of 2 to 5 hold the drift that redundancy and rounding excite; the hundreds of the literature make the problem stiff.
+    Gains of 2 to 5 bound the drift caused by redundancy and rounding; the hundreds of the literature make the problem stiff.
 
     Args:
         alpha: the gain on Psi_dot (1/s).
@@ -96,7 +96,7 @@ def multipliers(
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
 ) -> Float[Array, "m"]:
-    """Return lambda = -(D^+)^T D^+ b: of all that keep M a + Psi_q^T lambda = F those of least norm, where w is None."""
+    """Return lambda = -(D^+)^T D^+ b: without w, the multipliers of least norm with M a + Psi_q^T lambda = F."""
     D_plus = pseudoinverse(method, D(mechanism, t, q, w))
     return weigh(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
 
@@ -104,9 +104,9 @@ def multipliers(
 def project(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, method: Pseudoinverse, w: Weights = None, steps: int = 2
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Return a state to the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
+    """Project a state onto the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
 
-    Newton steps q - M^(-1/2) D^+ Psi are followed by one step v - M^(-1/2) D^+ Psi_dot, in which Psi_dot is linear.
+    Newton steps q - M^(-1/2) D^+ Psi are followed by one step v - M^(-1/2) D^+ Psi_dot, as Psi_dot is linear in v.
     """
 
     def newton(_: Array, q: Array) -> Array:
@@ -122,7 +122,7 @@ def project(
 def tangent_part(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
 ) -> Float[Array, "n"]:
-    """Return (I - M^(-1/2) D^+ D M^(1/2)) of a small change of q or v: its part within the manifold, which projection leaves."""
+    """Return (I - M^(-1/2) D^+ D M^(1/2)) times a small change of q or v: its tangent part, which projection preserves."""
     matrix = D(mechanism, t, q, w)
     return change - inverse_sqrt_mass(mechanism) * (
         pseudoinverse(method, matrix) @ (matrix @ (change / inverse_sqrt_mass(mechanism)))
@@ -135,12 +135,12 @@ def inverse_sqrt_mass(mechanism: Mechanism) -> Float[Array, "n"]:
 
 
 def weigh(w: Weights, rows: Array) -> Array:
-    """Return diag(w) times some rows, or times one number for each row; `rows` as they are where w is None."""
+    """Return diag(w) times `rows`, a matrix or a vector; unchanged if w is None."""
     return rows if w is None else (rows.T * jnp.asarray(w)).T
 
 
 def pseudoinverse(method: Pseudoinverse, D: Float[Array, "m n"]) -> "Plus | ZeroPseudoinverse":
-    """D^+ as an operator, `D_plus @ b` and `D_plus.T @ x`; of no rows at all it is zero."""
+    """Return D^+ as an operator, `D_plus @ b` and `D_plus.T @ x`; zero if D has no rows."""
     return method.plus(D) if len(D) else ZeroPseudoinverse(D.shape)
 
 

@@ -1,7 +1,7 @@
-"""The programs of a small scene written out: as expressions of one graph, without loops and without arrays in between.
+"""The unrolled programs of a small scene: expressions of one graph, without loops and intermediate arrays.
 
-Results that depend on numbers of the scene alone, the `constants`, are computed once a run, by `prologue`. They are not those
-of the loops, but whatever the programs need.
+Results that depend only on numbers of the scene, the `constants`, are computed once for each run by `prologue`. They differ from
+the constants of the loops.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ WITH_ENTRIES = ("rows_and_loads", "dense_accelerations", "dense_newton_q", "dens
 
 
 class UnrolledProgram(NamedTuple):
-    """A program, and where each of its inputs and outputs is."""
+    """A program, and the place of each of its inputs and outputs."""
 
     program: ScalarProgram
     inputs: list[ArrayPlace]
@@ -28,7 +28,7 @@ class UnrolledProgram(NamedTuple):
 
 
 class UnrolledDerivative(NamedTuple):
-    """A program, and its derivative along directions, or the transpose of that."""
+    """A program, and its derivative along directions or the transpose of the derivative."""
 
     evaluation: UnrolledProgram  # the results, and "stored": numbers that the derivative needs
     derivative: UnrolledProgram
@@ -39,10 +39,11 @@ class Unrolled:
 
     Args:
         programs: The programs as loops.
-        names: Names of those to write out.
-        differentiated: Names of those to differentiate, out of `ScenePrograms.differentiable`.
-        active: Of the numbers that the prologue takes: along which there are derivatives.
-        mode: Of derivatives: `FORWARD`, `TWICE`; `REVERSE`, from cotangents of the results to those of q, v and the constants.
+        names: Names of the programs to unroll.
+        differentiated: Names of the programs of `ScenePrograms.differentiable` to differentiate.
+        active: For each number that the prologue takes, whether derivatives by it are needed.
+        mode: Mode of differentiation: `FORWARD`, `TWICE`, or `REVERSE`, from cotangents of the results to those of q, v and the
+            constants.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class Unrolled:
     ):
         graph = self.graph = Graph()
         n, count = programs.coordinate_count, programs.number_count
-        # Thresholds of pivots are set anew for single programs: nothing is made of them beforehand.
+        # Thresholds of pivots differ between programs, so the prologue does not use them.
         groups = ["parameter"] * (count - 2) + ["threshold", "parameter"]
         self.numbers = [graph.input(("numbers", k), group) for k, group in enumerate(groups)]
         sizes = {"t": (1, "time"), "q": (n, "position"), "v": (n, "velocity"), "dq": (n, "change"), "dv": (n, "change")}
@@ -68,7 +69,7 @@ class Unrolled:
         }
         moved = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
         self.moving = [k for k, s in sorted(layout.items()) if s.index in moved]
-        """The constants of the loops along which there are derivatives; programs count these alone."""
+        """The constants that depend on active numbers; derivatives index only these."""
         self._derivatives = {x: self._differentiate(programs.differentiable[x], n, mode) for x in differentiated}
         wanted = [
             s for found in (*self._results.values(), *(x for d in self._derivatives.values() for x in d)) for s in found.values()
@@ -96,7 +97,7 @@ class Unrolled:
         return UnrolledDerivative(evaluation, self._program(outputs, at | self._seeds))
 
     def evaluations(self, names: Sequence[str]) -> UnrolledProgram:
-        """Return the numbers that derivatives of several programs need of one state, as "stored" and a program's name."""
+        """Return the program of the numbers that derivatives need at one state, as "stored" and the name of each program."""
         found: dict[ArrayPlace, Scalar] = {}
         for name in names:
             evaluation = self.derivative(name).evaluation
@@ -105,7 +106,7 @@ class Unrolled:
         return self._program(found, {})
 
     def prologue_derivative(self, active: Sequence[bool], mode: str) -> UnrolledProgram:
-        """Return the program from the changes of the active numbers to those of the moving constants, or its transpose."""
+        """Return the program from tangents of the active numbers to tangents of the moving constants, or its transpose."""
         graph, layout = self.graph, self._arrays["constants"]
         numbers = {s: ("numbers", k) for k, s in enumerate(self.numbers)}
         variables = [s for s, is_active in zip(self.numbers, active, strict=False) if is_active]
@@ -141,13 +142,13 @@ class Unrolled:
 
     @cached_property
     def _seeds(self) -> dict[Scalar, ArrayPlace]:
-        """The inputs of derivatives that are tangents or cotangents."""
+        """The tangents or cotangents among the inputs of derivatives."""
         return {}
 
     def _differentiate(
         self, given: DifferentiableProgram, n: int, mode: str
     ) -> tuple[dict[ArrayPlace, Scalar], dict[ArrayPlace, Scalar]]:
-        """Return the results, and their changes, or the cotangents of what they depend on."""
+        """Return the results and their tangents, or the cotangents of the inputs."""
         arrays = self._unroll(given.program)
         results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
         variables = {"constants": self.moving, "q": range(n), "v": range(n)}
@@ -171,7 +172,7 @@ def _entries(arrays: Arrays, names: Sequence[str]) -> dict[ArrayPlace, Scalar]:
 
 
 def _depending(graph: Graph, scalars: Sequence[Scalar]) -> set[int]:
-    """Return the nodes that depend on some scalars."""
+    """Return the nodes that depend on any of some scalars."""
     found = {s.index for s in scalars}
     for index, node in enumerate(graph.nodes):
         if any(a.index in found for a in node.arguments):

@@ -1,7 +1,7 @@
 """The operations of machine code: a class for each, with its module and the shapes of its inputs and outputs.
 
-An operation is all that its code depends on but the number of lanes. Inputs and outputs have the members first; an input that
-all members share has only one. Those that integrate are in runs.py, those that find positions in position_operations.py.
+An operation defines its code up to the number of lanes. The first axis of inputs and outputs is that of the members, of length
+one for shared inputs. runs.py has the operations that integrate, position_operations.py those that find positions.
 """
 
 from abc import ABC, abstractmethod
@@ -35,16 +35,16 @@ class Operation(ABC):
 
     code: ScenePrograms
 
-    input_names: ClassVar[tuple[str, ...]] = INPUTS  # of the first inputs
-    settings: ClassVar[tuple[str, ...]] = SETTINGS  # settings of this kind of operation
-    in_lanes: ClassVar[bool] = True  # whether members run side by side
-    results: ClassVar[int] = len(OUTPUTS)  # the first outputs, which have no directions
-    share: ClassVar[int] = SHARE  # members of a thread, at least
-    is_reverse: ClassVar[bool] = False  # whether it runs and walks back in two passes, each without what the other finds
+    input_names: ClassVar[tuple[str, ...]] = INPUTS  # names of the first inputs
+    settings: ClassVar[tuple[str, ...]] = SETTINGS  # names of the settings of this kind of operation
+    in_lanes: ClassVar[bool] = True  # whether members run in lanes
+    results: ClassVar[int] = len(OUTPUTS)  # number of the first outputs, which have no directions
+    share: ClassVar[int] = SHARE  # minimum number of members of a thread
+    is_reverse: ClassVar[bool] = False  # whether two passes integrate and backpropagate, each with a part of the outputs
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        """The names of the settings that it takes."""
+        """The names of the settings."""
         return self.settings
 
     @property
@@ -54,20 +54,20 @@ class Operation(ABC):
 
     @abstractmethod
     def module(self, width: int, beside: int, vector: int) -> Memory:
-        """Return the module in so many lanes.
+        """Return the module for a number of lanes.
 
         Args:
             width: The number of lanes.
-            beside: Number of directions of a single member side by side.
+            beside: Number of directions of a single member in the lanes of a tangent.
             vector: Number of float64 numbers in a register.
         """
 
     @abstractmethod
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the outputs, of one member."""
+        """Return the shapes of the outputs of one member."""
 
     def shapes(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the outputs, from inputs."""
+        """Return the shapes of the outputs of all members."""
         members = max([x.shape[0] for x in inputs])
         return [(members, *shape) for shape in self.outputs(inputs, times)]
 
@@ -86,18 +86,18 @@ class Operation(ABC):
         """Pack the inputs of one member.
 
         Args:
-            numbers: All numbers of the scene, and two thresholds of pivots.
+            numbers: All numbers of the scene and the two thresholds of pivots.
             ts: Times (s).
             q: Positions (n,).
             v: Velocities (n,).
-            settings: Settings by name; those of the operation are taken.
+            settings: Settings by name; others than those of the operation are ignored.
             rows: The scales of the rows of Psi.
             breaks: Times (s) where the motion is not smooth, in their order.
-            xp: jax.numpy, without derivatives, or NumPy, where all is known.
+            xp: jax.numpy, without derivatives, or NumPy if all inputs are concrete.
             further: Further inputs.
 
         Returns:
-            Arrays with the member first.
+            Arrays (1, ...).
         """
         as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
         values = [settings[name] for name in self.all_settings]
@@ -123,16 +123,16 @@ class StateOperation(Operation):
 
     @property
     def projection(self) -> "ProjectStates":
-        """The operation that returns states to the constraint manifold."""
+        """The operation that projects states onto the constraint manifold."""
         return ProjectStates(self.code, self.pseudoinverse, self.formulation)
 
     @property
     def tangent_part(self) -> "FindTangentPart":
-        """The operation that finds the part of small changes of states within the constraint manifold."""
+        """The operation that finds the tangent part of small changes of states."""
         return FindTangentPart(self.code, self.pseudoinverse, self.formulation)
 
     def of_events(self, conditions: Conditions, impacts: tuple[int, ...]) -> "EvaluateEvents":
-        """Return the operation that evaluates conditions, and the directions of the impulses of some of them, too."""
+        """Return the operation that evaluates conditions and, for some of them, directions of impulses."""
         return EvaluateEvents(self.code, self.pseudoinverse, self.formulation, conditions, impacts)
 
     def module(self, width: int, beside: int, vector: int) -> Module:
@@ -149,13 +149,13 @@ class Accelerate(StateOperation):
 
 
 class ProjectStates(StateOperation):
-    """Return states to the constraint manifold."""
+    """Project states onto the constraint manifold."""
 
     function = StateProjection
 
 
 class FindTangentPart(StateOperation):
-    """Find the part of small changes of states within the constraint manifold."""
+    """Find the tangent part of small changes of states."""
 
     function = StateTangentPart
 
@@ -165,7 +165,7 @@ class EvaluateEvents(StateOperation):
     """Find accelerations, conditions and directions of impulses at states."""
 
     conditions: Conditions | None = None
-    impacts: tuple[int, ...] = ()  # of the conditions: those with directions of impulses
+    impacts: tuple[int, ...] = ()  # indices of the conditions with directions of impulses
 
     def module(self, width: int, beside: int, vector: int) -> Module:
         assert self.conditions is not None
@@ -180,7 +180,7 @@ class EvaluateEvents(StateOperation):
 
 @dataclass(frozen=True)
 class MarkRows(Operation):
-    """Mark the rows of Psi that are independent near a position: one for each that is, zero for others."""
+    """Mark the rows of Psi that are independent near a position with one, others with zero."""
 
     settings: ClassVar[tuple[str, ...]] = RowMarks.settings
 
@@ -193,7 +193,7 @@ class MarkRows(Operation):
 
 @dataclass(frozen=True)
 class FindScales(Operation):
-    """Find the characteristic scales, of numbers alone."""
+    """Find the characteristic scales from the numbers of a scene."""
 
     settings: ClassVar[tuple[str, ...]] = ()
     in_lanes: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""Numbers as machine code takes them: all numbers of a scene in one vector, their changes and cotangents, and samples."""
+"""Inputs of machine code: all numbers of a scene in one vector, their tangents and cotangents, and samples."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -16,12 +16,12 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class ActiveNumbers:
-    """The numbers of a tree, of which some are active: they have derivatives.
+    """The numbers of a tree, some of which are active, that is, have derivatives.
 
-    Machine code takes them as one vector, with two thresholds at its end, which have none.
+    Machine code takes them as one vector, followed by the two thresholds of pivots, which are inactive.
 
     Attributes:
-        mask: of all numbers and the two thresholds, those that are active.
+        mask: whether each of all numbers and the two thresholds is active.
     """
 
     def __init__(self, numbers: PyTree[Array], active: PyTree[bool]):
@@ -35,7 +35,7 @@ class ActiveNumbers:
         leaves = zip(self._numbers, self._active, leaves_and_none(change), strict=True)
         moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
         which = np.array(self.mask)
-        # Two operations, however many pieces there are: each would take XLA as long as a hundred steps of a small scene.
+        # Two operations for any number of parts: XLA takes as long for each as for a hundred steps of a small scene.
         return jnp.concatenate([*moving, np.zeros(1)])[np.where(which, np.cumsum(which) - 1, np.sum(which))]
 
     def cotangents(self, bars: Array) -> PyTree[Array]:
@@ -49,26 +49,26 @@ class ActiveNumbers:
 
 
 def leaves_and_none(tree: PyTree) -> list[Any]:
-    """Return the leaves of a tree, None among them."""
+    """Return the leaves of a tree, including None."""
     return jax.tree.leaves(tree, is_leaf=lambda x: x is None)
 
 
 class SampleRows:
-    """The rows of all that has samples in a mechanism, side by side, one for each interval between the breakpoints of a run."""
+    """The sampled numbers of a mechanism as rows, one for each interval between the breakpoints of a run."""
 
     def __init__(self, mechanism: Mechanism, breakpoints: Float[Array, "K"] | None):
         self.samples = mechanism.samples
         self._breakpoints = breakpoints
 
     def breakpoints(self, xp: ModuleType) -> Any:
-        """Return the breakpoints of the run in their order: by NumPy where they are known."""
+        """Return the sorted breakpoints of the run; by NumPy if they are concrete."""
         if self._breakpoints is None:
             return np.zeros(0)
         traced = isinstance(self._breakpoints, Tracer)
         return xp.sort(stop_gradients(self._breakpoints)) if traced else np.sort(np.asarray(self._breakpoints))
 
     def stand_in(self, mechanism: Mechanism, marks: bool = False) -> Mechanism:
-        """Return the mechanism that programs are made of, or the tree of its changes, or, with `marks`, of what is active."""
+        """Return a mechanism, or a tree of its tangents or, with `marks`, of active numbers, with one row for the samples."""
         found = {}
         for place, given in mechanism.samples.items():
             present = [leaf for leaf in leaves_and_none(given) if leaf is not None]
@@ -77,7 +77,7 @@ class SampleRows:
         return mechanism.with_samples(found)
 
     def places(self, mechanism: Mechanism) -> tuple[int, ...]:
-        """Return the places of a row's numbers among all numbers of the mechanism that programs are made of."""
+        """Return the indices of a row's numbers among all numbers of the mechanism from `stand_in`."""
         if not self.samples:
             return ()
         blank = jax.tree.map(lambda x: np.zeros(np.shape(x), bool), self.stand_in(mechanism))
@@ -85,7 +85,7 @@ class SampleRows:
         return tuple(np.flatnonzero(np.concatenate([np.ravel(x) for x in marked.numbers])).tolist())
 
     def rows(self, xp: ModuleType, samples: Sequence[Any] | None = None) -> Any:
-        """Return the rows (K + 1, R), of other `samples` if they are given."""
+        """Return the rows (K + 1, R), by default of the mechanism's samples."""
         breakpoints = self.breakpoints(xp)
         columns = []
         for x in self.samples.values() if samples is None else samples:
@@ -101,14 +101,14 @@ class SampleRows:
         return xp.concatenate(columns, axis=1)
 
     def changes(self, mechanism: Mechanism) -> Array:
-        """Return the change of the rows along that of a mechanism."""
+        """Return the tangents of the rows from those of a mechanism."""
         leaves, form = jax.tree.flatten(list(self.samples.values()))
         given = leaves_and_none(list(mechanism.samples.values()))
         along = [jax.numpy.zeros(np.shape(x)) if dx is None else dx for x, dx in zip(leaves, given, strict=True)]
         return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (along,))[1]
 
     def with_cotangents(self, mechanism: Mechanism, active: Mechanism, bars: Array) -> Mechanism:
-        """Return a mechanism of cotangents with those of what has samples, from those of the rows."""
+        """Return a mechanism of cotangents with those of the samples, from those of the rows."""
         leaves, form = jax.tree.flatten(list(self.samples.values()))
         marks = leaves_and_none(list(active.samples.values()))
         (found,) = jax.vjp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), leaves)[1](bars)

@@ -1,4 +1,4 @@
-"""The operations of machine code that find positions: closing, with its derivatives, and following the positions of a drive."""
+"""The operations of machine code that find positions: closing with its derivatives, and following the positions of a drive."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from udkjax.native.operations import Operation
 
 @dataclass(frozen=True)
 class Close(Operation):
-    """Close a mechanism: its state, what is left of Psi and Psi_dot, and the rank of Psi_q."""
+    """Close a mechanism: its state, the remaining Psi and Psi_dot, and the rank of Psi_q."""
 
     settings: ClassVar[tuple[str, ...]] = Closing.settings
     in_lanes: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class Close(Operation):
 
 @dataclass(frozen=True)
 class CloseTangents(Close):
-    """Close, with the changes of the state along directions."""
+    """Close, with the tangents of the state along directions."""
 
     active: tuple[bool, ...] = ()
 
@@ -69,7 +69,7 @@ class CloseSecondTangents(CloseTangents):
 
 @dataclass(frozen=True)
 class CloseCotangents(Close):
-    """Close, and walk back from cotangents of the state to those of all numbers and of the guess."""
+    """Close, and pull cotangents of the state back to all numbers and the guess."""
 
     active: tuple[bool, ...] = ()
 
@@ -83,7 +83,7 @@ class CloseCotangents(Close):
 
 @dataclass(frozen=True)
 class March(Operation):
-    """Follow the positions of a driven mechanism over values: q, q', q'', their sides, and how many are to be relied on."""
+    """Follow the positions of a driven mechanism over values: q, q', q'', their sides, and the number of reliable ones."""
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 

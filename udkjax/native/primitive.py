@@ -1,4 +1,4 @@
-"""Machine code of operations: compiled once for each, called at once or, as a primitive of JAX, from compiled programs."""
+"""Machine code of operations: compiled once for each, called directly or, as a JAX primitive, from compiled programs."""
 
 import ctypes
 import math
@@ -31,19 +31,19 @@ from udkjax.native.operations import FindScales, Operation
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 
-QUICK_MEMBERS = 16  # of a call by code that is compiled quickly
-QUICK_STEPS = 4_000  # of all its members: some 20 ms
-QUICK_SECONDS_OF_LINE = 2e-6  # of such calls, in all: a tenth of what it takes to compile a line
-CORES = os.cpu_count() or 1  # threads of a call
+QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
+QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
+QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls for each line of text: a tenth of the time of compiling a line
+CORES = os.cpu_count() or 1  # maximum number of threads of a call
 TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
-FEW = 2  # members up to which one follows another: eight lanes take as long as two members
+FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
 
 @lru_cache(maxsize=256)
 def generate(operation: Operation, width: int, beside: int) -> Memory:
-    """Write the module of an operation in so many lanes; raise `UnsupportedError` where there is no instruction for it.
+    """Write the module of an operation in `width` lanes; raise `UnsupportedError` if machine code does not support it.
 
-    `beside`: how many directions of a single member are side by side.
+    `beside` is the number of directions of a single member in the lanes of a tangent.
     """
     module = operation.module(width, beside, machine.lanes())
     handlers = handler(module, "call_frame")
@@ -54,10 +54,9 @@ def generate(operation: Operation, width: int, beside: int) -> Memory:
 
 @lru_cache(maxsize=256)
 def unsupported(code: ScenePrograms) -> str:
-    """Return the operations of a scene that machine code has no instruction for; empty where there are none.
+    """Return the unsupported operations of a scene; empty if there are none.
 
-    The kernels of its elements are written once each, as loops take them: which operation needs them, in which form, may come to
-    be something else than what is compiled, and is much longer.
+    Each kernel of its elements is written once, in loops; the text that is compiled may be unrolled and much longer.
     """
     loops, at = LoopWriter(1), defaultdict(lambda: ("work", 0))
     try:
@@ -69,10 +68,10 @@ def unsupported(code: ScenePrograms) -> str:
 
 
 class LoadedCode:
-    """The machine code of one operation, in so many lanes.
+    """The machine code of one operation in `width` lanes.
 
-    First calls are of code that is compiled quickly, until they have taken a tenth of the time that optimized code would; and
-    those of few members and steps alone, since it runs slowly. Both round alike.
+    First calls use quickly compiled code, until they have taken a tenth of the time of compiling optimized code; and only if they
+    have few members and steps, as it runs slowly. Both round equally.
     """
 
     def __init__(self, operation: Operation, width: int, beside: int):
@@ -86,7 +85,7 @@ class LoadedCode:
 
     @property
     def name(self) -> str:
-        """The name that XLA knows it by."""
+        """The name of the FFI target in XLA."""
         return self._optimized.name
 
     @cached_property
@@ -99,7 +98,7 @@ class LoadedCode:
         return load(self._module.written_text, machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-        """Return outputs of these shapes, found on as many threads as there are cores."""
+        """Return outputs of these shapes, computed by one thread for each core."""
         if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and not self._quick.library.is_optimized:
             found = self._call_quickly(inputs, shapes)
             if found is not None:
@@ -107,7 +106,7 @@ class LoadedCode:
         return self.prepare(inputs, shapes)()
 
     def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
-        """Return the outputs; None if there are more steps than this should take."""
+        """Return the outputs; None if there are too many steps."""
         inputs, most, place = [*inputs], QUICK_STEPS / shapes[0][0], self._step_limit
         if place is not None:
             k = INPUTS.index("settings")
@@ -125,9 +124,9 @@ class LoadedCode:
     def prepare(
         self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: "Code | None" = None
     ) -> "PreparedCall":
-        """Return a call, which may be repeated with other numbers in its inputs: those given, where they are float64."""
+        """Return a call, which can be repeated with other numbers in its inputs; these are the given arrays if float64."""
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
-        # Of the two passes of reverse mode each leaves out what the other finds: zeros, since NaN would alarm jax.debug_nans.
+        # Each pass of reverse mode writes only a part of the outputs: zeros instead of NaN, which jax.debug_nans would report.
         found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
         arrays, following = (*inputs, *found), ctypes.c_int64(0)
@@ -152,7 +151,7 @@ class PreparedCall(NamedTuple):
     record: ctypes.Array
     next_member: ctypes.c_int64
     threads: int
-    inputs: list[np.ndarray]  # float64, one behind the other in memory
+    inputs: list[np.ndarray]  # float64, contiguous in memory
     outputs: list[np.ndarray]
 
     def __call__(self) -> list[np.ndarray]:
@@ -167,12 +166,12 @@ class PreparedCall(NamedTuple):
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """Return the threads that calls share: to start one takes longer than many a run."""
+    """Return the threads that calls share, as starting a thread takes longer than short runs."""
     return ThreadPoolExecutor(CORES)
 
 
 class Code(NamedTuple):
-    """Machine code in memory: the name that XLA knows it by if it is optimized, and its function `run`."""
+    """Loaded machine code: the name of its FFI target in XLA, if optimized, and its function `run`."""
 
     name: str
     run: Callable[[int], Any]
@@ -184,10 +183,10 @@ _LOADING = Lock()
 
 
 def load(text: str, level: int = machine.LEVEL) -> Code:
-    """Load the code of a module: that of this level, or optimized code where there is some.
+    """Load the code of a module at a level of optimization, or optimized code if there is some.
 
-    XLA takes one address for a name, and programs that it has compiled call that whenever they run: code that was loaded once
-    stays, and serves every caller with the same text.
+    XLA keeps one address for each name, and compiled programs may call it at any time: loaded code is never freed, and serves all
+    callers with the same text.
     """
     name = f"udkjax_{machine.digest(text)}"
     with _LOADING:
@@ -209,17 +208,17 @@ def machine_code(operation: Operation, width: int, beside: int) -> LoadedCode:
 
 
 def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
-    """Run an operation on the concrete numbers of one member: nothing is traced for it."""
+    """Run an operation on concrete numbers of one member, without tracing."""
     return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 
 
-# --- as a primitive of JAX
+# --- as a JAX primitive
 
 
 def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     few = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
     directions = inputs[-1].shape[1] if operation.tangents and few and operation.code.is_small else 1
-    beside = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are the faster ones
+    beside = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are faster
     return machine_code(operation, 1 if few else machine.lanes(), beside)
 
 
@@ -228,7 +227,7 @@ def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
 
 
 def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
-    """Run an operation on numbers that are known, of as many members as there are."""
+    """Run an operation on concrete numbers of any number of members."""
     return _select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
 
 
@@ -237,7 +236,7 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     found = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
     if not operation.is_reverse:
         return found
-    # Outputs that a pass does not write, as in `LoadedCode`, are uninitialized memory.
+    # The outputs that a pass does not write (`LoadedCode`) are uninitialized memory.
     results, (*bars, record) = found[: len(OUTPUTS)], found[len(OUTPUTS) :]
     if inputs[-1].shape[0]:
         return [*map(jnp.zeros_like, results), *bars, record]
@@ -251,7 +250,7 @@ def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
 def _batch(
     inputs: Sequence[Any], axes: Sequence[int | None], operation: Operation, times: int
 ) -> tuple[list[Any], list[int | None]]:
-    """Bind a batch as more members; but one of directions alone as more directions."""
+    """Bind a batch as more members, or a batch only of directions as more directions."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
     shared, results = len(inputs) - operation.tangents, operation.results
@@ -288,7 +287,7 @@ mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
 evaluate_as(native_p, call_members)
 
 
-# --- the scales of traced mechanisms, whose operation of JAX is the equations'
+# --- the scales of traced mechanisms, by the primitive of equations/scales.py
 
 
 def _scale_inputs(numbers: Any) -> list[Any]:
@@ -304,7 +303,7 @@ def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
 
 
 def _scales_of_batch(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
-    """Return scales as an operation by itself: of a few vectors by NumPy, which compiles nothing."""
+    """Evaluate the primitive of scales outside compiled programs; for a few vectors by NumPy, without compilation."""
     if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or jax.default_backend() != "cpu" or unsupported(programs):
         return evaluate_scales(numbers, programs)
     (found,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)

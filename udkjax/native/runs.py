@@ -1,4 +1,4 @@
-"""The operations of machine code that integrate: a run, up to an event, and with its derivatives."""
+"""The operations of machine code that integrate: a run, a run up to an event, and runs with derivatives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -20,16 +20,16 @@ from udkjax.native.watching.watching import Watching
 
 @dataclass(frozen=True)
 class RunStates(Operation):
-    """Integrate: q, v, the violation of Psi, and how the run ended."""
+    """Integrate: the outputs are q, v, the violation of Psi, and how the run ended."""
 
     method: Method
     projected: bool
-    breaks: bool  # whether there are times, or pieces of the state, where the motion is not smooth
-    sampled: tuple[int, ...] = ()  # places of the numbers that have samples
+    breaks: bool  # whether there are breakpoints, or pieces of the state
+    sampled: tuple[int, ...] = ()  # indices of the numbers that have samples
     pseudoinverse: DenseMethod | None = None  # None: elimination
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
 
-    info_names: ClassVar[tuple[str, ...]] = INFO  # of the first numbers of the output "info"; then the last q and v
+    info_names: ClassVar[tuple[str, ...]] = INFO  # names of the first numbers of the output "info", before the last q and v
 
     @property
     def all_settings(self) -> tuple[str, ...]:
@@ -56,20 +56,20 @@ class RunStates(Operation):
         return Accelerate(self.code, self.pseudoinverse, self.formulation)
 
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
-        """Return the operation that integrates along directions of what is active of the numbers of the scene, too."""
+        """Return the operation with tangents along directions of the active numbers of the scene and of the initial state."""
         return RunTangents(**self._for_derivatives, active=active)
 
     def with_second_tangents(self, active: tuple[bool, ...]) -> "RunSecondTangents":
-        """Return the operation that finds second derivatives along pairs of directions of what is active."""
+        """Return the operation with second derivatives along pairs of directions."""
         return RunSecondTangents(**self._for_derivatives, active=active)
 
     def with_cotangents(self, active: tuple[bool, ...], breakpoints: int = 0, points: int | None = None) -> "RunCotangents":
-        """Return the operation that walks back to the active numbers by a record.
+        """Return the operation that backpropagates to the active numbers along a record.
 
         Args:
             active: mask of the numbers of the scene.
             breakpoints: number of times where the motion is not smooth.
-            points: capacity of the record of a run; None: enough for most.
+            points: capacity of the record of a run; None: sufficient for most.
         """
         points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
@@ -108,9 +108,9 @@ class RunWatched(RunStates):
 
 @dataclass(frozen=True)
 class RunTangents(RunStates):
-    """Integrate, with the changes of the states and of the end along directions."""
+    """Integrate, with the tangents of the states and of the end along directions."""
 
-    active: tuple[bool, ...] = ()  # of the numbers of the scene: along which there are derivatives
+    active: tuple[bool, ...] = ()  # for each number of the scene, whether derivatives by it are needed
 
     @property
     def tangents(self) -> int:
@@ -139,7 +139,7 @@ class RunSecondTangents(RunTangents):
 
 @dataclass(frozen=True)
 class RunCotangents(RunStates):
-    """Integrate and leave a record; or, with cotangents of the states and of the end, walk back to those of all numbers."""
+    """Integrate and return a record; or, with cotangents of the states and of the end, backpropagate to all numbers."""
 
     active: tuple[bool, ...] = ()
     points: int = record.STORED  # capacity of the record of a run

@@ -83,7 +83,7 @@ class AbstractCurve(ABC):
         return X, closed
 
     def clearance(self, X: Float[Array, "n+1"]) -> Any:
-        """Return how far E is from losing rank, as where branches meet: its n-th singular value over the largest."""
+        """Return the distance of E from rank loss, as where branches meet: its n-th singular value over the largest."""
         xp, E = self.by.xp, self.slopes(X)
         if min(E.shape) < len(X) - 1:
             return xp.zeros(())

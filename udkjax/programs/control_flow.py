@@ -1,6 +1,6 @@
-"""Loops and branches of an algorithm that is written once: by NumPy and Python where all numbers are known, else by JAX.
+"""Loops and branches of algorithms that are written once and run by NumPy where all numbers are concrete, else by JAX.
 
-Programs that JAX compiles take seconds before their first step; NumPy begins at once.
+JAX compiles for seconds before the first step; NumPy begins at once.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,16 +21,16 @@ Result = TypeVar("Result")
 
 
 class ControlFlow(NamedTuple):
-    """An array library and its loops; `while_loop`, `cond`, `scan` and `map` are those of `jax.lax`, or take what these take."""
+    """An array library and its loops; `while_loop`, `cond`, `scan` and `map` have the signatures of `jax.lax`."""
 
     xp: ArrayLibrary
     while_loop: Callable[..., Any]
     cond: Callable[..., Any]
     scan: Callable[..., Any]
     map: Callable[..., Any]
-    vmap: Callable[[Callable[..., Any]], Callable[..., Any]]  # of one argument
-    put: Callable[[Any, Any, Any], Any]  # an array with another value at an index; the array before is not used again
-    call: Callable[..., Any]  # a function written for JAX, of some arguments
+    vmap: Callable[[Callable[..., Any]], Callable[..., Any]]  # of functions of one argument
+    put: Callable[[Any, Any, Any], Any]  # set an element of an array; the old array must not be used again
+    call: Callable[..., Any]  # call a function written for JAX
 
 
 def _while_loop(condition: Callable[[Carry], Any], body: Callable[[Carry], Carry], state: Carry) -> Carry:
@@ -95,12 +95,12 @@ BY_NUMPY = ControlFlow(np, _while_loop, _cond, _scan, _map, _vmap, _put, _call_c
 
 
 def control_flow(xp: ArrayLibrary) -> ControlFlow:
-    """Return the loops of an array library."""
+    """Return the control flow of an array library."""
     return BY_NUMPY if xp is np else BY_JAX
 
 
 def solve(function: Callable[..., Result], *given: Any) -> Result:
-    """Return function(*given, by), where `by` is NumPy's control flow if all is known, else JAX's in one compiled program."""
+    """Return function(*given, by): `by` is NumPy's control flow if all numbers are concrete, else JAX's in one program."""
     if is_traced(given):
         return _compiled(_by_jax, function, *given)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
@@ -109,13 +109,13 @@ def solve(function: Callable[..., Result], *given: Any) -> Result:
 
 
 def _by_jax(function: Callable[..., Result], *given: Any) -> Result:
-    return function(*given, BY_JAX)  # compared by identity: given to a compiled function it would be another one
+    return function(*given, BY_JAX)  # compared by identity: as an argument of a compiled function it would be a copy
 
 
 def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:
-    """Return function(*arguments), pytrees of arrays and choices; under `vmap`, of one member after another.
+    """Return function(*arguments), pytrees of arrays and static values, without derivatives; under `vmap`, one member at a time.
 
-    Side by side, all members of a loop would take as many steps as the slowest. Without derivatives.
+    Batched, all members of a loop would take as many steps as the slowest.
     """
     arrays, choices = eqx.partition(arguments, eqx.is_array)
 

@@ -1,7 +1,7 @@
-"""The scale of forces of a mechanism, for loads that ought to vanish, also where all of them do.
+"""The scale of a mechanism's forces, to which residual loads are compared, also if all loads vanish.
 
-Loads that balance leave rounding errors of their parts: of gravity, of each force element by itself, and of the change of the
-loads along a characteristic length, which a spring at its natural length has, too.
+Balanced loads leave rounding errors relative to their parts: gravity, each force element, and the change of the loads along a
+characteristic length, which is nonzero even for a spring at its natural length.
 """
 
 from typing import NamedTuple
@@ -22,14 +22,14 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class LoadScale(NamedTuple):
-    """Sizes in the metric of the mass matrix: where they are zero, nothing pulls, and nothing would nearby."""
+    """Sizes in the metric of the mass matrix; zero if there are no loads here and nearby."""
 
     force: Float[Array, ""]  # N/sqrt(kg): of M^(-1/2) F
     stiffness: Float[Array, ""]  # (rad/s)^2: of M^(-1/2) F_q M^(-1/2)
 
 
 def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n"]) -> LoadScale:
-    """Return the scale of forces and of stiffnesses at rest in a position q at time t (s); without derivatives."""
+    """Return the scales of forces and stiffnesses at rest in a position q at time t (s), without derivatives."""
     mechanism, scales, t, q = jax.lax.stop_gradient((mechanism, scales, t, q))
     at_rest, root, units = jnp.zeros_like(q), jnp.sqrt(loads.mass(mechanism)), scales.coordinates(len(q))
     change = jnp.abs(jax.jacfwd(lambda q: loads.force(mechanism, t, q, at_rest))(q)) @ units
@@ -38,7 +38,7 @@ def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n
 
 
 def load_sizes(mechanism: Mechanism, t: Time, q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Return the sum of the sizes of all loads on each coordinate (N, N m): of gravity, and of each force element by itself."""
+    """Return the sum of the absolute loads on each coordinate (N, N m), of gravity and of each force element."""
     time = jnp.asarray(t, jnp.result_type(float))
 
     def sizes(element: ForceElement, *frames: Frame) -> Float[Array, "frames 3"]:

@@ -19,7 +19,7 @@ SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds
 
 
 def both(operation, inputs, times):
-    """What an operation returns as WebAssembly, and by this processor without fused multiply-add."""
+    """The outputs of an operation as WebAssembly, and by this processor without fused multiply-add."""
     made, inputs = wasm_module(operation), [np.ascontiguousarray(x, float) for x in inputs]
     shapes = operation.shapes(inputs, times)
     host = Host(made.linked.code, made.linked.data_end)

@@ -1,4 +1,4 @@
-"""Modules out of LLVM's object code: exports, imports and constants, and what is no object code."""
+"""Modules out of LLVM's object code: exports, imports and constants, and refusal of other bytes."""
 
 import numpy as np
 import pytest

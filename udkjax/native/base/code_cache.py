@@ -1,7 +1,7 @@
 """The cache of machine code on disk.
 
-It holds object code as the compiler leaves it, under a digest of the text, the processor and the compiler: plain bytes. A file
-that is not whole is made again; the oldest go when there are too many.
+It holds object code under a digest of the text, the processor and the compiler. Incomplete files are compiled again; the oldest
+are deleted when there are too many.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import platformdirs
 
-MAX_FILES = 5_000  # object files, of 10 to 75 KiB: some 150 MB
+MAX_FILES = 5_000  # object files of 10 to 75 KiB, 150 MB in all
 _MAGIC = b"udkjax object 1\n"
 
 
@@ -24,21 +24,21 @@ def cache_folder() -> Path | None:
 
 
 def cached_files() -> list[tuple[float, int, Path]]:
-    """List the files of code: the time of their last use, their size in bytes, and their path."""
+    """List the time of last use, the size in bytes and the path of each file."""
     folder, found = cache_folder(), []
     try:
         for file in folder.iterdir() if folder else ():
-            if file.is_dir():  # of programs of JAX
+            if file.is_dir():  # JAX's own cache
                 continue
             status = file.stat()
             found.append((max(status.st_atime, status.st_mtime), status.st_size, file))
-    except OSError:  # not there yet, or another process has just removed a file
+    except OSError:  # the folder does not exist yet, or another process has just removed a file
         pass
     return found
 
 
 def read(name: str) -> bytes | None:
-    """Return the stored code of this name; None where there is none, or a file that is not whole."""
+    """Return the stored code of this name; None if the file is missing or incomplete."""
     folder = cache_folder()
     try:
         data = (folder / name).read_bytes() if folder else b""
@@ -51,7 +51,7 @@ def read(name: str) -> bytes | None:
 
 
 def write(name: str, code: bytes) -> None:
-    """Store code as a whole, or not at all: other processes may read it meanwhile."""
+    """Store code atomically, as other processes may read it meanwhile."""
     folder = cache_folder()
     if folder is None:
         return
@@ -62,12 +62,12 @@ def write(name: str, code: bytes) -> None:
             with os.fdopen(handle, "wb") as file:
                 file.write(_MAGIC + hashlib.sha256(code).digest() + code)
             os.replace(temporary, folder / name)
-        except OSError:  # a full disk: nothing half written is left on it
+        except OSError:  # a full disk: remove the partial file
             Path(temporary).unlink(missing_ok=True)
             raise
         files = [p for p in folder.iterdir() if p.is_file()]
         if len(files) > MAX_FILES:
             for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - MAX_FILES]:
                 old.unlink(missing_ok=True)
-    except OSError:  # nowhere to write: it runs all the same
+    except OSError:  # not writable: run without a cache
         return

@@ -1,11 +1,11 @@
-"""A function of ours as an operation of a compiled JAX program: XLA's typed foreign functions, without a C++ compiler.
+"""Generated code as an operation of a compiled JAX program, by XLA's typed foreign function interface without a C++ compiler.
 
 XLA calls a handler with a frame whose layout is its stable C interface (jaxlib/include/xla/ffi/api/c_api.h). The handler is
 generated along with the code that it calls: it reads the buffers of the frame and writes the call record of `run`
 (trajectory.py).
 
-Many members are shared with the threads of XLA's pool, as its own operations are. A thread that comes too late finds the work
-closed and leaves: the handler waits for those alone that have begun, so that threads that all wait cannot be waited for.
+Large batches are shared with the threads of XLA's pool. A thread that starts too late finds the work closed and leaves. The
+handler only waits for threads that have started, so a pool whose threads are all busy cannot cause a deadlock.
 """
 
 from typing import Any
@@ -14,26 +14,26 @@ from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.layout import INPUTS, SHARE
 from udkjax.native.base.memory import Memory
 
-# Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, and in it the arguments and results, 40 bytes each:
+# Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, then the arguments and the results, 40 bytes each:
 # size, extensions, count, types, buffers.
 EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
-# Functions of XLA_FFI_Api, each of a struct of its arguments: size, extensions, and then the words that are given.
+# Functions of XLA_FFI_Api, each taking a struct of its arguments: size, extensions, then the argument words.
 DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 64, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
-# Of an extension that asks for metadata: where they go, and in them the version (of the interface) that the handler speaks.
+# In an extension that requests metadata: the pointer to them, and in them the version of the interface that the handler uses.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)  # major, minor
-# Words of the work that threads share: how many may still look at it, how many have begun (and whether it is closed), how many
-# are done, the number of the next member, and what `run` is called with.
+# Words of the work that threads share: the number of threads that may still access it, the number that have started (and whether
+# it is closed), the number that have finished, the next member, and the call record of `run`.
 USERS, BEGUN, ENDED, NEXT, CALL = range(5)
 CLOSED = 2**32
 
 
 def handler(trajectory: Memory, name: str) -> list[Function]:
-    """`name(frame)`: every input is (1 or members, ...), of float64; outputs have all members, and then their directions.
+    """Write the handler `name(frame)` and its helpers; return the functions, with the handler last.
 
-    The last of some functions.
+    Every input is (1 or members, ...), of float64; outputs are (members, ...), with directions second.
     """
     f, fields = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), trajectory.call_fields
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
@@ -113,19 +113,19 @@ def _thread_count(f: Function, frame: Value) -> Value:
 
 
 def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:
-    """Add to a word of shared work; return what it was."""
+    """Add to a word of shared work; return its previous value."""
     number = f.like(number, INT, 1)
     return f.op(f"atomicrmw add ptr {f.at(work, word, 'i64').name}, i64 {number.name} seq_cst", INT)
 
 
 def _leave(f: Function, work: Value):
-    """Look at shared work no more: who does so last frees it."""
+    """Release shared work; the last thread frees it."""
     with f.if_(_add(f, work, USERS, -1).is_(1)):
         f.line(f"call void @free(ptr {work.name})")
 
 
 def _help() -> Function:
-    """`help(work)`: take part in the work, if it is not closed yet."""
+    """Write `help(work)`: take part in the work unless it is closed."""
     f = Function("help", [(POINTER, "work")], cold=True)
     work = f.given["work"]
     with f.if_(_add(f, work, BEGUN, 1) < CLOSED):
@@ -136,11 +136,11 @@ def _help() -> Function:
 
 
 def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Value):
-    """Run the members together with so many threads of the pool."""
+    """Run the members together with `helpers` threads of the pool."""
     work = f.op(f"call ptr @malloc(i64 {8 * (CALL + count)})", POINTER)
     for word, x in ((USERS, helpers + 1), (BEGUN, f.const(0, INT)), (ENDED, f.const(0, INT)), (NEXT, f.const(0, INT))):
         f.store(x, work, word, base=INT)
-    with f.each(count - 1) as k:  # all but the next member's address, the last
+    with f.each(count - 1) as k:  # all but the last field, the address of the next member
         f.store(f.load(call, k, base=INT), work, k + CALL, base=INT)
     f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
     context, task = f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)

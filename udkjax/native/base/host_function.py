@@ -1,7 +1,7 @@
-"""Functions of Python as operations of compiled JAX programs: arrays of float64 in and out, the members of a batch in front.
+"""Python functions as operations of compiled JAX programs, on float64 arrays whose first axis is the batch.
 
-XLA calls a handler, as that of machine code (ffi.py); this one is ctypes', and what it calls takes arrays of NumPy. It must not
-call JAX, which may wait for the very thread that it runs on.
+XLA calls a handler as it does for machine code (ffi.py); this one is a ctypes callback, and the function takes NumPy arrays. It
+must not call JAX, which may wait for the thread that it runs on.
 """
 
 import ctypes
@@ -24,12 +24,12 @@ from udkjax.programs.deferred import deferred_p, trace_once
 from udkjax.programs.numpy_program import Meter, evaluate_as, has_rules, numpy_program
 from udkjax.programs.varying_axes import result_type
 
-CREATE_ERROR = 48  # offset in XLA_FFI_Api: a function of a text and a code
-INTERNAL = 13  # the code of errors of programs
+CREATE_ERROR = 48  # offset in XLA_FFI_Api of the function that creates an error from a message and a code
+INTERNAL = 13  # XLA_FFI_Error_Code_INTERNAL
 
 
 class HostFunction(Hashable, Protocol):
-    """A function of arrays, each (1 or members, ...); equal ones are compiled once."""
+    """A function of arrays, each (1 or members, ...); equal functions are compiled once."""
 
     def __call__(self, *inputs: Any) -> Sequence[Any]:
         """Return the outputs, all (members, ...)."""
@@ -41,30 +41,30 @@ class HostFunction(Hashable, Protocol):
 
 
 def call_host(function: HostFunction, inputs: Sequence[Any]) -> list[Array]:
-    """Call a function on arrays that may be traced, which have their members in front."""
+    """Call a function on arrays that may be traced; the first axis is that of the members."""
     return host_p.bind(*(jnp.asarray(x, float) for x in inputs), function=function)
 
 
 def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
-    """Return function(*given), which is traced, and evaluated by NumPy where a program reaches it: nothing of it is compiled.
+    """Return function(*given), traced and, if a program reaches it, evaluated by NumPy instead of compiled, without derivatives.
 
-    For parts of programs that are hardly ever reached, and would take most of the time to compile. It has no derivatives.
+    It serves rarely executed parts of programs that would take most of the time to compile.
 
     Args:
-        function: a function of trees, known by its name: what is traced for it serves all calls of the same structure.
+        function: a top-level function of trees, traced once for all calls of the same structure.
         given: trees of arrays, which may be traced, and of static values.
     """
     if deferred_p is None or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
         return function(*given)
     program, leaves, out = trace_once(function, given)
-    if not has_rules(program):  # within a program that runs, JAX must not be called
+    if not has_rules(program):  # JAX must not be called from a running program
         return function(*given)
     found = call_host(_TracedFunction(program), [jnp.asarray(x)[None] for x in leaves])
     return out.rebuild([x[0].astype(aval.dtype) for x, aval in zip(found, program.out_avals, strict=True)])
 
 
 class _TracedFunction:
-    """A traced program as a function of arrays: NumPy evaluates it, one member after another."""
+    """A traced program as a function of arrays, evaluated by NumPy one member after another."""
 
     def __init__(self, program: Any):
         self._program = program
@@ -103,7 +103,7 @@ def _abstract_eval(*inputs: Any, function: HostFunction) -> list[Any]:
 
 
 def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunction) -> tuple[list[Array], list[int]]:
-    """A batch is more members."""
+    """Bind a batch as more members."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     members = max(x.shape[0] if axis is None else np.delete(x.shape, axis)[0] for x, axis in zip(inputs, axes, strict=True))
 
@@ -124,7 +124,7 @@ def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
 
 @lru_cache(maxsize=256)
 def _register(function: HostFunction) -> str:
-    """Return the name that XLA knows a function by: of this process alone, so that no program on disk calls another one."""
+    """Register a function; return its name in XLA, unique to this process, as programs on disk must not call another one."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     def handle(frame: int) -> int | None:
@@ -137,7 +137,7 @@ def _register(function: HostFunction) -> str:
             outputs = _buffers(frame + RESULTS)
             for to, x in zip(outputs, function(*_buffers(frame + ARGUMENTS)), strict=True):
                 to[...] = x
-        except Exception:  # C called this function: no exception may leave it
+        except Exception:  # exceptions must not propagate into C
             return _error(_word(frame + API), traceback.format_exc())
         return None
 

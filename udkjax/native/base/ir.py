@@ -1,8 +1,8 @@
-"""A thin layer over LLVM's text, in which an algorithm reads like one: values with operators, variables, loops, branches.
+"""A thin layer over LLVM's text: values with operators, variables, loops and branches.
 
-A `Function` is written once for one state, or for W of them side by side: wide values are vectors of W lanes, and plain numbers
-where W is one. Numbers meet wide values by being repeated. Of W lanes no branch is taken by one alone: differences between them
-are chosen (`select`), and a condition of all of them is `any_of`.
+A `Function` is written once for one state or for W states in SIMD lanes: wide values are vectors of W lanes, or plain numbers if
+W is one; numbers are broadcast to wide values. All lanes take the same branch: lanes differ by `select`, and a branch is taken if
+`any_of` the lanes needs it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +22,7 @@ _COMPARE = {
 
 
 class Variable:
-    """A place that holds a value; LLVM keeps it in a register where it can."""
+    """A mutable value; LLVM keeps it in a register if it can."""
 
     def __init__(self, f: "Function", base: str, width: int):
         self.f, self.base, self.width = f, base, width
@@ -43,16 +43,16 @@ class Variable:
 
 
 class Function:
-    """A function. `name` and `arguments` (pairs of base type and name) are those of its definition.
+    """A function with its `name` and `arguments`, pairs of base type and name.
 
-    One that is `cold` is left as it is written: LLVM's optimizations would take longer than it ever runs.
+    A `cold` function is not optimized: LLVM's optimizations would take longer than they save.
     """
 
     def __init__(
         self, name: str, arguments: Sequence[tuple[str, str]], width: int = 1, returns: str = "void", cold: bool = False
     ):
         self.name, self.width, self.returns, self.cold = name, width, returns, cold
-        self.noinline = False  # whether it is to be called, and never put in place of its call
+        self.noinline = False  # whether inlining is forbidden
         self._arguments, self._lines, self._reserved = list(arguments), [], []
         self._count, self.declared = 0, set()
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
@@ -69,14 +69,14 @@ class Function:
         return Value(self, name, base, width)
 
     def reserve(self, type_: str, count: int = 1) -> str:
-        """Memory of the function's own, for as long as it runs."""
+        """Reserve memory on the stack of the function; return its address."""
         self._count += 1
         name = f"%m{self._count}"
         self._reserved.append(f"{name} = alloca {type_}, i64 {count}, align 64")
         return name
 
     def text(self) -> str:
-        """Return the definition; what it calls of LLVM's own is in `declared`."""
+        """Return the definition; the LLVM intrinsics that it calls are in `declared`."""
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
@@ -90,7 +90,7 @@ class Function:
         return Value(self, one if width == 1 else f"<{', '.join([f'{base} {one}'] * width)}>", base, width)
 
     def like(self, x: Operand, base: str, width: int) -> Value:
-        """Return a value or a number as so many lanes of a type."""
+        """Return a value or a number as `width` lanes of a type."""
         if not isinstance(x, Value):
             return self.const(x, base, width)
         if x.base == INT and base == DOUBLE:
@@ -121,8 +121,7 @@ class Function:
     def arithmetic(self, kind: str, a: Operand, b: Operand) -> Value:
         """Add, subtract, multiply or divide.
 
-        A product that is added to something is not rounded before that. It is said here, and not left to LLVM, whose levels of
-        optimization would round in different places.
+        A product in a sum becomes a fused multiply-add here and not by LLVM, whose optimization levels would round differently.
         """
         x, y = self.both(a, b)
         if x.base != DOUBLE:
@@ -166,19 +165,19 @@ class Function:
         return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
 
     def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
-        """Return a b + c, rounded once where the processor has an instruction for it; a call of a library nowhere."""
+        """Return a b + c, rounded once if the processor has an instruction for it; never a library call."""
         return self.intrinsic("fmuladd", a, b, c)
 
     def abs(self, a: Value) -> Value:
         return self.intrinsic("fabs", a)
 
     def max(self, a: Operand, b: Operand) -> Value:
-        """Return the larger of two numbers; b where one is none: one instruction."""
+        """Return the larger of two numbers, or b if one is NaN: one instruction."""
         x, y = self.both(a, b)
         return self.select(x > y, x, y)
 
     def min(self, a: Operand, b: Operand) -> Value:
-        """Return the smaller of two numbers; b where one is none."""
+        """Return the smaller of two numbers, or b if one is NaN."""
         x, y = self.both(a, b)
         return self.select(x < y, x, y)
 
@@ -186,7 +185,7 @@ class Function:
         return self.abs(a) < float("inf")
 
     def largest_of(self, x: Value) -> Value:
-        """Return the largest of all lanes, none of which may be not a number."""
+        """Return the maximum over lanes; NaN is not allowed."""
         while x.width > 1:
             half, lanes = x.width // 2, range(x.width)
             take = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
@@ -235,7 +234,7 @@ class Function:
     # --- memory
 
     def at(self, pointer: Value | str, k: Operand, base: str = DOUBLE) -> Value:
-        """Return the address of the k-th number from a pointer. Of pointers as well each takes 8 bytes, whatever size it has."""
+        """Return the address of the k-th number from a pointer; pointers take 8 bytes on all targets."""
         name = pointer.name if isinstance(pointer, Value) else pointer
         index, stored = self.like(k, INT, 1), INT if base == POINTER else base
         return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
@@ -274,7 +273,7 @@ class Function:
         self.line(f"{end}:")
 
     def choose(self, condition: Value, then: Callable[[], None], otherwise: Callable[[], None]):
-        """Do one of two things."""
+        """Run one of two blocks."""
         yes, no, end = self._label("then"), self._label("else"), self._label("end")
         self.line(f"br i1 {condition.name}, label %{yes}, label %{no}")
         for label, do in ((yes, then), (no, otherwise)):
@@ -285,7 +284,7 @@ class Function:
 
     @contextmanager
     def while_(self, condition: Callable[[], Value]) -> Iterator[None]:
-        """Run the block while a condition holds, which is tested first."""
+        """Run the block while a condition holds; it is tested before each iteration."""
         head, body, end = self._label("while"), self._label("do"), self._label("end")
         self.line(f"br label %{head}")
         self.line(f"{head}:")
@@ -297,7 +296,7 @@ class Function:
 
     @contextmanager
     def each(self, end: Operand, start: Operand = 0) -> Iterator[Value]:
-        """Run the block for every whole number from `start` to before `end`."""
+        """Run the block for every integer from `start` to `end` - 1."""
         k = self.variable(start, INT, 1)
         last = self.like(end, INT, 1)
         with self.while_(lambda: k.value < last):

@@ -10,7 +10,7 @@ from udkjax.native.base.program import PointerPlace, Writer, from_memory
 
 
 class LoopWriter:
-    """The functions that programs of loops are made of, in one module: every kernel once."""
+    """The functions of loop programs in one module; programs share the functions of kernels."""
 
     def __init__(self, width: int, cold: bool = False):
         self.width, self._cold = width, cold
@@ -28,8 +28,8 @@ class LoopWriter:
             program: The program.
             name: The function's name.
             pointers: The names of its arguments.
-            at: Place where each array begins: a pointer, and an index from there.
-            width: The number of lanes, if it is another than that of the others.
+            at: Place where each array begins: a pointer and an index relative to it.
+            width: The number of lanes; by default that of the module.
         """
         width = width or self.width
         f = Function(name, [(POINTER, x) for x in pointers], width, cold=self._cold)
@@ -56,9 +56,9 @@ class LoopWriter:
         return self._kernels[key]
 
     def _write_result(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
-        """`name(arrays..., table, count)`, of a table with so many columns."""
+        """Write `name(arrays..., table, count)` for a table of `columns` columns."""
         f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width, cold=self._cold)
-        f.noinline = True  # copies of kernels in each of their programs would take as often as long to compile
+        f.noinline = True  # inlined copies in each program would multiply the time of compilation
         with f.each(f.given["count"]) as i:
             row = f.at(f.given["table"], i * columns, "i32")
             bases: dict[tuple[str, int], Value] = {}
@@ -75,7 +75,7 @@ class LoopWriter:
             writer = Writer(f, kernel.program)
             for s, slot in zip(kernel.program.inputs, kernel.inputs, strict=True):
                 if kernel.program.uses(s):
-                    writer.known[s.index] = from_memory(f, f.load(*address(slot), width), s.node.dtype)
+                    writer.values[s.index] = from_memory(f, f.load(*address(slot), width), s.node.dtype)
             for value, slot in zip(writer.run(), kernel.outputs, strict=True):
                 new = f.like(value, DOUBLE, width)
                 if slot.update == ADD:

@@ -1,6 +1,6 @@
 """Machine code for this processor from LLVM's text, compiled on all cores and stored on disk.
 
-A module is compiled in parts: each large function by itself, so that modules which share functions share their code, too.
+A module is compiled in parts, with each large function as a part of its own, so that modules share the code of equal functions.
 """
 
 import ctypes
@@ -16,13 +16,13 @@ from typing import Any
 
 from udkjax.native.base import code_cache
 
-LEVEL = 1  # of code generation: 2 takes a fifth longer, and runs take as long
-QUICK = 0  # for first calls: a quarter of the time of level 1; a run takes twice as long, five times in lanes, and rounds alike
-# Optimizations of the text before that. Programs come without common subexpressions and dead code: all that LLVM's own selection
-# of level 1 adds is two percent of a run's time, for half of the time of compiling.
+LEVEL = 1  # level of code generation; level 2 takes a fifth longer to compile, with equal run time
+QUICK = 0  # level for first calls: a quarter of the compile time; runs take twice as long, five times in lanes, and round equally
+# Optimization passes before code generation. Programs have no common subexpressions and no dead code: LLVM's own selection for
+# level 1 would save two percent of a run's time and take half of the compile time.
 PASSES = ("sroa", "simplify_cfg")
-PART_LINES = 1_000  # of a function that is compiled by itself: 20 to 30 ms
-GROUP_LINES = 2_000  # of smaller ones that go together: 50 ms, so that all cores have something to do; each part costs 2 ms
+PART_LINES = 1_000  # lines from which a function is compiled separately: 20 to 30 ms
+GROUP_LINES = 2_000  # lines of a group of smaller functions: 50 ms, to occupy all cores; the overhead of a part is 2 ms
 
 
 @cache
@@ -35,7 +35,7 @@ def _llvm() -> Any:
 
 
 def _target_machine(level: int) -> Any:
-    """Return a compiler for the processor that runs this."""
+    """Return a compiler for this processor."""
     llvm = _llvm()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=_features(), opt=level, reloc="pic", codemodel="small", jit=True
@@ -49,7 +49,7 @@ def _features() -> str:
 
 @cache
 def lanes() -> int:
-    """Return the number of float64 that a vector register holds."""
+    """Return the number of float64 numbers in a vector register."""
     features = _llvm().get_host_cpu_features()
     if features.get("avx512f") and features.get("avx512dq") and features.get("avx512vl"):
         return 8
@@ -57,13 +57,13 @@ def lanes() -> int:
 
 
 def digest(text: str, level: int = LEVEL) -> str:
-    """Return the key of a program, on this processor, with this compiler."""
+    """Return the key of a program for this processor and compiler."""
     return hashlib.sha256("\0".join((text, _compiler(), str(level), *PASSES)).encode()).hexdigest()[:32]
 
 
 @cache
 def _compiler() -> str:
-    """The processor and the compiler."""
+    """Return a description of the processor and the compiler."""
     import llvmlite
 
     llvm = _llvm()
@@ -72,14 +72,14 @@ def _compiler() -> str:
 
 @cache
 def _linker() -> Any:
-    """Return the loader of object code: JITLink lays code and constants side by side, wherever there is room for both."""
+    """Return the loader of object code; JITLink places code and constants next to each other, within relative addressing."""
     llvm = _llvm()
     machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
     return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
 
 
 class Library:
-    """The machine code of one module, in memory for as long as this object lives: addresses of some of its functions by name."""
+    """The machine code of one module, loaded while this object exists; indexing by name returns a function's address."""
 
     _numbers = itertools.count()
 
@@ -97,14 +97,14 @@ class Library:
 
 
 def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
-    """Return the code of a module, with the functions of these names: from disk, or compiled and put there."""
+    """Load a module with the functions `names`, from disk or newly compiled."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         codes, levels = zip(*pool.map(lambda part: _stored_code(part, level), split_module(text)), strict=True)
     return Library(codes, names, is_optimized=min(levels) == LEVEL)
 
 
 def _stored_code(text: str, level: int) -> tuple[bytes, int]:
-    """Return the code of a level, or better code that is on disk, and its level."""
+    """Return the code of a level, or of a higher level if that is on disk, and the level."""
     for some in range(LEVEL, level - 1, -1):
         code = code_cache.read(digest(text, some))
         if code is not None:
@@ -115,8 +115,8 @@ def _stored_code(text: str, level: int) -> tuple[bytes, int]:
 
 
 def split_module(text: str) -> list[str]:
-    """Split a module into modules that can be compiled at once, the largest first, each with the declarations that it needs."""
-    text = f"\n{text}"  # by which lines are found several times as fast as by the anchor of a line
+    """Split a module into modules for parallel compilation, the largest first, each with its declarations."""
+    text = f"\n{text}"  # searching for newlines is several times as fast as multiline anchors
     found = (text[match.end() : text.index("\n}\n", match.end()) + 3] for match in re.finditer(r"\n(?=define )", text))
     bodies = {body[body.index("@") + 1 : body.index("(", body.index("@"))]: body for body in found}
     heads = {match[2]: f"{match[1]}\n" for match in re.finditer(r"\n((?:declare [^@\n]*)?@([\w.]+)[ (].*)", text)}
@@ -140,12 +140,12 @@ def split_module(text: str) -> list[str]:
 
 
 def compile_module(text: str, level: int = LEVEL) -> bytes:
-    """Object code of a module."""
+    """Compile a module to object code for this processor."""
     return object_code(text, _target_machine(level), _llvm().get_default_triple(), () if level == QUICK else PASSES)
 
 
 def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[str] = PASSES) -> bytes:
-    """Object code of a module by a compiler of its own, as is the context: several threads compile at once."""
+    """Compile a module to object code in a context of its own, so that threads compile in parallel."""
     llvm = _llvm()
     with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
         module.triple = triple
@@ -158,7 +158,7 @@ def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[st
 
 
 def _emit(machine: Any, module: Any) -> bytes:
-    """Object code of a module, without the lock that llvmlite holds during each call: LLVM's contexts share nothing."""
+    """Emit object code without the lock that llvmlite holds during each call: LLVM's contexts share nothing."""
     from llvmlite.binding import ffi
 
     with ffi.OutputString() as error:
@@ -182,5 +182,5 @@ def _emission() -> Callable:
 
 
 def function(address: int, *arguments: Any) -> Any:
-    """Return a function at an address, to be called without Python's lock."""
+    """Return a function at an address, called without Python's global interpreter lock."""
     return ctypes.CFUNCTYPE(None, *arguments)(address)

@@ -1,4 +1,4 @@
-"""Access of a run's code to its memory, its inputs and its outputs."""
+"""Access of a run's code to its memory, inputs and outputs."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,29 +10,29 @@ from udkjax.native.base.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, P
 
 
 class Memory:
-    """The memory of a run, laid out by `places`, and what `run` is called with.
+    """The memory of a run, laid out by `places`, and its call record.
 
-    That is a record of 8-byte fields (`call_fields`): how many members, output times, breakpoints and directions there are; the
-    addresses of inputs, their strides from member to member (numbers), the addresses of outputs, how many numbers some of them
-    have of each member, and the address of the number of the next member, which threads share.
+    The record has 8-byte fields (`call_fields`): the numbers of members, output times, breakpoints and directions; the addresses
+    of the inputs and their strides between members (in numbers); the addresses of the outputs; the lengths per member of some of
+    them; and the address of the index of the next member, which threads share.
     """
 
     plan: Plan
     places: Layout
-    tangents: Layout  # of one direction of a derivative
-    begins: list[Callable[[Function], None]]  # write what is stored once a run
+    tangents: Layout  # memory of one direction of a derivative
+    begins: list[Callable[[Function], None]]  # write numbers that are stored once for each run
     n: int  # coordinates
     m: int  # rows of Psi
-    rowcount: int  # registers that they take
+    rowcount: int  # registers that the coordinates take
     stage_accelerations: list[str]
 
-    settings: tuple[str, ...] = SETTINGS  # settings that it takes
-    inputs: tuple[str, ...] = ()  # besides those of every run
+    settings: tuple[str, ...] = SETTINGS
+    inputs: tuple[str, ...] = ()  # in addition to those of every run
     results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()
-    lengths: tuple[str, ...] = ()  # inputs and outputs of which it must know how many numbers they have of each member
-    directions_in = 0  # the dimension of the last input that counts the directions
-    written_text = ""  # the whole module, once it is written
+    lengths: tuple[str, ...] = ()  # inputs and outputs whose length per member is in the call record
+    directions_in = 0  # the axis of the last input whose length is the number of directions
+    written_text = ""  # the text of the module, after `generate`
 
     @property
     def call_fields(self) -> tuple[str, ...]:
@@ -50,12 +50,12 @@ class Memory:
         return self.places if pointer == "work" else self.tangents
 
     def start(self, name: str, pointer: str) -> int:
-        """Return the place of an array, in numbers from a pointer."""
+        """Return the index of the first number of an array, relative to a pointer."""
         layout = self.layout(pointer)
         return layout[name] * layout.width
 
     def registers(self, pointer: str) -> int:
-        """Count the registers that the coordinates take."""
+        """Return the number of registers that the coordinates take."""
         return -(-self.n * self.layout(pointer).width // self.plan.vector)
 
     def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
@@ -66,11 +66,11 @@ class Memory:
         f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
 
     def broadcast(self, f: Function, x: Value) -> Value:
-        """Repeat a number of each lane, to go with registers of coordinates."""
+        """Repeat a number of each lane to match registers of coordinates."""
         return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
 
     def largest(self, f: Function, values: Callable[[Value], Iterable[Value]]) -> Value:
-        """Return the largest, in each lane, of `values(r)` of each register; without what is not a number."""
+        """Return the maximum in each lane of `values(r)` over all registers r, ignoring NaN."""
         worst = f.variable(0.0, width=self.plan.vector)
         with f.each(self.rowcount) as r:
             for x in values(r):
@@ -87,7 +87,7 @@ class Memory:
     def weighted_sum(
         self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
     ) -> Value | None:
-        """Return sum_j row_j a_j of one register of coordinates; None where all are zero."""
+        """Return sum_j row_j a_j for one register of coordinates; None if all coefficients are zero."""
         total = None
         for weight, name in zip(row, names or self.stage_accelerations, strict=False):
             if weight != 0:
@@ -96,7 +96,7 @@ class Memory:
         return total
 
     def copy(self, f: Function, source: str, to: str, mask: Value | None = None):
-        """Copy an array of coordinates, or that of some lanes, to another one, or to the pointer `out`."""
+        """Copy an array of coordinates, in all or some lanes, to another array or to the pointer `out`."""
         pointer, start = f.given["out" if to == "out" else "work"], 0 if to == "out" else self.start(to, "work")
         with f.each(self.rowcount) as r:
             place, new = r * self.plan.vector + start, self.vector(f, source, r)
@@ -109,21 +109,21 @@ class Memory:
             for name, x in zip(sources, "qva", strict=True):
                 self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
 
-    # --- single numbers of arrays, in all lanes or of one
+    # --- single numbers of arrays, of all lanes or of one
 
     def place(self, name: str, i: Operand = 0, pointer: str = "work") -> Operand:
-        """Return the place of the i-th number of an array, in numbers from a pointer: that of the first lane."""
+        """Return the index, relative to a pointer, of the i-th number of an array in the first lane."""
         return i * self.layout(pointer).width + self.start(name, pointer)
 
     def entry(self, f: Function, name: str, i: Operand = 0, pointer: str = "work") -> Value:
-        """Return the i-th number of an array, in all lanes."""
+        """Return the i-th number of an array in all lanes."""
         return f.load(f.given[pointer], self.place(name, i, pointer), self.layout(pointer).width)
 
     def put_entry(self, f: Function, name: str, i: Operand, x: Operand, pointer: str = "work"):
         f.store(x, f.given[pointer], self.place(name, i, pointer), self.layout(pointer).width)
 
     def lane_entry(self, f: Function, name: str, k: Value, i: Operand = 0, pointer: str = "work", base: str = DOUBLE) -> Value:
-        """Return the i-th number of an array, of lane k."""
+        """Return the i-th number of an array in lane k."""
         return f.load(f.given[pointer], k + self.place(name, i, pointer), base=base)
 
     def put_lane_entry(
@@ -133,44 +133,44 @@ class Memory:
 
     @contextmanager
     def each_lane(self, f: Function, mask: Value) -> Iterator[Value]:
-        """Run the block for every lane in which a condition holds, or a number is one, with the number of the lane."""
+        """Run the block with the index of every lane in which a condition holds or a number is one."""
         marks = mask if mask.base == DOUBLE else f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
         with f.each(f.width) as k, f.if_(f.lane(marks, k) > 0.5):
             yield k
 
     def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
-        """Copy the coordinates of lane k to an address, or the first numbers of another array."""
+        """Copy an array of lane k, or its first `count` numbers, to an address; by default all coordinates."""
         with f.each(self.n if count is None else count) as i:
             f.store(self.lane_entry(f, name, k, i, pointer), to, i + start)
 
     def to_int(self, f: Function, x: Value) -> Value:
         return f.op(f"fptosi double {x.name} to i64", INT)
 
-    # --- what `run` is called with
+    # --- the call record
 
     def call_record(self, f: Function) -> Value:
         """Return the pointer to the call record of `run`."""
         return f.given["call"] if "call" in f.given else f.load(f.given["work"], self.start("call", "work"), base=POINTER)
 
     def field(self, f: Function, name: str, base: str = INT) -> Value:
-        """Return a field of the call record: a count, or an address."""
+        """Return a field of the call record, a count or an address."""
         return f.load(self.call_record(f), self.call_fields.index(name), base=base)
 
     def input_number(self, f: Function, name: str, member: Value, k: Value) -> Value:
-        """Return the k-th number of an input of a member (one lane)."""
+        """Return the k-th number of a member in an input (one lane)."""
         return f.load(self.member_address(f, name, member), k)
 
     def member_address(self, f: Function, name: str, member: Value) -> Value:
-        """Return the address of what an input holds of a member (one lane)."""
+        """Return the address of a member in an input (one lane)."""
         number = member if member.base == INT else self.to_int(f, member)
         return f.at(self.field(f, name, POINTER), number * self.field(f, f"{name} stride"))
 
     def result_address(self, f: Function, name: str, number: Value, length: Operand) -> Value:
-        """Return the address of row `number` of an output, which has so many numbers in each."""
+        """Return the address of row `number` of an output with rows of `length` numbers."""
         return f.at(self.field(f, name, POINTER), number * length)
 
     def write_state(self, f: Function, s: Lane, k: Value, number: Value, q: str, v: str):
-        """Write state number `number` of lane k into the outputs."""
+        """Write the state of lane k as state `number` of the outputs."""
         row, violated = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number, f.lane(s.violated, k)
         for name, x in (("qs", q), ("vs", v)):
             self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, k)
@@ -180,7 +180,7 @@ class Memory:
             self.put_lane_entry(f, "lost", k, first)
 
     def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
-        """Reserve so many numbers: return what to free, and where they begin, at a register's boundary."""
+        """Allocate `count` numbers; return the block to free and the address of the first number, aligned to a register."""
         size = count * 8 + 64
         block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
         address = f.op(f"ptrtoint ptr {block.name} to i64", INT)

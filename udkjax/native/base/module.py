@@ -1,4 +1,4 @@
-"""One module of machine code: its functions, and what the memory of a run has room for."""
+"""One module of machine code: its functions, and the arrays in the memory of a run."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -11,7 +11,7 @@ from udkjax.native.base.memory import Memory
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.steps import POINTS
 
-# Once a run, beside singularities, or where a piece may end.
+# Functions that are called once for each run, near singular configurations, or where a piece may end.
 COLD = (
     "leave",
     "finish_members",
@@ -32,11 +32,11 @@ class Module(Memory):
 
     Args:
         plan: Choices that the code depends on.
-        differentiated: Of which differentiable programs of the scene the module takes derivatives.
-        active: Of the numbers of the scene: along which there are derivatives.
+        differentiated: Names of the scene's programs that the module differentiates.
+        active: For each number of the scene, whether derivatives by it are needed.
     """
 
-    mode = FORWARD  # of derivatives
+    mode = FORWARD  # mode of differentiation
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -46,7 +46,7 @@ class Module(Memory):
             self.inputs = ("samples", *self.inputs)
         if plan.formulation is not None:
             self.settings = (*self.settings, *FORMULATION_SETTINGS)
-        self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small to be trusted
+        self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small
         self.is_dense = plan.pseudoinverse is not None and m > 0
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
@@ -55,9 +55,9 @@ class Module(Memory):
         self.unrolled = Unrolled(code, list(self.programs), differentiated, active, self.mode) if plan.unrolled else None
         self.constants = len(self.unrolled.constants if self.unrolled else code.constants)
         self.moving = range(self.constants if any(active) else 0) if self.unrolled is None else self.unrolled.moving
-        """The constants, by their numbers in the layout of the scene, along which there are derivatives."""
+        """Indices, in the layout of the scene, of the constants that depend on active numbers."""
         self._lay_out()
-        self.tangents = self.places  # of one direction of a derivative
+        self.tangents = self.places  # memory of one direction of a derivative
         self.functions: list[Function] = []
         self.begins = []
         self.loops = LoopWriter(plan.width, cold=plan.unrolled)
@@ -65,7 +65,7 @@ class Module(Memory):
         self.rowcount = -(-n * plan.width // plan.vector)
 
     def _lay_out(self):
-        """Reserve room in memory for all arrays; layout.py says what they hold."""
+        """Reserve memory for all arrays; layout.py describes them."""
         plan, code, n, m = self.plan, self.code, self.n, self.m
         p = self.places = Layout(plan.width, plan.vector)
         for name in (*LANE_NUMBERS, *(FORMULATION_SETTINGS if plan.formulation else ())):
@@ -116,7 +116,7 @@ class Module(Memory):
 
     @property
     def drop_tol_place(self) -> int | None:
-        """The place of the threshold of pivots; None if no pivot is compared with it."""
+        """The offset of the threshold of pivots; None if it is not used."""
         place = (self.unrolled or self.code).drop_tol_index
         return None if place is None else self.places["constants"] + place
 
@@ -133,7 +133,7 @@ class Module(Memory):
 
     @property
     def solving(self) -> list[str]:
-        """The names of the functions that the module calls to solve: programs by elimination, or dense equations."""
+        """The names of the functions that solve: programs by elimination, or dense equations."""
         if not self.plan.projected:
             return ["accelerations"]
         of_step = ["project_and_accelerate", "tangent_part"] if self.method.ends else ["end_of_step"]
@@ -185,7 +185,7 @@ class Module(Memory):
         self.write_prologue("prologue", self.unrolled)
 
     def write_program(self, name: str, at: Mapping[str, PointerPlace]):
-        """Write one of the scene's programs, with its arrays where `at` says, as a function of `work` and `out`."""
+        """Write one of the scene's programs as a function of `work` and `out`, with its arrays at the places `at`."""
         if self.unrolled:
             self.write_scalars(self.unrolled.program(name), name, ("work", "out"), at)
         else:
@@ -199,7 +199,7 @@ class Module(Memory):
         at: Mapping[str, PointerPlace],
         width: int | None = None,
     ):
-        """Write a program without loops."""
+        """Write an unrolled program."""
 
         def find(places: Sequence[PointerPlace]) -> list[PointerPlace]:
             return [(at[x][0], at[x][1] + k) if x in at else (pointers[0], 0) for x, k in places]
@@ -220,7 +220,7 @@ class Module(Memory):
         )
 
     def write_prologue(self, name: str, unrolled: Unrolled | None):
-        """Write `name(numbers, constants)`, of one member."""
+        """Write `name(numbers, constants)` for one member."""
         if unrolled:
             inputs, outputs = consecutive("numbers", self.code.number_count), consecutive("constants", self.constants)
             self.functions.append(write(unrolled.prologue, name, 1, ("numbers", "constants"), inputs, outputs))
@@ -233,35 +233,35 @@ class Module(Memory):
         return f, Lane(f, self.places)
 
     def new_function(self, name: str, arguments: Sequence[tuple[str, str]], width: int) -> Function:
-        """Return a function of so many lanes."""
+        """Add a function of `width` lanes."""
         f = Function(name, arguments, width, cold=name in COLD and not self.is_dense)
         self.functions.append(f)
         return f
 
     def write_derivatives(self):
-        """Hook: writes the functions of derivatives; none by default."""
+        """Hook: writes the functions of derivatives; does nothing by default."""
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """Hook: called after stage i of a step, at its state."""
+        """Hook: called at the state of stage i of a step, after its accelerations."""
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        """Hook: called after a step, once its end is point 3 in lanes that `accept`."""
+        """Hook: called after a step, when its end has become point 3 in lanes that `accept`."""
 
     def record_output(self, f: Function, s: Lane):
         """Hook: called with a state between steps (`state t`, `state q`, `result v`) of lanes that are `due`."""
 
     def weigh_rows(self):
-        """Reserve room for the weights of rows, which then are those of the member in each lane."""
+        """Reserve memory for weights of rows, which are set for the member in each lane."""
         if "weights" not in self.places.places:
             self.places.add("weights", self.m)
 
     def begin_memory(self, f: Function):
-        """Store numbers that no member changes, once a run, with all memory zero."""
+        """Store numbers that are the same for all members, once for each run, in zeroed memory."""
         for begin in self.begins:
             begin(f)
 
     def begin_rows(self, f: Function, lane: Value, length: Value):
-        """Store the weights of the rows of a member, whose scales are in its lane."""
+        """Compute the weights of rows of a member from the scales in its lane."""
         if "weights" in self.places.places:
             with f.each(self.m) as i:
                 self.put_lane_entry(f, "weights", lane, length / self.lane_entry(f, "rows", lane, i), i)
@@ -270,35 +270,35 @@ class Module(Memory):
         """Hook: called with a member that is taken into a lane; does nothing by default."""
 
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
-        """Hook: called with the addresses of the numbers and constants that a lane goes on with; does nothing by default."""
+        """Hook: called with the addresses of new numbers and constants of a lane; does nothing by default."""
 
     def end_members(self, f: Function, s: Lane):
-        """Hook: called with members that are done, in lanes that are `due`."""
+        """Hook: called for completed members, in lanes that are `due`."""
 
     def goes_on(self, f: Function, s: Lane) -> Value:
-        """Return whether there is something to do in the lanes."""
+        """Return whether any lane is active."""
         return f.any_of(s.active > 0.5)
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Take one step in all lanes, and finish those that are done."""
+        """Take one step in all lanes, and finish completed members."""
         raise NotImplementedError
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Fill the lanes whose members are done with the next ones."""
+        """Fill the lanes of completed members with the next members."""
         fill()
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
-        """Further memory of a run, in `work` already: what to free."""
+        """Allocate further memory of a run and store its address in `work`; return the blocks to free."""
         del f, call
         return []
 
     def accelerate_stage(self, f: Function, i: int):
-        """Compute the accelerations of stage i, of its state."""
+        """Compute the accelerations of stage i at `state`."""
         self.accelerate(f, f"stage{i} a")
 
     def accelerate(self, f: Function, to: str):
-        """Compute the accelerations of the state."""
+        """Compute the accelerations at `state`."""
         self.invoke(f, "accelerations", to)
 
     def accelerate_end(self, f: Function):
-        """Hook: called with `state q` and `result v` at the end of a step, and `result a` of them."""
+        """Hook: called with `state q`, `result v` and their accelerations `result a` at the end of a step."""

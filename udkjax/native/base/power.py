@@ -1,15 +1,15 @@
-"""Powers of numbers in lanes, without a call of a library: for step sizes, which need not be exact to the last digit."""
+"""Powers of numbers in lanes without library calls, for step sizes, which need not be exact to the last digit."""
 
 import math
 
 from udkjax.native.base.ir import DOUBLE, INT, Function, Value, llvm_type
 
-TERMS = 10  # of both series: to 1e-9 and better
+TERMS = 10  # terms of both series, for a relative error below 1e-9
 BIAS, FRACTION = 1023, 52  # of float64
 
 
 def power(f: Function, x: Value, exponent: float, whole: bool = False) -> Value:
-    """Return x^exponent of positive x; `whole`: by multiplications."""
+    """Return x^exponent for positive x; `whole`: the exponent is an integer, and multiplications suffice."""
     if whole:
         return _whole(f, x, int(exponent))
     return _exp2(f, _log2(f, x) * exponent)
@@ -25,7 +25,7 @@ def _whole(f: Function, x: Value, n: int) -> Value:
 
 
 def _log2(f: Function, x: Value) -> Value:
-    """By the exponent, and of the fraction m in [1, 2): log m = log sqrt(2) + 2 artanh((m - sqrt 2) / (m + sqrt 2))."""
+    """Return log2 x: with m in [1, 2) the fraction of x, log m = log sqrt(2) + 2 artanh((m - sqrt 2) / (m + sqrt 2))."""
     whole, T = llvm_type(INT, x.width), x.type
     bits = f.op(f"bitcast {T} {x.name} to {whole}", INT, x.width)
     shift = f.const(FRACTION, INT, x.width)
@@ -40,7 +40,7 @@ def _log2(f: Function, x: Value) -> Value:
 
 
 def _exp2(f: Function, x: Value) -> Value:
-    """By the whole part, and a series of what is left. Of numbers far below the largest exponent."""
+    """Return 2^x by the integer part of x and a series for the rest; |x| must be far below the largest exponent."""
     whole, T = llvm_type(INT, x.width), x.type
     large = 1.5 * 2.0**52
     shifted = f.op(f"fadd {T} {x.name}, {f.const(large, DOUBLE, x.width).name}", DOUBLE, x.width)
@@ -56,7 +56,7 @@ def _exp2(f: Function, x: Value) -> Value:
 
 
 def _as_double(f: Function, k: Value) -> Value:
-    """Return a small whole number, not negative, as a number: by its digits."""
+    """Convert a small nonnegative integer to double by setting bits of the fraction."""
     whole, T = llvm_type(INT, k.width), llvm_type(DOUBLE, k.width)
     magic = 2.0**52
     import struct

@@ -1,6 +1,6 @@
-"""A straight-line program as an LLVM function: one state, or W lanes of them.
+"""A straight-line program as an LLVM function for one state, or for W states in lanes.
 
-It finds its inputs and leaves its outputs in memory: all are numbers side by side, W of each.
+Inputs and outputs are in memory, with the W lanes of each number contiguous.
 """
 
 import math
@@ -16,7 +16,7 @@ from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, l
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
 COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
 HALF_PI = (math.pi / 2, 6.123233995736766e-17)  # in two parts: their sum is exact to 107 binary digits
-ROUND = 1.5 * 2.0**52  # added to a number, it leaves the nearest whole one in the last digits
+ROUND = 1.5 * 2.0**52  # added to a number, it leaves the nearest integer in the last digits
 _COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
 _INTRINSIC = {
     "abs": "fabs", "exp": "exp", "log": "log", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum", "pow": "pow",
@@ -26,14 +26,14 @@ _INTRINSIC = {
 
 
 class UnsupportedError(ValueError):
-    """Something in a scene that machine code has no instruction for."""
+    """An operation of a scene that machine code does not support."""
 
 
-PointerPlace = tuple[str, int]  # the name of a pointer, and an index from there
+PointerPlace = tuple[str, int]  # the name of a pointer, and an index relative to it
 
 
 def consecutive(pointer: str, count: int) -> list[PointerPlace]:
-    """Return the places of so many numbers from a pointer on."""
+    """Return the places of the first `count` numbers at a pointer."""
     return [(pointer, k) for k in range(count)]
 
 
@@ -47,16 +47,16 @@ def write(
     cold: bool = False,
     lanes: Mapping[str, int] | None = None,
 ) -> Function:
-    """Return a function of some pointers: inputs come from their places, and outputs, conditions as one or zero, go to theirs.
+    """Write a program as a function of some pointers; conditions are stored as one or zero.
 
-    `lanes` are those of pointers to numbers of another width: results of single numbers alone are computed once for all.
+    `lanes` are the widths of pointers to numbers of another width; results that depend only on single numbers are computed once.
     """
     f = Function(name, [(POINTER, x) for x in pointers], width, cold=cold)
     writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})
     for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
         if program.uses(s):
             x = f.load(f.given[pointer], place * lanes[pointer], lanes[pointer])
-            writer.known[s.index] = from_memory(f, x, s.node.dtype)
+            writer.values[s.index] = from_memory(f, x, s.node.dtype)
     for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
         f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
     return f
@@ -69,17 +69,17 @@ def vector_function(program: ScalarProgram, name: str, given: str, found: str, p
 
 
 def from_memory(f: Function, x: Value, dtype: Any) -> Value:
-    """Return a number from memory as what it is in the graph."""
+    """Convert a number from memory to its type in the graph."""
     if dtype.kind == "b":
         return x.is_not(0.0)
     return f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
 
 
 class Writer:
-    """The operations of a program, within a function that has put the values of its inputs into `known`."""
+    """The operations of a program within a function; the values of inputs must be set in `values` first."""
 
     def __init__(self, f: Function, program: ScalarProgram):
-        self.f, self.program, self.known = f, program, {}
+        self.f, self.program, self.values = f, program, {}
         self._negative: dict[int, Value] = {}
         self._pairs: dict[str, tuple[Value, Value]] = {}
 
@@ -89,16 +89,16 @@ class Writer:
         used = Counter(s.index for index in self.program.order for s in nodes[index].arguments)
         used.update(s.index for s in self.program.outputs)
         for index in self.program.order:
-            self.known[index] = found = self._operation(nodes[index])
-            if used[index] > 1:  # fused with each sum, a product would keep two numbers in registers in place of one
+            self.values[index] = found = self._operation(nodes[index])
+            if used[index] > 1:  # fused with several sums, a product would occupy two registers instead of one
                 found.product = None
         return [self._with_sign(s) for s in self.program.outputs]
 
     def _with_sign(self, s: Any) -> Value:
         if s.sign > 0:
-            return self.known[s.index]
+            return self.values[s.index]
         if s.index not in self._negative:
-            self._negative[s.index] = -self.known[s.index]
+            self._negative[s.index] = -self.values[s.index]
         return self._negative[s.index]
 
     def _operation(self, node: Any) -> Value:
@@ -184,7 +184,7 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
 
 
 def _expm1(f: Function, x: Value) -> Value:
-    """Return e^x - 1 (Kahan): exact also where x is small."""
+    """Return e^x - 1 (Kahan), accurate also for small x."""
     u = f.intrinsic("exp", x)
     small, gone = u.is_(1.0), (u - 1.0).is_(-1.0)
     exact = (u - 1.0) * x / f.intrinsic("log", f.select(small | gone | ~f.is_finite(u), 2.0, u))
@@ -199,7 +199,7 @@ def _log1p(f: Function, x: Value) -> Value:
 
 
 def integer_power(a: Value, n: int) -> Value:
-    """Return a^n by squares."""
+    """Return a^n by repeated squaring."""
     f = a.f
     if n < 0:
         return 1.0 / integer_power(a, -n)
@@ -211,7 +211,7 @@ def integer_power(a: Value, n: int) -> Value:
 
 
 def sincos(f: Function, a: Value) -> tuple[Value, Value]:
-    """Sine and cosine to rounding, by one reduction to within a quarter of pi and two polynomials: no call of a library."""
+    """Return sine and cosine to rounding, by one reduction to within pi / 4 and two polynomials, without library calls."""
     width, T, whole = a.width, a.type, llvm_type(INT, a.width)
     shifted = f.fma(a, 2 / math.pi, ROUND)
     turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)

@@ -1,14 +1,14 @@
 """The functions of the derivatives of a scene's programs, unrolled or as loops.
 
 For the accelerations (no suffix), for the projection of a state on the manifold ("_projection") and for the corrections that
-close a mechanism ("_newton_q", "_newton_v") there are
+close a mechanism ("_newton_q", "_newton_v") the functions are
 
-    evaluation(work, out, stored)   the results, and what its derivatives need to know of the state
-    forward(work, stored, tangent, out)   the change of the results, from those of the constants and the state in a tangent
-    twice(work, stored, tangent, out)     the same along two directions and along both, in three tangents one behind the other
+    evaluation(work, out, stored)   the results, and the intermediate results that derivatives need
+    forward(work, stored, tangent, out)   the tangents of the results, from those of the constants and the state in `tangent`
+    twice(work, stored, tangent, out)     the same along two directions and along both, in three consecutive tangents
     reverse(work, stored, bar)      `bar constants` and `bar state`, from the cotangents of the results
 
-where all but the accelerations leave their changes in `result` of a tangent, and find their cotangents in `bar result`.
+All except the accelerations write tangents to `result` of a tangent, and read cotangents from `bar result`.
 """
 
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from udkjax.expressions.loop_program import LoopProgram, Reset
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import PointerPlace
 
-WAYS = ("d", "e", "de")  # the changes along two directions and along both, of which tangents hold one each
-GIVEN = ("d", "e")  # directions of numbers and of the first state do not change along either
+WAYS = ("d", "e", "de")  # derivatives along two directions and along both, one in each of three tangents
+GIVEN = ("d", "e")  # directions of numbers and of the first state, which have no second derivative
 
 
 class ProgramDerivative:
-    """One of the differentiable programs of a scene with its derivative, in a module."""
+    """One of the differentiable programs of a scene and its derivative in a module."""
 
     stored: int
-    """The number of values that its derivatives know of a state."""
+    """The number of intermediate results that its derivatives need."""
 
     def __init__(self, module: Module, name: str, evaluation: str = "evaluation"):
         self._module, self._name = module, name
@@ -35,7 +35,7 @@ class ProgramDerivative:
         self._evaluation = evaluation + self._suffix
         self._evaluated: DifferentiableProgram = module.code.differentiable[name]
         self._fixed = [] if module.moving else ["constants"]
-        self._stored: dict[str, int] = {}  # the arrays of loops, and where they begin
+        self._stored: dict[str, int] = {}  # offsets of the arrays of loops
         self.stored = 0
         if module.unrolled:
             self._unrolled = module.unrolled.derivative(name)
@@ -47,11 +47,11 @@ class ProgramDerivative:
             if x in used:
                 self._stored[x] = self.stored
                 self.stored += count
-        if "along" not in module.places.places:  # changes or cotangents of what is stored, of all such programs
+        if "along" not in module.places.places:  # tangents or cotangents of stored values, shared by all such programs
             module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
 
     def place(self, name: str) -> int:
-        """Return the place of an array among those that loops store."""
+        """Return the offset of an array among those that loops store."""
         return self._stored[name]
 
     @property

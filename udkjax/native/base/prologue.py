@@ -1,10 +1,10 @@
-"""Derivatives of the prologue: of what a scene's code computes of its numbers alone, once a run. Of one member,
+"""Derivatives of the prologue, which computes the constants of a scene from its numbers once for each run. For one member,
 
-    prologue_forward(numbers, constants, dnumbers, dconstants)          changes of the constants, from those of the numbers
+    prologue_forward(numbers, constants, dnumbers, dconstants)          tangents of the constants, from those of the numbers
     prologue_reverse(numbers, constants, constants_bar, numbers_bar)    cotangents of the numbers, from those of the constants
     prologue_twice(numbers, constants, dnumbers, enumbers, denumbers, dconstants, econstants, deconstants)
 
-of all numbers, and of the constants that move; the last along two directions, and along both.
+with all numbers and the moving constants; the last along two directions and along both.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ PROLOGUE = {mode: f"prologue_{mode}" for mode in (FORWARD, REVERSE, TWICE)}
 
 
 def write_prologue_derivative(module: Module, active: Sequence[bool], mode: str):
-    """Write the derivative of a mode, along the numbers that are active."""
+    """Write the derivative by the active numbers in a mode of differentiation."""
     changes = ("constants", "numbers") if mode == REVERSE else ("numbers", "constants")
     pointers = ("numbers", "constants", *(prefix + x for x in changes for prefix in PREFIXES[mode]))
     at = {x: (x, 0) for x in pointers}

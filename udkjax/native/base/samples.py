@@ -1,7 +1,7 @@
-"""Numbers of a scene that have samples: between breakpoints they are constants, as all others are.
+"""Sampled numbers of a scene, which are constant between breakpoints.
 
-A row of samples holds from one breakpoint to the next. Where a run begins anew behind a breakpoint, the constants of its lane are
-computed again, of the numbers with the row in: no step and no evaluation takes longer, however many samples there are.
+A row of samples is valid from one breakpoint to the next. When a run begins anew after a breakpoint, the constants of its lane
+are computed again from the numbers with the new row, so the time of a step does not depend on the number of samples.
 """
 
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
@@ -22,14 +22,14 @@ def count_breakpoints(module: Module, f: Function, member: Value, time: Value) -
 
 
 def enter_first_row(module: Module, f: Function, lane: Value, member: Value):
-    """Give a lane the constants with which its member begins."""
+    """Set the constants of a lane for the start of its member."""
     start, smallest = (module.lane_entry(f, name, lane) for name in ("start", "smallest"))
     module.put_lane_entry(f, "knot", lane, count_breakpoints(module, f, member, start - smallest))
     f.call("enter", f.given["work"], f.given["call"], lane)
 
 
 def write_next_breakpoint(module: Module):
-    """`next_breakpoint(work, call)`: `due` is the first breakpoint that a lane has not passed; infinite where there is none."""
+    """Write `next_breakpoint(work, call)`: `due` becomes the first breakpoint that a lane has not passed; infinite if none."""
     f, s = module.function("next_breakpoint", ARGUMENTS[:2])
     knots = module.field(f, "knots")
     with f.each(f.width) as k:
@@ -40,7 +40,7 @@ def write_next_breakpoint(module: Module):
 
 
 def write_enter(module: Module):
-    """`enter(work, call, lane)`: the constants of a lane, of the samples that hold behind the breakpoints that it has passed."""
+    """Write `enter(work, call, lane)`: compute the constants of a lane from the samples after the breakpoints it has passed."""
     f, _ = module.function("enter", ARGUMENTS)
     lane = f.given["lane"]
     knot, member = module.lane_entry(f, "knot", lane), module.to_int(f, module.lane_entry(f, "member", lane))
@@ -61,7 +61,7 @@ def write_enter(module: Module):
 
 
 def numbers_of_row(module: Module, f: Function, member: Value, row: Value) -> Value:
-    """Return the address of a copy of a member's numbers, with a row of samples in."""
+    """Return the address of a copy of a member's numbers with a row of samples inserted."""
     given = module.member_address(f, "numbers", member)
     copy = module.address(f, "numbers")
     with f.each(module.code.number_count) as i:

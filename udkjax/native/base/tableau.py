@@ -1,4 +1,4 @@
-"""Tableaus of explicit Runge-Kutta methods for q'' = a(t, q, v), among them that of the default."""
+"""Tableaus of explicit Runge-Kutta methods for q'' = a(t, q, v), including the default method."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -8,15 +8,15 @@ import numpy as np
 
 
 class Method(NamedTuple):
-    """A tableau as q'' = a needs it, without stages that serve interpolation alone."""
+    """A tableau for q'' = a, without stages that only serve interpolation."""
 
-    nodes: np.ndarray  # c, and below it 1: the end of the step is one state more
-    v: np.ndarray  # A, and below it b
-    q: np.ndarray  # A A, and below it b A
+    nodes: np.ndarray  # c, and in the last row 1, the end of the step
+    v: np.ndarray  # A, and in the last row b
+    q: np.ndarray  # A A, and in the last row b A
     error_v: np.ndarray  # (stages,)
     error_q: np.ndarray
     order: float
-    ends: bool  # whether the last stage is the next step's first
+    ends: bool  # whether the last stage is the first of the next step
 
     @classmethod
     def of(
@@ -47,7 +47,7 @@ class Method(NamedTuple):
 
     @property
     def clearings(self) -> tuple[float, float]:
-        """Fractions of a step far from all nodes: the middles of the widest gap between two and of the widest before it."""
+        """Fractions of a step far from all nodes: the middle of the widest gap between two nodes, and of the widest before it."""
         nodes = np.unique(self.nodes)
         middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
         widest = np.argmax(gaps)
@@ -55,12 +55,12 @@ class Method(NamedTuple):
 
 
 def row(text: str) -> np.ndarray:
-    """Coefficients written as fractions."""
+    """Parse coefficients written as fractions."""
     return np.array([float(Fraction(x)) for x in text.split()])
 
 
 # The pair of orders 8 and 7 with 13 stages: P. J. Prince, J. R. Dormand, High order embedded Runge-Kutta formulae, J. Comp. Appl.
-# Math. 7 (1981) 67-75; `diffrax.Dopri8` without the stage that serves its interpolation.
+# Math. 7 (1981) 67-75; `diffrax.Dopri8` without the stage that only serves interpolation.
 _ORDER_8 = row(
     """14005451/335480064 0 0 0 0 -59238493/1068277825 181606767/758867731 561292985/797845732 -1041891430/1371343529
     760417239/1151165299 118820643/751138087 -528747749/2220607170 1/4"""

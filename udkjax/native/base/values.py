@@ -1,4 +1,4 @@
-"""Values of functions in LLVM's text (ir.py): numbers and vectors of W lanes, with operators that write instructions."""
+"""Values in functions of LLVM's text (ir.py): numbers and vectors of W lanes, with operators that write instructions."""
 
 import struct
 from typing import Any, NamedTuple, Union
@@ -8,7 +8,7 @@ Operand = Union["Value", float, int, bool]
 
 
 def literal(number: Any, base: str) -> str:
-    """Return a number as LLVM writes it."""
+    """Return a number in LLVM's syntax."""
     if base == DOUBLE:
         return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
     return str(int(number)) if base != BOOL else str(bool(number)).lower()
@@ -23,7 +23,7 @@ class Product(NamedTuple):
 
 
 class Value:
-    """One value of a function: its name there, and what it is a vector of."""
+    """One value of a function: its name, base type and number of lanes."""
 
     __slots__ = ("base", "f", "name", "product", "width")
 
@@ -82,7 +82,7 @@ class Value:
         return self.f.compare("eq", self, other)
 
     def is_not(self, other: Operand) -> "Value":
-        """Inequality; true of what is not a number."""
+        """Compare for inequality; true for NaN."""
         return self.f.compare("ne", self, other)
 
     def __and__(self, other):
@@ -100,5 +100,5 @@ class Value:
 
 
 def llvm_type(base: str, width: int) -> str:
-    """Return the type of so many lanes."""
+    """Return the LLVM type of `width` lanes."""
     return base if width == 1 else f"<{width} x {base}>"

@@ -1,6 +1,6 @@
 """Rows for dense methods: D = W Psi_q M^(-1/2), with W the characteristic length over the scale of each row.
 
-They come from the arrays `psi_q` and `root`, which holds M^(-1/2).
+They are made from the arrays `psi_q` and `root`, M^(-1/2).
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,9 +15,9 @@ _ENTRIES, _FACTORS, _CHOSEN = "@entries", "@factors", "@chosen"
 
 
 class RowEntries:
-    """The entries of Psi_q, or of the chosen ones of its rows, with their tables among the constants of a module.
+    """The entries of Psi_q, or of chosen rows of it, with their tables among the constants of a module.
 
-    A module has one choice of rows.
+    A module has only one choice of rows.
     """
 
     def __init__(self, module: Module, chosen: Sequence[int] | None = None):
@@ -39,23 +39,20 @@ class RowEntries:
                 module.loops.globals.append(line)
 
     def entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
-        """Run the block for each entry: its row, its column, its place in `psi_q`, and the factor of what is there.
-
-        Rows are counted among the chosen ones.
-        """
+        """Run the block for each entry with its row among the chosen ones, its column, its index in `psi_q`, and its factor."""
         with f.each(self._count) as e:
             row, column, place = (f.load(Value(f, _ENTRIES, POINTER), e * 3 + j, base=INT) for j in range(3))
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
 
     def row_of_psi(self, f: Function, row: Value) -> Value:
-        """Return the row of Psi of a chosen one."""
+        """Return the row of Psi of a chosen row."""
         return row if len(self._chosen) == self._module.m else f.load(Value(f, _CHOSEN, POINTER), row, base=INT)
 
 
 class WeightedRows(RowEntries):
-    """The rows of a module, and what a dense method solves by them: in all lanes, or lane by lane.
+    """The rows of a module, and their solution by a dense method in all lanes, or lane by lane.
 
-    Where it is lane by lane, functions that use it have one lane, and its number as their argument `lane`.
+    Lane by lane, functions that use it have one lane, whose index is their argument `lane`.
     """
 
     def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False, chosen: Sequence[int] | None = None):
@@ -77,12 +74,12 @@ class WeightedRows(RowEntries):
         return DenseMatrices(self._layout, f)
 
     def array(self, f: Function, name: str, i: Operand) -> Value:
-        """Return one number of an array, in all lanes of the function."""
+        """Return one number of an array in all lanes of the function."""
         place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         return f.load(f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
     def put(self, f: Function, name: str, i: Operand, x: Value):
-        """Store one number of an array, in all lanes of the function."""
+        """Store one number of an array in all lanes of the function."""
         place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         f.store(x, f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
@@ -92,7 +89,7 @@ class WeightedRows(RowEntries):
             yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", self.row_of_psi(f, row))
 
     def factor(self, f: Function):
-        """Factorize D, of the entries of Psi_q at hand."""
+        """Factorize D, from the current entries of Psi_q."""
         d = self.matrices(f)
         with f.each(d.m) as i:
             d.row("D", i).clear()
@@ -116,7 +113,7 @@ class WeightedRows(RowEntries):
         return self.matrices(f).row("x")
 
     def solve_transposed(self, f: Function) -> MatrixRow:
-        """Return (D^+)^T x, with x in its row, of a method that solves so."""
+        """Return (D^+)^T x, with x in its row, if the method solves transposed systems."""
         d = self.matrices(f)
         self._method.solve_transposed(d)
         return d.row("b")

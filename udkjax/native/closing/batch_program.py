@@ -1,4 +1,4 @@
-"""Machine code of a straight-line program for whole batches: W members of arrays (numbers, members) side by side."""
+"""Machine code of a straight-line program for batches: W members of arrays (numbers, members) at a time."""
 
 import ctypes
 
@@ -11,11 +11,11 @@ from udkjax.native.base.program import Writer, from_memory
 
 
 class BatchProgram:
-    """A program of scalars, evaluated for M members at once, on the calling core.
+    """A program of scalars, evaluated for M members on the calling thread.
 
     Args:
         program: the program; its first inputs differ between members.
-        shared: number of inputs, the last ones, that are the same for all members.
+        shared: number of the last inputs that are the same for all members.
     """
 
     def __init__(self, program: ScalarProgram, shared: int = 0):
@@ -26,7 +26,7 @@ class BatchProgram:
         self._run = machine.function(self._library[f.name], *[ctypes.c_void_p] * 3, ctypes.c_int64)
 
     def __call__(self, members: np.ndarray, shared: np.ndarray | None = None) -> np.ndarray:
-        """Return the outputs (outputs, M) for inputs (inputs, M) and what is the same for all."""
+        """Return the outputs (outputs, M) for inputs (inputs, M) and shared inputs."""
         count = members.shape[1]
         padded = -(-count // self.width) * self.width
         given = np.empty((self.own, padded))
@@ -48,7 +48,7 @@ class BatchProgram:
                     x = f.load(f.given["members"], count * k + first, self.width)
                 else:
                     x = f.repeat(f.load(f.given["shared"], k - self.own), self.width)
-                writer.known[s.index] = from_memory(f, x, s.node.dtype)
+                writer.values[s.index] = from_memory(f, x, s.node.dtype)
             for k, value in enumerate(writer.run()):
                 f.store(value, f.given["found"], count * k + first, self.width)
         return f

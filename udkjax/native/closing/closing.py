@@ -1,9 +1,9 @@
-"""Machine code that closes a mechanism: the loop of equations/position_closure.py, for numbers that are known when it runs.
+"""Machine code that closes a mechanism: the loop of equations/position_closure.py at run time, also for traced numbers.
 
     q <- q - s C J^T y,      J C J^T y = Psi,      J = Psi_q,      C = M^(-1)
 
-by steps that are limited, and halved until the residual falls; then the velocities that the constraints allow. Corrections are
-those of corrections.py, of all rows.
+by steps that are limited, and halved until the residual falls; then v is projected onto the constraints. Corrections are those of
+corrections.py, with all rows.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from udkjax.native.closing.corrections import EliminationCorrection, LeastNormCo
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.run.members import write_begin, write_run
 
-CORRECTED = "qv"  # corrected quantities, by their number in a record
+CORRECTED = "qv"  # corrected quantities, by their index in a record
 
 
 class Closing(Module):
@@ -29,7 +29,7 @@ class Closing(Module):
 
     settings = ("length", "fallback_tol")
     results = ("state", "residuals", "rank")
-    further = 1  # corrections of a closed state, which change nothing but derivatives
+    further = 1  # corrections of a closed state, which only change derivatives
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
         plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, unrolled=False, steps=False)
@@ -59,12 +59,12 @@ class Closing(Module):
         return ["psi", "psi_dot"] if self.code.is_small else ["psi", "psi_dot", "rank"]
 
     def _close(self):
-        """`close(work, call)`: the member in the one lane."""
+        """Write `close(work, call)`: close the member in the only lane."""
         f, s = self.function("close", [(POINTER, "work"), (POINTER, "call")])
         n, m = self.n, self.m
 
         def size() -> Value:
-            """Return |Psi|, each row over its scale; not a number where a row is none."""
+            """Return |Psi|, each row over its scale; NaN if any row is NaN."""
             self.invoke(f, "psi")
             total = f.variable(0.0)
             with f.each(m) as i:
@@ -119,7 +119,7 @@ class Closing(Module):
         self._write_result(f, s)
 
     def _write_result(self, f: Function, s: Lane):
-        """Write the state, Psi and Psi_dot there, and the rank of D."""
+        """Write the state, its Psi and Psi_dot, and the rank of D to the outputs."""
         member = self.to_int(f, s.member)
         state, residuals = (self.result_address(f, x, member, 2 * size) for x, size in (("state", self.n), ("residuals", self.m)))
         self.copy_lane(f, state, 0, "state q", f.const(0, INT))
@@ -133,16 +133,16 @@ class Closing(Module):
         self._finish_closing(f, member)
 
     def _evaluate(self, f: Function, x: str):
-        """Evaluate a correction of q or v at the state, with what its derivatives know of it."""
+        """Evaluate a correction of q or v at the state, with the intermediate results that derivatives need."""
         f.call(f"evaluation_newton_{x}", f.given["work"], f.given["work"], self.address(f, "correction"))
 
     def change(self, f: Function, x: str, i: Value) -> Value:
-        """Return a coordinate of the whole correction."""
+        """Return a coordinate of the unlimited correction."""
         place = self.places["correction"] + self.corrections[x].place(f"{x}1")
         return f.load(f.given["work"], i + place) - self.entry(f, f"state {x}", i)
 
     def _correct(self, f: Function, x: str):
-        """Compute the whole correction of q or v, in `state dq` or `state dv`."""
+        """Compute the unlimited correction of q or v as `state dq` or `state dv`."""
         self._evaluate(f, x)
         with f.each(self.n) as i:
             self.put_entry(f, f"state d{x}", i, self.change(f, x, i))
@@ -150,13 +150,13 @@ class Closing(Module):
     # --- hooks for derivatives (closing_derivatives.py)
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
-        """Hook: called at the state before each correction with its `scale`, and one if that was `limited`."""
+        """Hook: called at the state before each correction with its `scale`, and `limited`, one if the scale is a limit."""
 
     def _finish_closing(self, f: Function, member: Value):
-        """Hook: called with a member that is closed."""
+        """Hook: called for a closed member."""
 
     def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
-        """Do something at the state before a step, which lies in `corrected q`, in place of the one that it led to."""
+        """Run `do` at the state before a step, which is in `corrected q`, instead of the state after it."""
         with f.each(self.n) as i:
             current, before = self.entry(f, f"state {x}", i), self.entry(f, "corrected q", i)
             self.put_entry(f, "corrected q", i, current)

@@ -1,9 +1,9 @@
-"""Derivatives of closing a mechanism: of its steps as they are, forward along directions and backward.
+"""Derivatives of closing a mechanism, through its steps, in forward mode along directions and in reverse mode.
 
-The coordinates change by -s times a correction; s, where it limits the step, is a function of it, too. Behind the last step there
-is one more correction, which changes nothing but the derivative: it returns it to the constraint manifold. Corrections
-are differentiated as corrections.py has it. Second derivatives take one correction more: the first leaves a state that changes by
-much beside the manifold by the square of that.
+The coordinates change by -s times a correction; if s limits the step, it is a function of the correction as well. After the last
+step, one more correction only changes the derivative, which it projects onto the constraint manifold. corrections.py has the
+derivatives of corrections. Second derivatives take another correction, as large tangents leave an error of their square after the
+first.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +26,7 @@ class ClosingDerivative(Closing):
         self.put_entry(f, name, i, self.entry(f, name, i, pointer) + x, pointer)
 
     def _longest(self, f: Function, x: str) -> tuple[Value, Value]:
-        """Return the largest change of a coordinate by the whole correction, in units of the scene, and which it is."""
+        """Return the largest change of a coordinate by the unlimited correction, in units of the scene, and its index."""
         longest, which = f.variable(0.0), f.variable(0, INT)
         with f.each(self.n) as i:
             size = f.abs(self.change(f, x, i)) * self.entry(f, "inverse unit", i)
@@ -36,10 +36,10 @@ class ClosingDerivative(Closing):
 
 
 class ClosingForward(ClosingDerivative):
-    """Closing along directions, each with memory of its own: a tangent for each of the changes that are taken."""
+    """Closing with tangents along directions, each in its own memory."""
 
     mode = FORWARD
-    ways = ("d",)  # the changes along a direction, and prefixes of inputs
+    ways = ("d",)  # prefixes of the inputs of each tangent
     outputs = ("dstate",)
     directions_in = 1
 
@@ -63,13 +63,13 @@ class ClosingForward(ClosingDerivative):
         self.corrections[x].forward()
 
     def _linearize(self, f: Function, x: str) -> Value:
-        """Evaluate a correction at the state; return the address of what its derivative needs to know."""
+        """Evaluate a correction at the state; return the address of the intermediate results for its derivative."""
         self._evaluate(f, x)
         self.corrections[x].prepare_derivative(f)
         return self.address(f, "correction")
 
     def _write_push(self, x: str):
-        """Write push_x(work, scale, limited): the change of the state by so much of a correction, which was limited or not."""
+        """Write push_x(work, scale, limited): the tangents of a correction times `scale`, which may be `limited`."""
         f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         known = self._linearize(f, x)
         longest, which = self._longest(f, x)
@@ -79,7 +79,7 @@ class ClosingForward(ClosingDerivative):
             for way in self.ways:
                 with f.each(self.n) as i:
                     self._increase(f, f"result {x}", i, -self.entry(f, f"state {x}", i, way), way)
-            # Of the longest step, over its length: with it the limit changes.
+            # Relative change of the longest coordinate, by which the limit changes.
             steps = {way: self.entry(f, f"result {x}", which, way) for way in self.ways}
             shares = {way: f.select(limits, step / self.change(f, x, which), 0.0) for way, step in steps.items()}
             with f.each(self.n) as i:
@@ -88,7 +88,7 @@ class ClosingForward(ClosingDerivative):
                     self._increase(f, f"state {x}", i, f.given["scale"] * step, way)
 
     def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
-        """Return the changes of a coordinate of a limited step c / c_j, times c_j: dc - a c, with the share a = dc_j / c_j."""
+        """Return the tangents of a coordinate of a limited step c / c_j, times c_j: dc - a c, with a = dc_j / c_j."""
         return {way: change - shares[way] * step for way, change in steps.items()}
 
     @contextmanager
@@ -137,10 +137,10 @@ class ClosingForward(ClosingDerivative):
 
 
 class ClosingTwice(ClosingForward):
-    """Closing along pairs of directions, with its second derivatives.
+    """Closing with second derivatives along pairs of directions.
 
-    Those of corrections are taken by elimination, which agrees with the least-norm solution wherever rows do not contradict each
-    other; so they are to first order.
+    Corrections are differentiated by elimination, which agrees with the least-norm solution to first order, where rows are
+    consistent.
     """
 
     mode = TWICE
@@ -169,7 +169,7 @@ class ClosingTwice(ClosingForward):
 
 
 class ClosingReverse(ClosingDerivative):
-    """Closing, and back: its corrections are recorded and walked back from a cotangent of the state."""
+    """Closing with reverse mode: corrections are recorded, and a cotangent of the state is pulled back through them."""
 
     mode = REVERSE
     inputs = ("statebar",)
@@ -178,7 +178,7 @@ class ClosingReverse(ClosingDerivative):
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
         n, most, p = self.n, CLOSURE_ITERATIONS + 1 + VELOCITIES, self.places
-        self.row = 3 + 2 * n  # of the record: what was corrected, scale, whether it was limited, q and v before
+        self.row = 3 + 2 * n  # length of a row of the record: index of the quantity, scale, whether limited, q and v before
         p.add("record", most * self.row)
         p.add("records")
         for name, count in {
@@ -198,7 +198,7 @@ class ClosingReverse(ClosingDerivative):
             self._write_pull(x)
 
     def _write_pull(self, x: str):
-        """Write pull_x(work, scale, limited): from `bar iterate` behind a correction, made at the state, to that before."""
+        """Write pull_x(work, scale, limited): pull `bar iterate` back through a correction at the state."""
         f, _ = self.function(f"pull_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
         self.corrections[x].prepare_derivative(f)
@@ -216,7 +216,7 @@ class ClosingReverse(ClosingDerivative):
         self._accumulate(f)
 
     def _accumulate(self, f: Function):
-        """Add the cotangents that a correction's derivative has left in `bar state`."""
+        """Add the cotangents in `bar state` from the derivative of a correction."""
         with f.each(self.constants) as i:
             self._increase(f, "total bar constants", i, self.entry(f, "bar constants", i))
         with f.each(self.n) as i:

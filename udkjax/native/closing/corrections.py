@@ -1,6 +1,6 @@
-"""Corrections that close a mechanism, with their derivatives: x - M^(-1/2) D^+ r of q by r = Psi, and of v by r = Psi_dot.
+"""Corrections that close a mechanism, with their derivatives: x - M^(-1/2) D^+ r, for q with r = Psi, and for v with r = Psi_dot.
 
-Those of small scenes are of least norm, by singular values. With the rows weighted, A = W Psi_q M^(-1/2) and z = A^+ W r, along a
+For small scenes they are of least norm, by singular values. With weighted rows, A = W Psi_q M^(-1/2) and z = A^+ W r, along a
 change of the state and of the numbers, where the rank is constant (Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413),
 
     dz = A^+ (dr - dA z - A g) + g,        g = dA^T y,        y = (A^+)^T z,
@@ -9,10 +9,10 @@ and transposed, from a cotangent w of z,
 
     u = (A^+)^T w,    h = w - A^T u:    u is the cotangent of r, and -u z^T + y h^T that of A.
 
-While loops are open, redundant rows contradict each other: singular values below the rank tolerance are not quite zero. How their
-vectors turn is left out, which costs as much of the derivative as their product with the violation: a part in a million at worst.
+While loops are open, redundant rows are inconsistent: singular values below the rank tolerance are not exactly zero. The rotation
+of their vectors is neglected, a relative error of the derivative of the size of their product with the violation, at most 1e-6.
 
-Those of large scenes are by elimination of all rows, without those that depend on others.
+For large scenes they are by elimination of all rows with dependent ones left out.
 """
 
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
@@ -27,13 +27,13 @@ class EliminationCorrection(ProgramDerivative):
     """A correction by elimination."""
 
     def write_adjoint(self):
-        """Nothing: derivatives know all that they need from an evaluation."""
+        """Do nothing: an evaluation stores all intermediate results."""
 
     def prepare_derivative(self, f: Function):
-        """Nothing."""
+        """Do nothing."""
 
     def find_rank(self, f: Function):
-        """Leave the rank of Psi_q in `rank`, after an evaluation."""
+        """Set `rank` to the rank of Psi_q, after an evaluation."""
         module = self._module
         with f.each(module.code.scratch["factors"]) as i:
             x = f.load(f.given["work"], i + (module.places["correction"] + self.place("factors")))
@@ -42,9 +42,9 @@ class EliminationCorrection(ProgramDerivative):
 
 
 class LeastNormCorrection:
-    """A correction by singular values, of one lane. What is stored: x corrected, z, y.
+    """A correction by singular values, for one lane. The stored results are x corrected, z, y.
 
-    An evaluation leaves the factors of A, by which derivatives at the same state solve.
+    Derivatives at the same state use the factors of A from the evaluation.
     """
 
     def __init__(self, module: Module, name: str, rows: WeightedRows):
@@ -59,11 +59,11 @@ class LeastNormCorrection:
                 module.places.add(f"change {name}", size)
 
     def place(self, name: str) -> int:
-        """Return the place at which an array begins in `stored`."""
+        """Return the offset of an array in `stored`."""
         return {f"{self._x}1": 0, "z": self._module.n, "y": 2 * self._module.n}[name]
 
     def find_rank(self, f: Function):
-        """Nothing: an evaluation leaves the rank of Psi_q in `rank`."""
+        """Do nothing: an evaluation sets `rank`."""
 
     def _changes(self, prefix: str) -> dict[str, tuple[str, int]]:
         return {prefix + x: ("work", self._module.places[f"change {x}"]) for x in ("psi_q", "psi", "root")}
@@ -95,7 +95,7 @@ class LeastNormCorrection:
             f.store(self._at(f, f"state {self._x}", i) - self._at(f, "root", i) * z.entry(i), f.given["stored"], i)
 
     def write_adjoint(self):
-        """`adjoint_...(work, stored)`: y, which derivatives need besides."""
+        """Write `adjoint_...(work, stored)`: compute y, which only derivatives need."""
         f, _ = self._module.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
         x = self._rows.matrices(f).row("x")
         x.clear()
@@ -106,11 +106,11 @@ class LeastNormCorrection:
             f.store(y.entry(i), f.given["stored"], i + self.place("y"))
 
     def prepare_derivative(self, f: Function):
-        """Compute the further numbers that derivatives need, behind an evaluation."""
+        """Compute the additional results that derivatives need, after an evaluation."""
         f.call(f"adjoint_{self._name}", f.given["work"], self._module.address(f, "correction"))
 
     def forward(self):
-        """Write `forward_...(work, stored, tangent, out)`: the change of the correction along one direction."""
+        """Write `forward_...(work, stored, tangent, out)`: the tangent of the correction along one direction."""
         module, w = self._module, self._module.tangents
         at = module.arrays | {"root": ("work", module.places["root"])} | self._changes(TANGENT)
         places = {"constants": "constants", "q": "state q", "v": "state v"}

@@ -1,12 +1,12 @@
 """Machine code that follows the positions of a driven mechanism from value to value: a batch of members in W lanes.
 
-A step predicts by the Taylor polynomial of q(s) to the third order, from q', q'' and the change of q'', and corrects twice by
-Newton's method with elimination. All lanes take the same steps: nothing depends on how one of them fares. Positions to be
-relied on are counted: as long as each is closed to rounding, lies near its prediction, the tangent has turned little since the
-one before, and no row is near dependence. From there on, the caller goes on by singular values.
+A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects twice by Newton's
+method with elimination. All lanes take the same steps, even if some fail. Reliable positions are counted, up to the first that is
+not closed to rounding, lies far from its prediction, has turned its tangent too far, or has a row near dependence. From there
+the caller continues by singular values.
 
-Where the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows:
-it is another one behind a position where branches meet, and on another branch that comes close.
+If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. It
+changes where branches meet, and differs on another branch that comes close.
 """
 
 import numpy as np
@@ -24,10 +24,10 @@ from udkjax.native.run.manifold import largest_violation
 from udkjax.native.run.members import write_begin, write_run
 
 CORRECTIONS = 2
-STRAIGHT = 0.95  # cosine of the angle by which the tangent may turn in a step
-SLACK = 0.1  # of a step: how far a position may lie from its prediction
+STRAIGHT = 0.95  # cosine of the largest rotation of the tangent in a step
+SLACK = 0.1  # largest distance of a position from its prediction, as a fraction of the step
 _METHOD = LUCode(relative=True)
-DISTANT = 1e-2  # from dependence: nearer, elimination loses more than half of the digits of q''
+DISTANT = 1e-2  # smallest distance from dependence; nearer, elimination loses more than half of the digits of q''
 
 
 class Marching(Module):
@@ -71,7 +71,7 @@ class Marching(Module):
         return super().arrays | {name: ("work", self.places[name]) for name in named}
 
     def _march(self):
-        """`march(work, call)`: the members in all lanes, over all values."""
+        """Write `march(work, call)`: follow the members in all lanes over all values."""
         f, s = self.function("march", [(POINTER, "work"), (POINTER, "call")])
         zero, times = f.const(0.0, DOUBLE, f.width), self.field(f, "times")
         trusted, good, before = f.variable(0.0), f.variable(1.0), f.variable(s.start)
@@ -87,7 +87,7 @@ class Marching(Module):
             self._step_on(f, h)
             good.value = f.select(self._is_sound(f, s, h, begins), good.value, zero)
             trusted.value = trusted.value + good.value
-            with f.if_(begins), f.each(self.n) as i:  # there was no step: nothing is known of the third derivative
+            with f.if_(begins), f.each(self.n) as i:  # the first step has no third derivative
                 self.put_entry(f, "third derivative", i, zero)
             before.value, side = now, self._side(f)
             with self.each_lane(f, s.active) as lane:
@@ -100,7 +100,7 @@ class Marching(Module):
             f.store(f.lane(trusted.value, lane), self.field(f, "trusted", POINTER), member)
 
     def _step_on(self, f: Function, h: Value):
-        """Predict the positions a step ahead, correct them, and compute q' and q'' there."""
+        """Predict the next positions, correct them, and compute their q' and q''."""
         with f.each(self.n) as i:
             first, second = self.entry(f, "result dq", i), self.entry(f, "result dv", i)
             bend = f.fma(h * (1 / 6), self.entry(f, "third derivative", i), second * 0.5)
@@ -114,7 +114,7 @@ class Marching(Module):
         self.invoke(f, "value_derivatives")
 
     def _side(self, f: Function) -> Value:
-        """Return the sign of det Psi_q at `state q`; 1 where Psi_q is not square."""
+        """Return the sign of det Psi_q at `state q`; 1 if Psi_q is not square."""
         if not self._rows:
             return f.const(1.0, DOUBLE, f.width)
         self.invoke(f, "dense_newton_q")
@@ -122,7 +122,7 @@ class Marching(Module):
         return _METHOD.sign(self._rows.matrices(f))
 
     def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> Value:
-        """Tell whether positions are closed, near their prediction, and on a straight course; estimate the third derivative."""
+        """Return whether positions are closed, near their prediction, and with little rotation; estimate the third derivative."""
         one, zero, eps = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), float(np.finfo(float).eps)
         off, largest = f.variable(0.0), f.variable(1.0)
         product, old_square, new_square = f.variable(0.0), f.variable(0.0), f.variable(0.0)

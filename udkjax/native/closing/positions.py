@@ -1,7 +1,7 @@
-"""Machine code of the positions of batches of mechanisms (equations/position_programs.py): W members side by side.
+"""Machine code of the positions of batches of mechanisms (equations/position_programs.py), W members at a time.
 
-Of each member the constants are computed once; then, position by position, q is predicted, closed by Newton's method, and
-measured. Positions follow one another from the drawn one on (a march), or each starts from a guess of its own.
+The constants are computed once for each member; then q is predicted, closed by Newton's method, and measured at one position
+after another. A march follows positions from the drawn one on; otherwise each position starts from its own guess.
 """
 
 import ctypes
@@ -19,14 +19,14 @@ from udkjax.native.base import machine
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.base.program import consecutive, write
 
-# A Newton step below so many units of a coordinate is the last: the next one would be its square.
+# A Newton step shorter than this, in units of the coordinates, is the last: the next one would be its square.
 LAST_STEP = 1e-7
-LONGEST_CORRECTION = 0.5  # units: a position that Newton's method moves farther is not the one that was predicted
-LONGEST_OF_MARCH = 0.1  # likewise, of a step of a march: more, and it is taken in smaller ones
-SHORTEST = 1 / 128  # of the longest step of a march: a member that cannot go on by that much has come to its end
+LONGEST_CORRECTION = 0.5  # largest Newton step, in units of the coordinates; a longer one leads to another position
+LONGEST_OF_MARCH = 0.1  # largest Newton step in a march; otherwise the step of the march is shortened
+SHORTEST = 1 / 128  # shortest step of a march, relative to the longest; a member that fails with it has reached its end
 MOST_CORRECTIONS = 12
-FARTHEST = 4.0  # times the step before: farther, the cubic through two positions is no prediction
-MOST_SUBSTEPS = 1000  # between two positions: beyond, the values are in another unit
+FARTHEST = 4.0  # largest extrapolation by the cubic through two positions, relative to the previous step
+MOST_SUBSTEPS = 1000  # maximum between two positions; more indicate a wrong unit of the values
 POINTERS = ("x", "s", "guess", "data", "unit", "q", "out", "end", "next")
 FIELDS = ("members", "count", "marches", "s stride", "data stride", *POINTERS, "longest")
 
@@ -37,7 +37,7 @@ class Positions(NamedTuple):
     Attributes:
         q: coordinates (M, J, n).
         out: the outputs of the programs (M, J, K).
-        end: the last Newton step (M, J), in units of the coordinates; not a number where a position was not reached.
+        end: the last Newton step (M, J), in units of the coordinates; NaN where a position was not reached.
     """
 
     q: np.ndarray
@@ -67,15 +67,15 @@ class PositionCode:
 
         Args:
             x: Free numbers (M, P).
-            s: Values of the driver, of all members (J,) or of each (M, J).
-            unit: Units of the coordinates (n,), by which corrections are judged.
-            data: Data of the positions, of all members (J, D) or of each (M, J, D).
-            guess: Positions from which each is closed (M, J, n); None: a march from the drawn position.
-            longest: Step of s that a march takes, at most.
-            threads: Number of threads that share the members; by default that of the cores.
+            s: Values of the driver, for all members (J,) or for each (M, J).
+            unit: Units of the coordinates (n,), in which corrections are measured.
+            data: Data of the positions, for all members (J, D) or for each (M, J, D).
+            guess: Initial guesses (M, J, n); None: a march from the drawn position.
+            longest: Longest step of s in a march.
+            threads: Number of threads that share the members; by default one for each core.
 
         Returns:
-            Positions; not a number where one was not reached.
+            The positions; NaN where one was not reached.
         """
         members, count, sizes = len(x), s.shape[-1], self.programs.sizes
         data = np.zeros((count, sizes.data)) if data is None else data
@@ -147,7 +147,7 @@ class _Text:
         return f.load(f.given["call"], FIELDS.index(name), base=base)
 
     def _gather(self, f: Function, addresses: Sequence[Value], name: str, count: int):
-        """Numbers of each lane's own address, side by side."""
+        """Load `count` numbers from the address of each lane into an array."""
         with f.each(count) as i:
             for k, address in enumerate(addresses):
                 f.store(f.load(address, i), f.given["work"], (i + self.places[name]) * self.width + k)
@@ -163,7 +163,7 @@ class _Text:
     # --- functions
 
     def _close(self) -> Function:
-        """`close(work, most)`: q by Newton's method at s; `end` becomes the last step, or not a number where it fails."""
+        """Write `close(work, most)`: q by Newton's method at s; `end` becomes the last step, or NaN if it fails."""
         arguments = [(POINTER, "work"), (DOUBLE, "most")]
         f, n = Function("close", arguments, self.width), self.programs.sizes.coordinates
         most = f.given["most"]
@@ -205,7 +205,7 @@ class _Text:
 
     @contextmanager
     def _groups(self, f: Function, members: Value) -> Iterator[Value]:
-        """Groups of members that threads take in turn."""
+        """Run the block for groups of members, which threads take in turn."""
         following = self._field(f, "next", POINTER)
         first = f.variable(0, INT, 1)
 
@@ -254,7 +254,7 @@ class _Text:
         f.call("close", f.given["work"], f.const(LONGEST_CORRECTION))
 
     def _march(self, f: Function, before: Variable, sign: Variable, longest: Variable):
-        """Go on to the target, in steps that are halved where a lane loses its way, and grow again."""
+        """Continue to the target, in steps that are halved if a lane fails, and grow again."""
         n, goes_on = self.programs.sizes.coordinates, f.variable(1.0, width=1)
         limit = self._field(f, "longest", DOUBLE)
 
@@ -298,7 +298,7 @@ class _Text:
         self._put(f, "s", self._load(f, "target"))
 
     def _predict(self, f: Function, step: Value, before: Value):
-        """Extrapolate the cubic of the last two positions and their rates; the first step, along the rate."""
+        """Extrapolate the cubic through the last two positions and their rates; in the first step, the rate."""
         known = (f.abs(before) > 0.0) & (f.abs(before) * FARTHEST >= f.abs(step))
         u = f.select(known, step / f.select(known, before, 1.0), 0.0) + 1.0
         u2, u3 = u * u, u * u * u

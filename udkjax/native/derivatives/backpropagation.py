@@ -1,15 +1,15 @@
-"""Derivatives of a trajectory in reverse mode: the recorded steps (record.py) are walked back.
+"""Derivatives of a trajectory in reverse mode, by backpropagation through the recorded steps (record.py).
 
-A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are collected
-from the last to the first: those of an output go through its projection and through the interpolation to the four points that it
-lies on; those of a point through its accelerations and its projection to the end of the step that led there, and through the sums
+A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are accumulated
+from the last to the first: those of an output go through its projection and interpolation to the four points of its polynomial;
+those of a point go through its accelerations and its projection to the end of the step that led to it, and through the sums
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
-of its stages, the last first, to the point before. The stages are evaluated again on the way, with what the derivatives need to
-know of them; the transposed programs are those of expressions/differential.py.
+of its stages, the last first, to the point before. The stages are evaluated again with the intermediate results that derivatives
+need; the transposed programs are those of expressions/differential.py.
 
-Members walk back side by side, in lanes; the next ones follow when all are back.
+Members in lanes are backpropagated together; the next ones are loaded when all are complete.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from udkjax.native.run.runge_kutta import stage_state
 
 
 class Reverse(Recorded):
-    """A trajectory that is walked back, with cotangents of its outputs and its end; or not, where these have no members."""
+    """A trajectory with backpropagation from cotangents of its outputs and its end; without cotangents it only runs."""
 
     inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar", "record")
@@ -63,16 +63,16 @@ class Reverse(Recorded):
             self._write_find_rows()
         self._write_backpropagate()
 
-    # --- the way back
+    # --- backpropagation
 
     def _accumulate_constants(self, f: Function, mask: Value):
-        """Add the cotangents of the constants that a program has found to those of lanes in question."""
+        """Add the cotangents of the constants from one program to the sums, in the lanes of `mask`."""
         with f.each(self.count) as i:
             total, more = (self.entry(f, name, i) for name in ("total bar constants", "bar constants"))
             self.put_entry(f, "total bar constants", i, f.select(mask, total + more, total))
 
     def _pull_projection(self, f: Function, mask: Value):
-        """Pull `bar result` through the projection that led to the state, which has been evaluated, to `bar state`."""
+        """Pull `bar result` back through the projection that led to the state, after its evaluation, to `bar state`."""
         if self.of_projection:
             f.call("reverse_projection", f.given["work"], self.address(f, "projection linearization"), f.given["work"])
             self._accumulate_constants(f, mask)
@@ -82,18 +82,18 @@ class Reverse(Recorded):
                     self.put(f, f"bar state {x}", r, self.vector(f, f"bar result {x}", r))
 
     def _pull_accelerations(self, f: Function, stored: str, bar: str, mask: Value):
-        """Pull cotangents of accelerations through the equations at the state, to `bar state`."""
+        """Pull cotangents of accelerations back through the equations at the state, to `bar state`."""
         f.call("reverse", f.given["work"], self.address(f, stored), self.address(f, bar))
         self._accumulate_constants(f, mask)
 
     def _write_step_back(self):
-        """Write `step_back`: from the cotangents of point 3 to those of point 2, of lanes that are not yet back (`at`)."""
+        """Write `step_back`: from the cotangents of point 3 to those of point 2, in lanes with points left (`at`)."""
         f, s = self.function("step_back")
         active = s.at > 0.5
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
         h, last = self.broadcast(f, step), self.last
         stages = range(1, last)
-        steps = f.any_of(active & (s.begin < 0.5))  # where runs only begin there are no stages
+        steps = f.any_of(active & (s.begin < 0.5))  # the beginning of a run has no stages
         with f.if_(steps):
             for i in stages:
                 stage_state(self, f, s, i, "point2", step)
@@ -119,7 +119,7 @@ class Reverse(Recorded):
             self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))
 
     def _accumulate_stage(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
-        """Add `bar state` of stage i to the cotangents of the point before and of the stages that it is made of."""
+        """Add `bar state` of stage i to the cotangents of the point before and of the earlier stages."""
         method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
             of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
@@ -137,7 +137,7 @@ class Reverse(Recorded):
                     self.put(f, f"bar stage{j} a", r, total)
 
     def _write_backpropagate(self):
-        """Walk back all members that are `ready`, and write the cotangents of what they began with."""
+        """Write the backpropagation of all members that are `ready` to the cotangents of their initial states and numbers."""
         f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
         call, yes = f.given["call"], f.const(1.0, DOUBLE, f.width)
         self._begin_walk(f, s)
@@ -157,7 +157,7 @@ class Reverse(Recorded):
                 f.call("differences_back", f.given["work"])
             f.call("step_back", f.given["work"])
             self._move_back(f, s)
-        # The remaining cotangent is that of the first state as it was given, which is the first output, too.
+        # The remaining cotangent is that of the given initial state, which is also the first output.
         with self.each_lane(f, s.ready > 0.5) as k:
             self._add_output(f, k, f.const(0, INT), "bar point3")
             for x in "qv":
@@ -204,7 +204,7 @@ class Reverse(Recorded):
                     f.store(0.0, to, i)
 
     def _pull_output(self, f: Function, s: Lane):
-        """Pull the cotangents of the outputs that are `due` through projection and interpolation, to `bar difference`.
+        """Pull the cotangents of the outputs that are `due` back through projection and interpolation, to `bar difference`.
 
         q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the differences N_k and the products pi_k of differences of times.
         """
@@ -236,7 +236,7 @@ class Reverse(Recorded):
         s.where(mask, written=s.written - 1.0)
 
     def _move_back(self, f: Function, s: Lane):
-        """Shift points and their cotangents by one, and load the point that comes in at the other end."""
+        """Shift points and their cotangents by one, and load the next earlier point."""
         active, zero = s.at > 0.5, f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
             for name in ("bar point", "point"):
@@ -252,7 +252,7 @@ class Reverse(Recorded):
             self._load_head(f, k)
 
     def _write_find_rows(self):
-        """`find_rows(work, call)`: the rows of samples that hold where lanes are, each with its constants."""
+        """Write `find_rows(work, call)`: load the rows of samples at the lanes' times, with their constants."""
         f, s = self.function("find_rows", ARGUMENTS[:2])
         work, call = f.given["work"], f.given["call"]
         with self.each_lane(f, s.at > 0.5) as k:
@@ -264,7 +264,7 @@ class Reverse(Recorded):
                 f.call("enter", work, call, k)
 
     def _write_leave_row(self):
-        """`leave_row(work, call, lane)`: the cotangents of a lane's constants, to those of the numbers and of the samples."""
+        """Write `leave_row(work, call, lane)`: pull the cotangents of a lane's constants back to the numbers and samples."""
         if not self.count:
             return
         f, _ = self.function("leave_row", ARGUMENTS)

@@ -1,4 +1,4 @@
-"""The base of forward and reverse mode of a trajectory: the programs whose derivatives both take, at their states."""
+"""The base of forward and reverse mode of a trajectory: the differentiated programs, evaluated at the same states."""
 
 from udkjax.native.base.ir import Function
 from udkjax.native.base.layout import Plan
@@ -7,29 +7,29 @@ from udkjax.native.run.trajectory import Trajectory
 
 
 class Differentiated(Trajectory):
-    """The base of both modes: programs of derivatives, and memory for what they know of a state.
+    """The base of both modes: programs of derivatives, and memory for their intermediate results.
 
-    `active` says which numbers of the scene have derivatives; positions and velocities do.
+    `active` marks the numbers of the scene with derivatives; positions and velocities always have them.
     """
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         differentiated = ("accelerations", "projection") if plan.projected else ("accelerations",)
         super().__init__(plan, differentiated, active)
         self.active, self.count, self.last = active, len(self.moving), plan.method.stages
-        # Of each active number that has samples: its column there, and its place among the numbers.
+        # For each active number with samples: its column among the samples, and its index among the numbers.
         self.active_samples = {k: place for k, place in enumerate(plan.sampled) if active[place]}
         self.of_accelerations = ProgramDerivative(self, "accelerations")
         self.of_projection = ProgramDerivative(self, "projection") if plan.projected else None
-        for i in range(1, self.last + 1):  # the last: of the end
+        for i in range(1, self.last + 1):  # the last is at the end of the step
             self.places.add(f"stage{i} linearization", self.of_accelerations.stored)
         if self.of_projection:
             self.places.add("projection linearization", self.of_projection.stored)
 
     def evaluate_stage(self, f: Function, i: int):
-        """Compute the accelerations of stage i at its state, with what their derivatives need to know of it."""
+        """Compute the accelerations of stage i with the intermediate results that derivatives need."""
         f.call("evaluation", f.given["work"], self.address(f, f"stage{i} a"), self.address(f, f"stage{i} linearization"))
         if self.dense or self.formulated:
-            self.accelerate(f, f"stage{i} a")  # derivatives are those of all methods, values the method's own
+            self.accelerate(f, f"stage{i} a")  # all methods share the derivatives; values are the method's own
 
     def write_programs(self):
         super().write_programs()
@@ -46,7 +46,7 @@ class Differentiated(Trajectory):
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
     def _evaluate_end(self, f: Function):
-        """Evaluate accelerations and a projection at the end of a step, for their derivatives: by the same factors."""
+        """Evaluate accelerations and a projection at the end of a step for their derivatives, from one factorization."""
         accelerations = self.address(f, f"stage{self.last} linearization")
         if self.unrolled and self.of_projection:
             f.call("evaluation_end", f.given["work"], accelerations, self.address(f, "projection linearization"))
@@ -55,6 +55,6 @@ class Differentiated(Trajectory):
             self._evaluate_projection(f)
 
     def _evaluate_projection(self, f: Function):
-        """Evaluate a projection at the state, which lies on the manifold, for its derivatives."""
+        """Evaluate a projection at the state, which lies on the manifold, for the derivatives of the projection."""
         if self.of_projection:
             f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "projection linearization"))

@@ -1,7 +1,7 @@
-"""The record of a trajectory, from which reverse mode walks back: its accepted states, and what led to each of them.
+"""The record of a trajectory for reverse mode: its accepted states and the steps between them.
 
-A first call of the code runs, and leaves the record of each member among its outputs. A second one, with cotangents, is given the
-record and walks back at once; a member whose record was too long for its place is run again.
+A first call of the code integrates, and returns the record of each member among its outputs. A second one takes the record and
+cotangents, and backpropagates; a member whose record was too long for the output is integrated again.
 """
 
 from collections.abc import Callable
@@ -10,20 +10,20 @@ from udkjax.native.base.ir import POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.derivatives.differentiated import Differentiated
 
-FIRST = 32  # points that a record has room for while a member runs, before it grows
-STORED = 200  # points up to which a record is given to the second call: as much memory as 300 outputs
-PER_BREAKPOINT = 3  # further points for each breakpoint: where a run begins anew, and two steps
-TITLE = 3  # numbers of a record before its points: how many points, how the run ended, how many outputs it wrote
-HEAD = 3  # numbers of a point before its state: its time, how many outputs were written before its step, whether it begins anew
+FIRST = 32  # initial capacity of a record, in points, while a member runs
+STORED = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs
+PER_BREAKPOINT = 3  # additional capacity for each breakpoint: the beginning of a new run, and two steps
+TITLE = 3  # numbers of a record before its points: the number of points, how the run ended, the number of outputs written
+HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, whether a run begins
 
 
 def record_length(n: int, points: int) -> int:
-    """Return the length of the record of a member, of n coordinates and so many points."""
+    """Return the length of a record of `points` points with n coordinates."""
     return TITLE + points * (HEAD + 3 * n)
 
 
 class Recorded(Differentiated):
-    """A trajectory that leaves a record, or walks back from one."""
+    """A trajectory that returns a record, or backpropagates from one."""
 
     lengths = ("given record", "record")
 
@@ -64,7 +64,7 @@ class Recorded(Differentiated):
             self._leave_record(f, k)
 
     def _leave_record(self, f: Function, k: Value):
-        """Write the record of lane k, or none where it is too long: no points."""
+        """Write the record of lane k to the output; without points if it is too long."""
         length = self.field(f, "record length")
         to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
         points, record = self.lane_entry(f, "points", k), self._record(f, k)
@@ -81,7 +81,7 @@ class Recorded(Differentiated):
         with f.if_(self.lane_entry(f, "given", k) < 0.5):
             f.line(f"call void @free(ptr {self._record(f, k).name})")
 
-    # --- which members are next
+    # --- order of members
 
     def goes_on(self, f: Function, s: Lane) -> Value:
         return f.any_of(s.active > 0.5) | f.any_of(s.ready > 0.5)
@@ -91,14 +91,14 @@ class Recorded(Differentiated):
             fill()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Walk back with the members in the lanes side by side when all have run; the next ones follow."""
+        """Backpropagate the members of all lanes together when all are complete, and load the next ones."""
         with f.if_(f.any_of(s.active > 0.5)):
             super().step_all(f, s, fill)
         with f.if_(self.walks_back(f) & ~f.any_of(s.active > 0.5)):
             f.call("walk", f.given["work"], f.given["call"])
             fill()
 
-    # --- its points
+    # --- points
 
     def _new_record(self, f: Function, lane: Value):
         s = Lane(f, self.places)
@@ -130,7 +130,7 @@ class Recorded(Differentiated):
         self.put_lane_entry(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
-        """Load a point of lane k from its record; before the first one there is the first."""
+        """Load a point of lane k from its record; numbers before the first point mean the first."""
         row = f.at(self._record(f, k), self.to_int(f, f.max(number, 0.0)) * self.row)
         self.put_lane_entry(f, f"{point}_t", k, f.load(row, 0))
         for j, x in enumerate("qva"):
@@ -138,7 +138,7 @@ class Recorded(Differentiated):
                 self.put_lane_entry(f, f"{point} {x}", k, f.load(row, i + (HEAD + j * self.n)), i)
 
     def _load_head(self, f: Function, k: Value):
-        """Load the head of lane k's point: outputs written `before` its step, and `begin`."""
+        """Load the head of the current point of lane k: the number of outputs `before` its step, and `begin`."""
         row = f.at(self._record(f, k), self.to_int(f, self.lane_entry(f, "at", k)) * self.row)
         self.put_lane_entry(f, "before", k, f.load(row, 1))
         self.put_lane_entry(f, "begin", k, f.load(row, 2))

@@ -1,12 +1,12 @@
-"""Derivatives of a trajectory in forward mode: along directions, in the same code, step by step.
+"""Derivatives of a trajectory in forward mode, along directions, computed with each step.
 
-Where a run goes is a function of the constants of a scene and of the initial state. Steps are taken as they are: no derivative is
-taken of their sizes. Along a direction, the states of the stages change by the same sums that they are made of,
+A run is a function of the constants of a scene and of the initial state; step sizes are not differentiated. Along a direction,
+the tangents of the stages are the sums
 
     dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
 
-and the accelerations, the end of a step and the outputs, which are projected, by the programs of their own derivatives
-(expressions/differential.py), with what those know of the state from its own evaluation. Interpolation is linear.
+and those of the accelerations, the end of a step and the projected outputs come from the programs of derivatives
+(expressions/differential.py), with intermediate results from the evaluation. Interpolation is linear.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,16 +24,16 @@ from udkjax.native.run.dense_output import write_between, write_differences
 
 
 class Forward(Differentiated):
-    """A trajectory with its changes along directions.
+    """A trajectory with its tangents along directions.
 
-    Directions come in groups, each with memory of its own, a `tangent`: one direction for all members, or, of a single member, as
-    many directions side by side as there are lanes. Where changes are taken along pairs of directions, a group has a tangent for
-    each of them and one for both, one behind the other.
+    Directions come in groups, each with its own memory, a `tangent`: one direction for all members, or, for a single member, as
+    many directions as there are lanes. For second derivatives along pairs of directions, a group has three consecutive tangents,
+    for each direction and for both.
     """
 
-    accelerate_stage = Differentiated.evaluate_stage  # in each step, since its changes follow at once
+    accelerate_stage = Differentiated.evaluate_stage  # intermediate results are needed in each step
     mode = FORWARD
-    ways = ("d",)  # of the tangents of a direction: the changes that each holds, prefixes of inputs
+    ways = ("d",)  # prefixes of the inputs of each tangent of a group
     outputs = ("dys", "dend")
     directions_in = 1
 
@@ -66,13 +66,13 @@ class Forward(Differentiated):
 
     @contextmanager
     def _each_group(self, f: Function) -> Iterator[Value]:
-        """Run the block for every group of directions, with `tangent` where its memory is."""
+        """Run the block for every group of directions, with `tangent` set to its memory."""
         with self._each_tangent(f, len(self.ways)) as p:
             yield p
 
     @contextmanager
     def _each_tangent(self, f: Function, step: int = 1) -> Iterator[Value]:
-        """Run the block for every tangent of every group, or for the first of so many."""
+        """Run the block for every `step`-th tangent of all groups."""
         first = f.load(f.given["work"], self.start("tangents", "work"), base=POINTER)
         with f.each(self._groups(f) * (len(self.ways) // step)) as p:
             f.given["tangent"] = f.at(first, p * (step * self.tangents.size * self.tangents.width))
@@ -80,7 +80,7 @@ class Forward(Differentiated):
 
     @contextmanager
     def _each_direction(self, f: Function, p: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
-        """Run the block for every direction of a group, of the member in a lane: its number, and its lane in a tangent."""
+        """Run the block for every direction of group p for the member in a lane: its index, and its lane in the tangent."""
         with f.each(self.group) as j:
             direction = p * self.group + j
             with f.if_(direction < self.field(f, "directions")):
@@ -98,7 +98,7 @@ class Forward(Differentiated):
         f.call(name, f.given["work"], self.address(f, stored), tangent, out or tangent)
 
     def _project_tangent(self, f: Function):
-        """Compute `result` of a tangent: its `state` once projected, at the state, which is on the manifold."""
+        """Compute `result` of a tangent, the projection of its `state`, at a state on the manifold."""
         if self.of_projection:
             self._along(f, f"{self.mode}_projection", "projection linearization")
         else:
@@ -111,7 +111,7 @@ class Forward(Differentiated):
             f.given["tangent"] = group
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """Compute the changes of the stage's accelerations."""
+        """Compute the tangents of the stage's accelerations."""
         h = self.broadcast(f, s.step)
         with self._each_tangent(f):
             self._change_stage(f, i, h, "point3")
@@ -123,7 +123,7 @@ class Forward(Differentiated):
             self._change_end(f, s, accept)
 
     def _change_end(self, f: Function, s: Lane, accept: Value):
-        """Compute the changes of point 3, from those of point 2, where the step began."""
+        """Compute the tangents of point 3 from those of point 2, where the step began."""
         step = f.select(s.begin > 0.5, 0.0, s.t1 - s.point2_t)
         h, begin = self.broadcast(f, step), s.begin > 0.5
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
@@ -151,7 +151,7 @@ class Forward(Differentiated):
                 self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
 
     def _project_end(self, f: Function, begin: Value):
-        """Project the changes of the state at the end of a step."""
+        """Project the tangents of the state at the end of a step."""
         del begin
         with self._each_group(f):
             self._project_tangent(f)
@@ -160,7 +160,7 @@ class Forward(Differentiated):
                 self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
 
     def _change_stage(self, f: Function, i: int, h: Value, start: str):
-        """Compute the change of the state of stage i in a tangent, of the step from a point."""
+        """Compute the state of stage i in a tangent, for the step from a point."""
         node, names = float(self.method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
         with f.each(self.registers("tangent")) as r:
             q, v = self.vector(f, f"{start} q", r, "tangent"), self.vector(f, f"{start} v", r, "tangent")
@@ -174,7 +174,7 @@ class Forward(Differentiated):
 
     def record_output(self, f: Function, s: Lane):
         with f.each(self.rowcount) as r:
-            self.put(f, "state v", r, self.vector(f, "result v", r))  # the programs look for states there
+            self.put(f, "state v", r, self.vector(f, "result v", r))  # the input of the programs
         self._evaluate_projection(f)
         with self._each_tangent(f):
             f.call("tangent_differences", f.given["work"], f.given["tangent"])
@@ -186,7 +186,7 @@ class Forward(Differentiated):
                 self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "result q", "result v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
-        """Write the changes of a state of the member in lane k along the directions of group p, of the last tangent of each."""
+        """Write the derivatives of a state of the member in lane k along the directions of group p, from its last tangent."""
         member, times = self.to_int(f, f.lane(s.member, k)), self.field(f, "times")
         with self._each_direction(f, p, k) as (direction, lane):
             row = (member * self.field(f, "directions") + direction) * times + number
@@ -195,11 +195,11 @@ class Forward(Differentiated):
             self.copy_lane(f, to, self.n, v, lane, "tangent")
 
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
-        """Compute the changes of the constants along all directions."""
+        """Compute the tangents of the constants along all directions."""
         if not self.count:
             return
         found = [Value(f, f.reserve(DOUBLE, self.count), POINTER) for _ in self.ways]
-        none = Value(f, f.reserve(DOUBLE, self.code.number_count), POINTER)  # along both of two directions numbers do not change
+        none = Value(f, f.reserve(DOUBLE, self.code.number_count), POINTER)  # numbers have no second derivatives
         if len(self.ways) > 1:
             with f.each(self.code.number_count) as i:
                 f.store(0.0, none, i)
@@ -211,7 +211,7 @@ class Forward(Differentiated):
                     f.store(f.load(changes, i), self._way(f, way), place + self.place("constants", i, "tangent"))
 
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
-        """Return the address of the changes of a member's numbers along a direction; of samples, those of their row."""
+        """Return the address of the tangents of a member's numbers along a direction, with those of the row of samples."""
         count = self.code.number_count
         given = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
         places = self.active_samples
@@ -238,7 +238,7 @@ class Forward(Differentiated):
     def _read_state(
         self, f: Function, way: str, member: Value, direction: Value, tangent: Value, place: Value, to: Sequence[str]
     ):
-        """Read the change of the first state of a member along a direction, into a lane of arrays of a tangent."""
+        """Read the tangent of the initial state of a member along a direction into a lane of arrays of a tangent."""
         for x in "qv":
             start = self.member_address(f, f"{way}{x}", member) if way in GIVEN else None
             with f.each(self.n) as i:
@@ -247,7 +247,7 @@ class Forward(Differentiated):
                     f.store(change, tangent, place + self.place(f"{array} {x}", i, "tangent"))
 
     def end_members(self, f: Function, s: Lane):
-        """Write the changes of the first state, which is taken as it is given, and of the last."""
+        """Write the tangents of the first state, as given, and of the last."""
         way, times = self.ways[-1], self.field(f, "times")
         with self._each_group(f) as p, self.each_lane(f, s.due) as k:
             f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))
@@ -260,7 +260,7 @@ class Forward(Differentiated):
             self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
 
     def allocate_memory(self, f: Function, call: Value) -> list[Value]:
-        """Memory for all directions."""
+        """Allocate memory for all directions; return the blocks to free."""
         size = self._groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
         block, start = self.allocate(f, size)
         with f.each(size) as i:
@@ -270,18 +270,18 @@ class Forward(Differentiated):
 
 
 class ForwardTwice(Forward):
-    """A trajectory with its second derivatives along pairs of directions: the changes of its changes.
+    """A trajectory with its second derivatives along pairs of directions.
 
-    Of the sums of the stages, of the ends of steps and of outputs they are the same sums, and the programs of accelerations and
-    projections find them beside the changes along either direction.
+    They are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections compute them
+    together with the tangents along either direction.
     """
 
     mode = TWICE
     ways = WAYS
 
     def _project_end(self, f: Function, begin: Value):
-        # Newton's step from a state beside the manifold is right to first order, two are to second: only a first state may be
-        # moved off it.
+        # From a state off the manifold, one Newton step is exact to first order, two steps to second order. Only the initial
+        # state may be off the manifold.
         super()._project_end(f, begin)
         with f.if_(f.any_of(begin)):
             super()._project_end(f, begin)

@@ -1,8 +1,8 @@
-"""Machine code of the pseudoinverses of `udkjax.pinv`: D^+ b of a dense D, each by the algorithm of its class there.
+"""Machine code of the pseudoinverses of `udkjax.pinv`: D^+ b for a dense D, each by the algorithm of its class in `pinv`.
 
-`dense` has matrices in the memory of a run, one of each lane: rows of whole registers, with the few operations that all methods
-are made of. A method says what arrays it needs, how D becomes factors, and how these solve. Each lane has pivots and a rank of
-its own: differences between lanes are chosen (`select`), as everywhere in machine code.
+`dense` has matrices in the memory of a run, one for each lane, as rows of whole registers, and the operations on rows that all
+methods use. A method defines its matrices, the factorization and the solution. Each lane has its own pivots and rank: lanes
+differ by `select`, as everywhere in machine code.
 """
 
 from udkjax import pinv
@@ -24,7 +24,7 @@ METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
 
 
 def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
-    """Return the machine code of a pseudoinverse; None where there is none."""
+    """Return the machine code of a pseudoinverse; None if there is none."""
     if isinstance(method, pinv.OneOf):
         found = [dense_method(choice) for choice in method.choices]
         known = tuple(code for code in found if code is not None)

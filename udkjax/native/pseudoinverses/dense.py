@@ -1,7 +1,7 @@
 """Dense matrices in the memory of a run, one per lane, and operations on their rows.
 
-The entries of a row lie behind one another, each in all lanes, and fill whole registers; padding of the last one is zero. So
-an operation on rows is one on registers: of one member they hold several columns, of W members side by side one column of each.
+The entries of a row are contiguous, each in all lanes, and fill whole registers; the padding of the last register is zero. So an
+operation on rows is one on registers, which hold several columns of one member, or one column of W members.
 """
 
 from abc import ABC, abstractmethod
@@ -12,32 +12,32 @@ from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Operand, Value, l
 from udkjax.native.base.memory import Memory
 
 UNROLLED = 16  # registers of a row up to which operations on it are unrolled; longer rows take this many per iteration
-SUMS = 4  # independent partial sums of a scalar product: as many as hide the latency of an addition
+SUMS = 4  # independent partial sums of a scalar product, to hide the latency of additions
 
 
 @dataclass(frozen=True)
 class DenseMethod(ABC):
-    """A pseudoinverse as machine code: what it stores, how it factorizes D and how it solves D x = b by that.
+    """A pseudoinverse as machine code: its matrices, the factorization of D and the solution of D x = b.
 
-    `relative`: whether the threshold of the rank is relative to the method's scale of D.
+    `relative`: whether the rank tolerance is relative to the method's scale of D.
     """
 
     relative: bool
 
     @abstractmethod
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
-        """Return the rows and columns of the matrices that it stores besides D (m, n), by name."""
+        """Return the shapes of the matrices that it stores in addition to D (m, n), by name."""
 
     @abstractmethod
     def factor(self, d: "DenseMatrices") -> None:
-        """Write how factors are made of D, which is overwritten."""
+        """Write the factorization of D, which is overwritten."""
 
     @abstractmethod
     def solve(self, d: "DenseMatrices") -> None:
-        """Write how the row `x` becomes D^+ b of the row `b`, which is overwritten."""
+        """Write the solution: the row `x` becomes D^+ b; the row `b` is overwritten."""
 
     def solve_transposed(self, d: "DenseMatrices") -> None:
-        """Write how the row `b` becomes (D^+)^T x of the row `x`."""
+        """Write the transposed solution: the row `b` becomes (D^+)^T x."""
         raise NotImplementedError(type(self).__name__)
 
 
@@ -46,11 +46,11 @@ class DenseLayout:
 
     Args:
         module: The module.
-        matrices: The rows and columns of the matrices besides D, by name.
-        shape: Shape of D.
-        prefix: Of the names of their places.
-        tol: The name of the threshold of the rank.
-        width: Number of matrices side by side: one of each lane, or a single one. By default those of all lanes.
+        matrices: The shapes of the matrices other than D, by name.
+        shape: The shape of D.
+        prefix: Prefix of the names of arrays.
+        tol: The name of the rank tolerance.
+        width: Number of lanes that have a matrix; by default all.
     """
 
     def __init__(
@@ -73,14 +73,14 @@ class DenseLayout:
         module.begins.append(self.number_columns)
 
     def number_columns(self, f: Function):
-        """Store the numbers of columns, which nothing changes."""
+        """Store the indices of the columns, which are constant."""
         start = self.module.places[f"{self.prefix} index"] * self.module.plan.width
         with f.each(self.shapes["index"][1]) as j:
             f.store(f.like(j, DOUBLE, self.width), f.given["work"], j * self.width + start, self.width)
 
 
 class MatrixRow:
-    """A row of a matrix, by its address: so many registers."""
+    """A row of a matrix: its address and its number of registers."""
 
     def __init__(self, d: "DenseMatrices", address: Value, registers: int):
         self._d, self.address, self.registers = d, address, registers
@@ -94,17 +94,17 @@ class MatrixRow:
         d.f.store(x, self.address, d.f.like(r, INT, 1) * d.vector if isinstance(r, Value) else r * d.vector, d.vector)
 
     def entry(self, j: Operand) -> Value:
-        """Return one entry, in all lanes."""
+        """Return one entry in all lanes."""
         f = self._d.f
         return f.load(self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
     def put(self, j: Operand, x: Operand):
-        """Store one entry, in all lanes."""
+        """Store one entry in all lanes."""
         f = self._d.f
         f.store(x, self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
     def at(self, places: Value) -> Value:
-        """Return the entries at places that differ from lane to lane."""
+        """Return the entries at an index for each lane."""
         f = self._d.f
         if f.width == 1:
             return f.load(self.address, places)
@@ -115,7 +115,7 @@ class MatrixRow:
         return found
 
     def put_at(self, places: Value, x: Value):
-        """Store entries at places that differ from lane to lane."""
+        """Store entries at an index for each lane."""
         f = self._d.f
         if f.width == 1:
             f.store(x, self.address, places)
@@ -135,7 +135,7 @@ class MatrixRow:
 
 
 class DenseMatrices:
-    """The matrices of a method in one function, which has the arguments `work`."""
+    """The matrices of a method in one function, which has the argument `work`."""
 
     def __init__(self, layout: DenseLayout, f: Function, part: str = ""):
         self.layout, self.f, self.module, self._part = layout, f, layout.module, part
@@ -149,19 +149,19 @@ class DenseMatrices:
         return self.f.const(x, DOUBLE, self.f.width)
 
     def register(self, x: float) -> Value:
-        """Return a register of the same number."""
+        """Return a register filled with a number."""
         return self.f.const(x, DOUBLE, self.vector)
 
     def spread(self, x: Value) -> Value:
-        """Repeat a number of each lane, to go with registers."""
+        """Repeat a number of each lane to match registers."""
         return self.module.broadcast(self.f, x)
 
     def number(self, k: Value) -> Value:
-        """Return a whole number as a number in all lanes."""
+        """Convert an integer to a number in all lanes."""
         return self.f.like(k, DOUBLE, self.f.width)
 
     def whole(self, x: Value) -> Value:
-        """Numbers as places."""
+        """Convert numbers to integers."""
         return self.f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width)
 
     def sqrt(self, x: Value) -> Value:
@@ -169,22 +169,22 @@ class DenseMatrices:
 
     @property
     def tol(self) -> Value:
-        """The threshold of the rank."""
+        """The rank tolerance."""
         f, place = self.f, self.module.places[self.layout.tol] * self.module.plan.width
         return f.load(f.given["work"], f.given["lane"] + place if "lane" in f.given else place, f.width)
 
     def threshold(self, method: DenseMethod, square_of_scale: Value) -> Value:
-        """Return the square of the threshold, from that of the method's scale of D."""
+        """Return the square of the threshold, from the square of the method's scale of D."""
         tol = self.tol
         return tol * tol * square_of_scale if method.relative else tol * tol
 
     @property
     def method_number(self) -> Value:
-        """The number of the method that each lane has chosen of several."""
+        """The index of the method that each lane has chosen."""
         return self.f.load(self.f.given["work"], self.module.places["method"] * self.f.width, self.f.width)
 
     def part(self, prefix: str) -> "DenseMatrices":
-        """Return the same with the matrices whose names have a prefix, in place of those without."""
+        """Return the matrices whose names have a prefix."""
         return DenseMatrices(self.layout, self.f, prefix)
 
     def _name(self, name: str) -> str:
@@ -210,7 +210,7 @@ class DenseMatrices:
         return MatrixRow(self, f.at(f.given["work"], place), registers)
 
     def gather(self, name: str, places: Value, to: MatrixRow):
-        """Copy a row of a matrix that differs from lane to lane."""
+        """Copy a row of a matrix, with an index for each lane."""
         f, registers = self.f, self.layout.registers[self._name(name)]
         if f.width == 1:
             self.copy(self.row(name, places), to)
@@ -221,7 +221,7 @@ class DenseMatrices:
                 f.store(f.load(source, j * f.width + k), to.address, j * f.width + k)
 
     def over_registers(self, registers: int, do: Callable[[Operand], None]):
-        """Do something with each register of a row: unrolled, or in a loop over several at a time."""
+        """Run `do` for each register of a row, unrolled, or in a loop over several at a time."""
         f = self.f
         if registers <= UNROLLED:
             for r in range(registers):
@@ -236,8 +236,8 @@ class DenseMatrices:
             do(r)
 
     def sum(self, registers: int, term: Callable[[Operand, Value], Value]) -> Value:
-        """Add up over registers, and of one member over what they hold: `term(r, sum)` is the sum with a register's share."""
-        f, totals = self.f, [self.register(0.0)] * max(1, min(SUMS, registers))  # rows of a free body have none
+        """Sum over registers and, for one member, over their entries: `term(r, sum)` adds the terms of register r."""
+        f, totals = self.f, [self.register(0.0)] * max(1, min(SUMS, registers))  # rows of a free body are empty
         if registers <= UNROLLED:
             for r in range(registers):
                 totals[r % len(totals)] = term(r, totals[r % len(totals)])
@@ -255,11 +255,11 @@ class DenseMatrices:
         return totals[0] if f.width > 1 else f.total(totals[0])
 
     def dot(self, a: MatrixRow, b: MatrixRow) -> Value:
-        """Return the scalar product of two rows, of each lane."""
+        """Return the scalar product of two rows in each lane."""
         return self.sum(a.registers, lambda r, total: self.f.fma(a[r], b[r], total))
 
     def axpy(self, factor: Value, x: MatrixRow, y: MatrixRow):
-        """Add a multiple of the row x to the row y, of which the shorter one counts."""
+        """Add a multiple of the row x to the row y, up to the length of the shorter one."""
         wide = self.spread(factor)
 
         def add(r: Operand):
@@ -268,7 +268,7 @@ class DenseMatrices:
         self.over_registers(min(x.registers, y.registers), add)
 
     def largest(self, row: MatrixRow, count: int) -> Value:
-        """Return the largest of the first entries of a row."""
+        """Return the largest of the first `count` entries of a row."""
         worst = self.f.variable(0.0)
         with self.f.each(count) as j:
             worst.value = self.f.max(row.entry(j), worst.value)

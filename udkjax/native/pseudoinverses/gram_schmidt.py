@@ -1,4 +1,4 @@
-"""D^+ by modified Gram-Schmidt, of the columns of D and then of the rows of R (`udkjax.pinv.GramSchmidt`)."""
+"""D^+ by modified Gram-Schmidt on the columns of D and then on the rows of R (`udkjax.pinv.GramSchmidt`)."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from udkjax.native.pseudoinverses.qr import add_to_rows, choose_pivot, combine_r
 class GramSchmidtCode(DenseMethod):
     """D = Q R with column pivoting, then R = L Z^T: D^+ = Z L^(-1) Q^T.
 
-    Once the rank is decided the rows of R are independent: the second factorization needs no pivots.
+    The rows of R up to the rank are independent, so the second factorization needs no pivots.
     """
 
     twice: bool = True
@@ -36,7 +36,7 @@ class GramSchmidtCode(DenseMethod):
         self._orthogonalize_rows(d)
 
     def _orthogonalize_columns(self, d: DenseMatrices):
-        """Write D = Q R: rows of `q` are the columns of Q, and D is what remains of it."""
+        """Write D = Q R: rows of `q` are the columns of Q, and D is reduced to its remainder."""
         f, column, above = d.f, d.row("column"), d.row("above")
         threshold = f.variable(d.threshold(self, start_pivoting(d)))
         going, rank = f.variable(d.yes(), BOOL), f.variable(0.0)

@@ -1,4 +1,4 @@
-"""D^+ by Householder's QR: a basic solution, freed of its part in the null space (`udkjax.pinv.Householder`)."""
+"""D^+ by Householder's QR: a basic solution minus its projection on the null space (`udkjax.pinv.Householder`)."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ from udkjax.native.pseudoinverses.qr import (
 
 @dataclass(frozen=True)
 class HouseholderCode(DenseMethod):
-    """D = Q T G, with T of the pivot columns of R and G = T^(-1) R: rows e_f - sum_i G_if e_(pivot i) span the null space of D.
+    """D = Q T G, with T the pivot columns of R and G = T^(-1) R: rows e_f - sum_i G_if e_(pivot i) span the null space of D.
 
-    The basic solution solves T; reflections of the null space's basis then take out its part along that.
+    The basic solution solves with T; reflections of the basis of the null space then remove its component in the null space.
     """
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
@@ -58,7 +58,7 @@ class HouseholderCode(DenseMethod):
         self._reflect_null_space(d, d.wide(float(d.n)) - rank.value)
 
     def _reflect_null_space(self, d: DenseMatrices, free: Value):
-        """Reflect the basis of the null space to the first coordinates, one vector after another: one for each free column."""
+        """Reflect the basis of the null space to the first coordinates, one vector for each free column."""
         f = d.f
         d.row("free").put(0, free)
         column = f.variable(-1.0)
@@ -79,7 +79,7 @@ class HouseholderCode(DenseMethod):
             reflect_row(d, "null", k, is_there, "z", "tau_z")
 
     def _count(self, d: DenseMatrices) -> Value:
-        """Return the largest number of free columns of any lane."""
+        """Return the maximum over lanes of the number of free columns."""
         found = d.row("free").entry(0)
         return d.whole(found if d.f.width == 1 else d.f.reduce("fmax", found))
 

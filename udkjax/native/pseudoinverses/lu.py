@@ -1,4 +1,4 @@
-"""D^(-1) of a square matrix by LU with partial pivoting: of a singular one it is no number, or a rounding error's reciprocal."""
+"""D^(-1) of a square matrix by LU with partial pivoting; NaN or dominated by rounding if D is singular."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from udkjax.native.pseudoinverses.qr import reversed_each
 
 @dataclass(frozen=True)
 class LUCode(DenseMethod):
-    """P D = L U: rows of `upper` are the pivot rows as they were taken; row k of `lower`, what step k took of each other row."""
+    """P D = L U: rows of `upper` are the pivot rows when chosen; row k of `lower` holds the multipliers of step k."""
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
         return {
@@ -56,11 +56,11 @@ class LUCode(DenseMethod):
             y.put(k, found)
             d.axpy(-found, d.row("lower", k), b)
         x.clear()
-        with reversed_each(d, d.m) as k:  # entries left of the diagonal meet coordinates that are still zero
+        with reversed_each(d, d.m) as k:  # entries left of the diagonal multiply coordinates that are still zero
             x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))
 
     def sign(self, d: DenseMatrices) -> Value:
-        """Write how the sign of det D is found of its factors: that of the pivots, and -1 for each pair of rows out of order."""
+        """Return the sign of det D: the product of the signs of the pivots, and -1 for each inversion of rows."""
         f, order, found = d.f, d.row("order"), d.f.variable(1.0)
         with f.each(d.m) as k:
             place = order.entry(k)

@@ -1,4 +1,4 @@
-"""D^+ by one of several methods, chosen by a number that each lane has (`udkjax.pinv.OneOf`)."""
+"""D^+ by one of several methods, chosen by an index in each lane (`udkjax.pinv.OneOf`)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 @dataclass(frozen=True)
 class OneOfCode(DenseMethod):
-    """Each method has matrices of its own, and a copy of D and b; it is called where some lane has chosen it."""
+    """Each method has its own matrices and a copy of D and b; it is called if any lane has chosen it."""
 
     methods: tuple[DenseMethod, ...]
 
@@ -41,7 +41,7 @@ class OneOfCode(DenseMethod):
             d.over_registers(x.registers, take)
 
     def _chosen(self, d: DenseMatrices) -> Iterator[tuple[DenseMethod, DenseMatrices, Value]]:
-        """Write for each method, within a branch that is taken where some lane has chosen it, what the caller does."""
+        """Run the block for each method within a branch that is taken if any lane has chosen it."""
         for k, method in enumerate(self.methods):
             chosen = d.method_number.is_(float(k))
             with d.f.if_(d.f.any_of(chosen)):

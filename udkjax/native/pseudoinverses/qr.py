@@ -1,4 +1,4 @@
-"""Householder's reflections: QR with column pivoting, and their counterpart from the right."""
+"""Householder reflections: QR with column pivoting, and reflections from the right."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,7 +23,7 @@ def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
 
 
 def start_pivoting(d: DenseMatrices) -> Value:
-    """Note that no column of D is used, and the squares of their lengths; return the largest."""
+    """Mark all columns of D as unused, with the squares of their lengths; return the largest."""
     unused, squares = d.row("unused"), d.row("squares")
 
     def of_column(r: Operand):
@@ -39,7 +39,7 @@ def start_pivoting(d: DenseMatrices) -> Value:
 
 
 def choose_pivot(d: DenseMatrices) -> tuple[Value, Value]:
-    """Return the square of the longest of the columns that are left, and which one it is: the first of those as long."""
+    """Return the squared length of the longest unused column, and its index; the first of equal ones."""
     f, squares = d.f, d.row("squares")
     best, pivot = f.variable(-1.0), f.variable(0.0)
     with f.each(d.n) as j:
@@ -51,7 +51,7 @@ def choose_pivot(d: DenseMatrices) -> tuple[Value, Value]:
 
 
 def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
-    """Of a register of columns: note their squares, -1 for those that are used; the pivot is one of them from now on."""
+    """Store the squared lengths of a register of columns, with -1 for used ones, and mark the pivot as used."""
     f, unused, squares = d.f, d.row("unused"), d.row("squares")
     left = f.select(d.row("index")[r].is_(d.spread(pivot)), 0.0, unused[r])
     unused[r] = left
@@ -59,7 +59,7 @@ def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
 
 
 def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operand = 0) -> Value:
-    """Return the sum of the rows of D from `start` on, each with its weight, of a register of columns."""
+    """Return the weighted sum of the rows of D from `start` on, for a register of columns."""
     total = d.f.variable(0.0, width=d.vector)
     with d.f.each(d.m, start) as i:
         total.value = d.f.fma(d.spread(weights.entry(i)), d.row("D", i)[r], total.value)
@@ -67,7 +67,7 @@ def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operan
 
 
 def add_to_rows(d: DenseMatrices, weights: MatrixRow, change: Value, r: Operand, start: Operand = 0) -> Value:
-    """Add a change to the rows of D from `start` on, each times its weight; return the squares of the columns' lengths there."""
+    """Add multiples of `change` to the rows of D from `start` on; return the squared lengths of the columns below."""
     square = d.f.variable(0.0, width=d.vector)
     with d.f.each(d.m, start) as i:
         row = d.row("D", i)
@@ -77,10 +77,10 @@ def add_to_rows(d: DenseMatrices, weights: MatrixRow, change: Value, r: Operand,
 
 
 def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
-    """Write D = Q R, its columns in their places: D becomes R; each step takes the longest column that is left.
+    """Write D = Q R without moving columns: D becomes R; each step takes the longest unused column.
 
-    Rows of `v` are the reflectors of Q; it stops, in each lane, where the longest is at most the threshold, whose square is a
-    function of the square of the longest column of D.
+    Rows of `v` are the reflectors of Q. Each lane stops when the longest column is at most the threshold; `threshold` returns its
+    square from the square of the longest column of D.
     """
     f = d.f
     least = f.variable(threshold(start_pivoting(d)))
@@ -92,7 +92,7 @@ def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
         rank.value = rank.value + f.select(goes_on, d.wide(1.0), 0.0)
         place, norm, used = d.whole(pivot), d.sqrt(square), f.select(goes_on, pivot, -1.0)
         top = d.row("D", k).at(place)
-        end = f.select(top > 0.0, -norm, norm)  # away from it: no cancellation
+        end = f.select(top > 0.0, -norm, norm)  # the sign that avoids cancellation
         tau = f.select(goes_on, 1.0 / (square + f.abs(top) * norm), 0.0)
         v = d.row("v", k)
         v.clear()
@@ -122,13 +122,13 @@ def apply_q_transposed(d: DenseMatrices):
 
 
 def apply_q(d: DenseMatrices, name: str = "b", i: Operand = 0):
-    """Write Q times a row."""
+    """Write the product of Q with a row."""
     with reversed_each(d, d.steps) as k:
         apply_reflector(d, "v", "tau", k, name, i)
 
 
 def reflect_row(d: DenseMatrices, name: str, k: Value, is_active: Value, reflectors: str, factors: str) -> Value:
-    """Write the reflection from the right that leaves of row k of a matrix nothing behind column k; return what stays there."""
+    """Write the reflection from the right that clears row k of a matrix after column k; return its entry in column k."""
     f, row, z = d.f, d.row(name, k), d.row(reflectors, k)
     number = d.spread(d.number(k))
 
@@ -154,6 +154,6 @@ def apply_reflector(d: DenseMatrices, reflectors: str, factors: str, k: Value, n
 
 @contextmanager
 def reversed_each(d: DenseMatrices, count: Operand) -> Iterator[Value]:
-    """Do something for every whole number from `count` - 1 down to zero."""
+    """Run the block for every integer from `count` - 1 down to zero."""
     with d.f.each(count) as k:
         yield d.f.like(count, INT, 1) - 1 - k

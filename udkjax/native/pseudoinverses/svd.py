@@ -1,11 +1,11 @@
 """D^+ by singular values (`udkjax.pinv.SVD`): one-sided Jacobi rotations of the rows of R, where D = Q R with column pivoting.
 
-Pairs of rows of [R I] are turned until all rows of R are orthogonal to one another (Hestenes 1958): R = U^T S, where the lengths
-of the rows s_i of S are the singular values of D, to high relative accuracy, and
+Pairs of rows of [R I] are rotated until all rows of R are mutually orthogonal (Hestenes 1958): R = U^T S, where the lengths of
+the rows s_i of S are the singular values of D, to high relative accuracy, and
 
-    D^+ b = sum_i s_i (U Q^T b)_i / |s_i|^2    of all rows that are longer than the threshold.
+    D^+ b = sum_i s_i (U Q^T b)_i / |s_i|^2    over all rows longer than the threshold.
 
-The rows of R are nearly orthogonal from the first, so that fewer rounds do (Drmac, Veselic, SIAM J. Matrix Anal. 29 (2008) 1322).
+The rows of R are nearly orthogonal initially, which saves sweeps (Drmac, Veselic, SIAM J. Matrix Anal. 29 (2008) 1322).
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from udkjax.native.base.ir import INT, Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q, apply_q_transposed, pivoted_qr, qr_matrices
 
-SWEEPS = 30  # at most; some six or eight do
-ORTHOGONAL = 1e-15  # cosines of angles between rows that are orthogonal but for rounding
+SWEEPS = 30  # maximum; six to eight are usual
+ORTHOGONAL = 1e-15  # largest cosine of the angle between rows that count as orthogonal
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class SVDCode(DenseMethod):
             d.axpy(d.dot(d.row("u", i), b) * d.row("lengths").entry(i), d.row("D", i), x)
 
     def solve_transposed(self, d: DenseMatrices):
-        """Write how the row `b` becomes (D^+)^T x of the row `x`."""
+        """Write the transposed solution: the row `b` becomes (D^+)^T x."""
         b, x = d.row("b"), d.row("x")
         b.clear()
         with d.f.each(d.steps) as i:

@@ -17,7 +17,7 @@ from udkjax.native.pseudoinverses.qr import (
 class VargaCode(DenseMethod):
     """D = Q R with column pivoting, then R = L Z^T by reflections from the right: D^+ = Z L^(-1) Q^T.
 
-    Once the rank is decided the rows of R are independent: the second factorization needs no pivots.
+    The rows of R up to the rank are independent, so the second factorization needs no pivots.
     """
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
@@ -39,7 +39,7 @@ class VargaCode(DenseMethod):
         f, b, x = d.f, d.row("b"), d.row("x")
         apply_q_transposed(d)
         x.clear()
-        with f.each(d.steps) as k:  # L y = b: entries of row k behind column k meet zeros
+        with f.each(d.steps) as k:  # L y = b: entries of row k after column k multiply zeros
             x.put(k, (b.entry(k) - d.dot(d.row("D", k), x)) * d.row("inverse").entry(k))
         with reversed_each(d, d.steps) as k:
             apply_reflector(d, "z", "tau_z", k, "x")

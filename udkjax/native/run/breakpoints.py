@@ -1,4 +1,4 @@
-"""The end of the next step: the end of the run, a breakpoint, or the time that was planned."""
+"""The end of the next step: the end of the run, a breakpoint, or the end chosen by the controller."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from udkjax.native.base.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POI
 
 
 def aim(module: Module, f: Function, s: Lane):
-    """`t1`, `step`, `begin`, `last` and `lands` of the next step of each lane (breakpoints.py)."""
+    """Set `t1`, `step`, `begin`, `last` and `lands` for the next step of each lane."""
     where, yes = f.select, f.const(1.0, DOUBLE, f.width)
     begin = (s.steps if module.plan.breaks else s.tried) < 0.0
     t1 = s.point3_t + s.h
@@ -28,7 +28,7 @@ def aim(module: Module, f: Function, s: Lane):
         parts = f.max(float(POINTS - 1) - s.steps, 1.0)
         share = start + rest / parts
         several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
-        several = several & (s.next < stop - s.smallest)  # for the sake of outputs in between
+        several = several & (s.next < stop - s.smallest)  # only if outputs are due in between
         if module.pieces:
             several = several & s.aim.is_not(float(AIM_ACROSS))
         t1 = where(several, share, t1 if module.pieces else halve(f, s, t1, begin | last | several))
@@ -46,13 +46,13 @@ def aim(module: Module, f: Function, s: Lane):
 
 
 def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
-    """Return the end of a step: in the middle of what is left, where little would be left behind it."""
+    """Return the end of a step: `t1`, or the middle of the remaining time if little would remain after `t1`."""
     short = (s.end - t1 < s.h * SHORTEST_LAST) & ~otherwise
     return f.select(short, s.point3_t + (s.end - s.point3_t) * 0.5, t1)
 
 
 def next_breakpoint(module: Module, f: Function, s: Lane, here: Value):
-    """Set t1 just before the next breakpoint, and behind just behind all of those that are here."""
+    """Set `t1` just before the next breakpoint, and `behind` just after all breakpoints at the time `here`."""
     work, call = f.given["work"], f.given["call"]
     f.call("next_breakpoint", work, call)
     with f.while_(lambda: f.any_of(s.due <= here + s.smallest)):

@@ -1,4 +1,15 @@
-"""The step controller: whether a step counts, and how long the next one is."""
+"""The step controller: whether a step is accepted, and how long the next one is.
+
+Numbers of a lane `s` (layout.py has them all):
+
+    point3_t, t1            time of the latest accepted state, and end of the attempted step (s)
+    h, behind               step length chosen by the controller (s); scratch
+    error, rate             error of the attempt over the tolerance; error of the previous step over length^order
+    begin, last, lands      one if the attempt begins a run, ends it, ends at a breakpoint
+    fallback, fallback_due  one if the attempt is made by the fallback, if the next one must be
+    retries, distance       successive attempts shortened because of a pivot; distance from singular configurations
+    distance0 to 2          distances of the accepted states before, the latest last
+"""
 
 from typing import Any
 
@@ -25,7 +36,7 @@ from udkjax.native.run.manifold import largest_violation, velocity_tolerance
 
 
 def write_decide(module: Module):
-    """Accept or reject the step of lanes that are `stepping`, and choose the next one; `until`: outputs up to there are due."""
+    """Accept or reject the step of lanes that are `stepping`, choose the next one, and set `until`, when outputs are due."""
     f, s = module.function("decide")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
@@ -72,10 +83,10 @@ def write_decide(module: Module):
 
 
 def _retry_or_fall_back(module: Module, f: Function, s: Lane, bad: Value) -> tuple[Value, Value, Value]:
-    """Try a step that met a pivot too small to be trusted a little shorter, or leave it to the fallback.
+    """Shorten a step that encountered a pivot too small for elimination, or leave it to the fallback.
 
     Returns:
-        The lanes whose step counts, those that try it shorter, and the time that is left until the singular configuration.
+        Masks of the lanes whose attempt is complete and of those that shorten it, and the time to the singular configuration.
     """
     where, stepping, fallback, error = f.select, s.stepping > 0.5, s.fallback > 0.5, s.error
     fallback_due = bad & ~fallback
@@ -92,12 +103,12 @@ def _retry_or_fall_back(module: Module, f: Function, s: Lane, bad: Value) -> tup
 
 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
-    """Return the next step over this one, and the error over the length to the power of the order."""
+    """Return the ratio of the next step to this one, and the error over the length to the power of the order."""
     where, order, error = f.select, module.method.order, s.error
-    # Errors below the one that lets a step grow as far as it may count as that one: they may be rounding and say nothing.
+    # Errors are bounded below by the one at which a step grows by GROW, as smaller ones may be rounding.
     size = where(f.is_finite(error), f.max(error, FACTORS.grow ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
-    foreseen = size * (rate / s.rate)  # the error of a step as long, where errors grow as they did (Gustafsson 1994)
+    foreseen = size * (rate / s.rate)  # the error of an equal step if errors continue to grow (Gustafsson 1994)
     steep = accept & (foreseen > 1.0)
     factor = power(f, where(steep, foreseen, size), -1.0 / order) * FACTORS.safety
     factor = f.max(factor, where(accept & ~steep, f.const(1.0, DOUBLE, f.width), FACTORS.shrink))
@@ -105,7 +116,7 @@ def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Valu
 
 
 def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
-    """Make the end of a step the latest point; return one in lanes in which that is off the constraint manifold."""
+    """Make the end of a step the latest point; return one in lanes in which it is off the constraint manifold."""
     lost = f.variable(0.0)
     with f.if_(f.any_of(accept)):
         for k in range(POINTS - 1):
@@ -130,7 +141,7 @@ def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value
     """Return the time up to which outputs are due."""
     begin = s.begin > 0.5
     ready = accept & ((s.accepted > 0.0) | (~begin & (s.last > 0.5)))
-    # The last step may end a little before a breakpoint at the end of the run: outputs there are due, too.
+    # The last step may end slightly before a breakpoint at the end of the run, where outputs are also due.
     until = f.select(ready, f.select(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
     if module.plan.breaks:
         enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
@@ -139,9 +150,9 @@ def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value
 
 
 def first_step(module: Module, f: Function, s: Lane) -> Value:
-    """Return the first step as given, or one over which the state changes by a hundredth of itself, or of its unit.
+    """Return the given first step, or one over which the state changes by a hundredth of itself or of its unit.
 
-    It is that of `first_step` of integrate/diffrax_engine.py.
+    The rule is that of `first_step` in integrate/diffrax_engine.py.
     """
     rtol, atol, omega = (module.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
 
@@ -149,7 +160,7 @@ def first_step(module: Module, f: Function, s: Lane) -> Value:
         def both(r: Value) -> list[Value]:
             per_unit, found = module.vector(f, "inverse unit", r), []
             for name, y, per in ((of_q, "state q", per_unit), (of_v, "result v", per_unit / omega)):
-                floor = f.select(per > 0.0, f.const(least, DOUBLE, module.plan.vector), 0.0)  # none of what fills up a register
+                floor = f.select(per > 0.0, f.const(least, DOUBLE, module.plan.vector), 0.0)  # zero for the padding of registers
                 x = f.max(f.abs(module.vector(f, name, r)) * per, floor)
                 found.append(x / f.fma(rtol, f.abs(module.vector(f, y, r)) * per, atol))
             return found
@@ -164,12 +175,12 @@ def first_step(module: Module, f: Function, s: Lane) -> Value:
 
 
 def is_clear(module: Module, f: Function, s: Lane, distance: Value) -> Value:
-    """Return whether a step as long as the one that is tried may begin so far away from singular configurations."""
+    """Return whether a step of the current length may begin at a distance from singular configurations."""
     return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > s.h * s.omega * ROUNDING_GROWTH)
 
 
 def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
-    """Return the time that is left until a singular configuration: a root of the parabola through three distances."""
+    """Return the time until a singular configuration, a root of the parabola through three distances."""
     t2, t1, t0, d2, d1, d0 = s.point1_t, s.point2_t, s.point3_t, s.distance0, s.distance1, s.distance2
     slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
     curve = (slope - before) / (t0 - t2)
@@ -178,7 +189,7 @@ def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
 
 
 def step_around(module: Module, f: Function, s: Lane, left: Value, step: Value, otherwise: Value) -> Value:
-    """In place of a step that failed, one that has the configuration ahead in the middle of a wide gap between its nodes."""
+    """Return a step with the configuration ahead in the middle of a wide gap between its nodes, to replace a failed one."""
     low, high = (float(x) for x in module.method.clearings)
     share = left / step
     found = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)

@@ -1,11 +1,11 @@
-"""The equations of a scene solved by a dense pseudoinverse of all rows, in place of elimination.
+"""The equations of a scene solved by a dense pseudoinverse of all rows instead of elimination.
 
 With D = W Psi_q M^(-1/2), W the weights of the rows, and a method of pseudoinverses/,
 
     a = a_F + M^(-1/2) D^+ W b,        q - M^(-1/2) D^+ W Psi,        v - M^(-1/2) D^+ W Psi_dot,
 
-and the part of a small change within the manifold, dq - M^(-1/2) D^+ W Psi_q dq. The functions have the names and results of the
-scene's programs by elimination. Systems of one state are solved by the same factors.
+and the tangent part of a small change, dq - M^(-1/2) D^+ W Psi_q dq. The functions have the names and results of the scene's
+programs by elimination. Systems of one state share one factorization.
 """
 
 from collections.abc import Callable
@@ -17,14 +17,14 @@ from udkjax.native.pseudoinverses.dense import DenseMethod, MatrixRow
 
 
 class DenseEquations:
-    """The functions of a module whose method is dense."""
+    """The functions of a module with a dense method."""
 
     def __init__(self, module: Module, method: DenseMethod):
         self._in, self._rows = module, WeightedRows(module, method)
         module.places.add("saved", module.n)
 
     def write(self):
-        """Write the functions that the module calls in place of programs."""
+        """Write the functions that the module calls instead of programs."""
         module = self._in
         self._rows.write()
         for name, write in self._functions.items():
@@ -75,7 +75,7 @@ class DenseEquations:
         self._in.invoke(f, "psi")
 
     def _at(self, f: Function, name: str, other: str, do: Callable[[], None]):
-        """Do something with another array in place of one."""
+        """Run `do` with the array `other` in place of `name`."""
         module = self._in
         module.copy(f, name, "saved")
         module.copy(f, other, name)

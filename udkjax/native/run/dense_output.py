@@ -8,7 +8,7 @@ from udkjax.native.run.manifold import project_output
 
 
 def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
-    """Newton's divided differences of the last points, the latest first: of their states, or of changes of these."""
+    """Write Newton's divided differences of the last points, the latest first, for their states or tangents."""
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     inverse, used = _spacing(module, f, s)
@@ -28,7 +28,7 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
 
 
 def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int], Value], list[Value | None]]:
-    """Return one over the time between each two points, and whether the polynomial goes through each (None: always)."""
+    """Return the inverse of the time between each two points, and whether the polynomial uses each point (None: always)."""
     times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
     step = times[0] - times[1]
     inverse: dict[tuple[int, int], Value] = {}
@@ -46,7 +46,7 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
 
 
 def write_differences_back(module: Module):
-    """Write `differences_back`: from cotangents of divided differences, which are cleared, to those of the points."""
+    """Write `differences_back`: cotangents of the points from those of divided differences, which are cleared."""
     f, s = module.function("differences_back")
     active, (inverse, used) = s.at > 0.5, _spacing(module, f, s)
     zero, count = f.const(0.0, DOUBLE, module.plan.vector), 3 * POINTS
@@ -57,7 +57,7 @@ def write_differences_back(module: Module):
             mine, mask = module.vector(f, f"bar difference{degree}", r), used[degree // 3]
             mine = mine if mask is None else f.select(mask, mine, 0.0)
             here = [zero] * (count - degree)
-            for i, bar in enumerate(column):  # of the column after this one
+            for i, bar in enumerate(column):  # cotangents of the next column
                 one, two = i // 3, (i + degree + 1) // 3
                 if one == two:
                     x, share = ("v", bar) if degree == 0 else ("a", bar * 0.5)
@@ -79,7 +79,7 @@ def write_differences_back(module: Module):
 
 
 def write_between(module: Module, name: str = "between", to: tuple[str, Layout] | None = None):
-    """Write the polynomial at the time `next`."""
+    """Write the evaluation of the polynomial at the time `next`."""
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     ahead = [module.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]

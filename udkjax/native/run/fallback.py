@@ -1,12 +1,12 @@
-"""Fallback steps: where elimination must not trust a pivot, a rank-revealing method on all rows takes its place.
+"""Fallback steps: if a pivot is too small for elimination, a rank-revealing method on all rows takes the step.
 
-It has two functions of `work`, for the lanes that are `wanted`, at their state:
+It has two functions of `work`, for the lanes that are `wanted`, at their state, with results in separate arrays:
 
-    fallback                 accelerations a, and q and v after a Newton step each, in arrays of their own
-    fallback_tangent_part    the parts of `state dq` and `state dv` within the manifold, in arrays of their own
+    fallback                 accelerations a, and q and v after a Newton step each
+    fallback_tangent_part    the tangent parts of `state dq` and `state dv`
 
-For small scenes the method is the pseudoinverse by singular values, lane by lane; for large ones elimination
-of all rows, without those that depend on others, which near singular configurations has about half as many digits.
+For small scenes the method is the pseudoinverse by singular values, lane by lane; for large ones it is elimination of all rows
+with dependent ones left out, which near singular configurations has about half as many correct digits.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from udkjax.native.run.manifold import iterate_newton, with_threshold
 
 
 def write_fallback(module: Module):
-    """Write what a fallback step does besides: accelerations, the end of a step, outputs that elimination leaves open."""
+    """Write the functions of a fallback step: accelerations, the end of a step, and closing of outputs."""
     (_write_singular_values if module.unrolled else _write_elimination)(module)
 
     def invoke(f: Function, s: Lane, mask: Value, name: str = "fallback"):
@@ -36,13 +36,13 @@ def write_fallback(module: Module):
 
         iterate_newton(module, f, s, mask, closer)
 
-    # The accelerations of lanes whose pivots were not safe.
+    # Accelerations of lanes whose pivots were not safe.
     f, s = module.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     mask = (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)
     invoke(f, s, mask)
     module.copy(f, "fallback a", "out", mask)
-    # The end of a fallback step: Newton's method in position, velocities and accelerations there where the pivots are
-    # not safe; and, whether they are or not, what projection leaves of the errors.
+    # The end of a fallback step: Newton's method in position, velocities and accelerations if the pivots are not safe; and in any
+    # case the tangent part of the errors.
     f, s = module.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
     unsafe = fallback & (s.ok < 0.5)
@@ -56,7 +56,7 @@ def write_fallback(module: Module):
     invoke(f, s, fallback, "fallback_tangent_part")
     for x in ("dq", "dv"):
         module.copy(f, f"fallback {x}", f"result {x}", fallback)
-    # An output that elimination leaves open.
+    # An output that still violates Psi after projection by elimination.
     f, s = module.function("close_output")
     close_position(f, s, s.open > 0.5)
     invoke(f, s, s.open > 0.5)
@@ -65,7 +65,7 @@ def write_fallback(module: Module):
 
 
 def _write_elimination(module: Module):
-    """Write `fallback` and `fallback_tangent_part` by elimination, with constants of their own: another threshold."""
+    """Write `fallback` and `fallback_tangent_part` by elimination, with a copy of the constants for another threshold."""
     every = module.code.with_all_rows
     at = module.arrays | {x: ("work", module.places[f"fallback {x}"]) for x in (*every.scratch, "constants", "a")}
     at |= {f"{x}1": ("work", module.places[f"fallback {x}"]) for x in ("q", "v", "dq", "dv")}

@@ -1,6 +1,6 @@
-"""Accelerations by other formulations (`udkjax.equations.formulations`) as machine code, in place of the Udwadia-Kalaba equation.
+"""Accelerations by other formulations (`udkjax.equations.formulations`) as machine code, instead of the Udwadia-Kalaba equation.
 
-Of the unconstrained accelerations a_F, and the change x that the constraints make, with A = Psi_q,
+With the unconstrained accelerations a_F, their change x by the constraints, and A = Psi_q,
 
     M x + A^T lambda = 0,        A x = b,        a = a_F + x,
 
@@ -37,7 +37,7 @@ class FormulationCode(ABC):
 
     @abstractmethod
     def prepare(self, module: Module) -> "FormulatedAccelerations":
-        """Return the writer of a module's code, which has laid out its matrices."""
+        """Lay out the matrices in a module; return the writer of its code."""
 
 
 class FormulatedAccelerations(ABC):
@@ -47,7 +47,7 @@ class FormulatedAccelerations(ABC):
         self._in, self._layout, self._entries = module, layout, RowEntries(module)
 
     def write(self):
-        """Write `formulate(work, out)`: a of the state."""
+        """Write `formulate(work, out)`: the accelerations of the state."""
         module = self._in
         f, _ = module.function(FORMULATE, [(POINTER, "work"), (POINTER, "out")])
         module.invoke(f, "dense_accelerations")
@@ -58,10 +58,10 @@ class FormulatedAccelerations(ABC):
 
     @abstractmethod
     def solve(self, d: DenseMatrices) -> MatrixRow:
-        """Write how x is found of Psi_q, M^(-1/2) and b at hand; return the row that holds it."""
+        """Write the solution x from the current Psi_q, M^(-1/2) and b; return the row that holds it."""
 
     def _array(self, f: Function, name: str, i: Operand = 0) -> Value:
-        """Return one number of an array, in all lanes."""
+        """Return one number of an array in all lanes."""
         return self._in.entry(f, name, i)
 
     def _unit(self, f: Function, i: Operand) -> Value:
@@ -79,7 +79,7 @@ class FormulatedAccelerations(ABC):
             yield row, column, value / self._array(f, "rows", row)
 
     def right(self, f: Function, i: Value) -> Value:
-        """Return a number of b."""
+        """Return an entry of b."""
         return self._array(f, "terms", i + self._in.n) / self._array(f, "rows", i)
 
 
@@ -128,7 +128,7 @@ class NullSpaceCode(FormulationCode):
 
 
 class NullSpaceAccelerations(FormulatedAccelerations):
-    """By the pivoted QR of vectors that span the rows of A, as columns: reflections of the other coordinates are N.
+    """Accelerations by pivoted QR of vectors that span the rows of A, as columns; the remaining columns of Q are N.
 
     The columns of N are made orthonormal in the metric of M, n_k, and x = x_p - sum_k n_k (n_k^T M x_p).
     """
@@ -190,7 +190,7 @@ class NullSpaceQRAccelerations(NullSpaceAccelerations):
         for row, column, value in self.each_entry(f):
             d.row("D", column).put(row, value)
         pivoted_qr(d, lambda scale: tol * tol * scale)
-        right = d.row("product")  # of as many entries as there are rows of A
+        right = d.row("product")  # one entry for each row of A
         right.clear()
         with f.each(d.n) as i:
             right.put(i, self.right(f, i))
@@ -207,7 +207,7 @@ class NullSpaceQRAccelerations(NullSpaceAccelerations):
 
 
 class NullSpaceSVDAccelerations(NullSpaceAccelerations):
-    """x_p = A^+ b by singular values; the right singular vectors of those that count span the rows."""
+    """x_p = A^+ b by singular values; the right singular vectors of nonzero singular values span the rows."""
 
     def __init__(self, module: Module):
         m, n = module.m, module.n
@@ -230,20 +230,20 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
             row.clear()
             with f.each(of.steps) as j:
                 row.put(j, of.row("D", j).entry(i) * d.sqrt(of.row("lengths").entry(j)))
-        pivoted_qr(d, lambda _: d.wide(0.25))  # lengths are one, or zero of those that do not count
+        pivoted_qr(d, lambda _: d.wide(0.25))  # lengths are one, or zero beyond the rank
         d.row("b").clear()
         with f.each(d.m) as i:
             d.row("b").put(i, of.row("x").entry(i))
 
 
 def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
-    """Return the machine code of a formulation; None where there is none."""
+    """Return the machine code of a formulation; None if there is none."""
     if isinstance(formulation, NullSpaceQR | NullSpaceSVD):
         return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
     if not isinstance(formulation, Augmented):
         return None
     method = LUCode(relative=True) if formulation.method is None else dense_method(formulation.method)
-    return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one number
+    return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one method number
 
 
 class MethodCode(NamedTuple):
@@ -257,7 +257,7 @@ class MethodCode(NamedTuple):
         """Return the machine code of a method and a formulation.
 
         Raises:
-            UnsupportedError: there is none.
+            UnsupportedError: machine code does not support one of them.
         """
         found = cls(dense_method(method), None if formulation is None else formulation_code(formulation))
         if formulation is not None and found.formulation is None:
@@ -268,7 +268,7 @@ class MethodCode(NamedTuple):
 
     @staticmethod
     def formulation_settings(formulation: Any, mass: Any) -> dict[str, Any]:
-        """Return the settings of a formulation by name: the threshold of its rank, and the scale of masses (kg)."""
+        """Return the settings of a formulation by name: its rank tolerance, and the characteristic mass (kg)."""
         if isinstance(formulation, Augmented):
             tol = None if formulation.method is None else formulation.method.rank_tol
             tol = RANK_TOL**2 if tol is None else tol

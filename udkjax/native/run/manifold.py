@@ -1,4 +1,4 @@
-"""Projection: Newton's method that returns positions and velocities to the constraint manifold."""
+"""Projection of positions and velocities onto the constraint manifold by Newton's method."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from udkjax.native.base.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTP
 
 
 def newton(module: Module, f: Function, s: Lane):
-    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until they move nothing but rounding errors."""
+    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until they are at rounding level."""
 
     def closer(active: Value):
         module.invoke(f, "newton_q")
@@ -19,7 +19,7 @@ def newton(module: Module, f: Function, s: Lane):
 
 
 def iterate_newton(module: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
-    """Take Newton steps in some lanes: `closer` leaves `corrected q`, nearer to the manifold than `state q`."""
+    """Take Newton steps in some lanes: `closer` computes `corrected q` from `state q`."""
     s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
@@ -31,7 +31,7 @@ def iterate_newton(module: Module, f: Function, s: Lane, mask: Value, closer: Ca
 
 
 def take_newton_step(module: Module, f: Function, active: Value) -> Value:
-    """Take `state q` from `corrected q` in lanes that move; return the largest change, in the scene's own units."""
+    """Set `state q` to `corrected q` in active lanes; return the largest change, in the scene's own units."""
 
     def change(r: Value) -> list[Value]:
         old, new = module.vector(f, "state q", r), module.vector(f, "corrected q", r)
@@ -42,7 +42,7 @@ def take_newton_step(module: Module, f: Function, active: Value) -> Value:
 
 
 def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
-    """Do something with another threshold of pivots, which lies at a place; at none where no pivot is looked at."""
+    """Run `do` with another threshold of pivots, whose offset is `place`; None: pivots are not compared."""
     if place is None:
         do()
         return
@@ -59,7 +59,7 @@ def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value
 
 
 def project_output(module: Module, f: Function, s: Lane, which: str):
-    """Project the state, as `state q` and `result v`; `violated` is its distance from the manifold before."""
+    """Project the state to `state q` and `result v`; set `violated` to its largest violation of Psi before."""
     mask = getattr(s, which) > 0.5
 
     def iterate(lanes: Value):
@@ -71,13 +71,13 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
         s.violated = largest_violation(module, f)
         far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
         with f.if_(f.any_of(far)):
-            with f.each(module.rowcount) as r:  # no lane depends on its neighbours: others keep what they have
+            with f.each(module.rowcount) as r:  # other lanes keep their states
                 module.put(f, "result dv", r, module.vector(f, "result v", r))
             iterate(far)
             with f.each(module.rowcount) as r:
                 module.put(f, "result v", r, f.select(far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
             s.where(far, violated=largest_violation(module, f))
-        if module.falls_back:  # a row that was left out, and a pivot that is small: nothing holds what they do
+        if module.falls_back:  # rows with small pivots are left out and may be violated
             s.open = f.select(mask & (s.violated > OPEN_OUTPUT), f.const(1.0, DOUBLE, f.width), 0.0)
             with f.if_(f.any_of(s.open > 0.5)):
                 f.call("close_output", f.given["work"])
@@ -94,7 +94,7 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
 
 
 def largest_violation(module: Module, f: Function) -> Value:
-    """Return the largest of Psi, each row over its scale; not a number where a row is none."""
+    """Return the largest row of Psi over its scale; NaN if any row is NaN."""
     worst = f.variable(0.0)
     with f.each(module.m) as i:
         x = f.abs(module.entry(f, "psi", i)) / module.entry(f, "rows", i)

@@ -1,4 +1,4 @@
-"""Members and lanes: a lane takes a member, steps it to its end, writes what it found, and takes the next one."""
+"""Members and lanes: a lane loads a member, steps it to its end, writes the results, and loads the next one."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from udkjax.native.run.manifold import largest_violation, project_output
 
 
 def write_begin(module: Module):
-    """Take a member into a lane."""
+    """Write the function that loads a member into a lane."""
     write_enter(module)
     arguments = [(POINTER, "work"), (POINTER, "call"), (INT, "lane"), (INT, "member")]
     f, _ = module.function("begin", arguments)
@@ -77,11 +77,11 @@ def write_begin(module: Module):
 
 
 def write_finish(module: Module):
-    """Write what is left of the members whose lanes are marked in `due`: their first and last states, and how they ended."""
+    """Write the first and last states and the info of completed members, in lanes that are `due`."""
     f, s = module.function("finish_members", [(POINTER, "work"), (POINTER, "call")])
     times = module.field(f, "times")
     _find_cause(module, f, s)
-    # The last state, once more to the manifold; and then the first, which is taken as it is.
+    # The last state is projected once more; the first is returned as given.
     with f.each(module.rowcount) as r:
         for x in "qv":
             module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
@@ -114,7 +114,7 @@ def write_finish(module: Module):
 
 
 def _find_cause(module: Module, f: Function, s: Lane):
-    """Find out why steps fell to nothing: by a number that is not finite, at the end of the run or right ahead, or otherwise."""
+    """Distinguish steps that became too small because of a non-finite number, at the end of the run or just ahead of it."""
     stopped = (
         s.due.is_(1.0)
         & s.code.is_not(float(Status.DONE))
@@ -141,7 +141,7 @@ def _find_cause(module: Module, f: Function, s: Lane):
 
 
 def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
-    """Clear the outputs of lane k that its run did not reach, and those behind the first lost one: they are no numbers."""
+    """Set the outputs of lane k to NaN that its run did not reach or that follow the first lost one."""
     times, nan = module.field(f, "times"), f.const(np.nan)
     is_done = f.lane(s.code, k).is_(float(Status.DONE))
     reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)
@@ -154,7 +154,7 @@ def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
 
 
 def write_run(module: Module):
-    """`run(call)`: members one after another, until there are none left."""
+    """Write `run(call)`: integrate members until none is left."""
     f = Function("run", [(POINTER, "call")], module.plan.width)
     module.functions.append(f)
     call, width = f.given["call"], module.plan.width
@@ -166,7 +166,7 @@ def write_run(module: Module):
     f.store(call, work, module.start("call", "work"), base=POINTER)
     module.begin_memory(f)
     blocks = [block, *module.allocate_memory(f, call)]
-    for name in ("length", "omega", "rtol", "atol", "smallest"):  # of lanes that stay empty
+    for name in ("length", "omega", "rtol", "atol", "smallest"):  # for lanes that stay empty
         setattr(s, name, f.const(1.0, DOUBLE, width))
     with f.each(-(-module.n // max(module.plan.vector // width, 1)) * max(module.plan.vector // width, 1)) as i:
         for name in ("scale q", "scale v"):
@@ -175,7 +175,7 @@ def write_run(module: Module):
 
     def fill():
         with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
-            # Members are taken in order, by whoever comes first: threads share the count.
+            # Threads share the index of the next member.
             member = f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
             with f.if_(member < members):
                 f.call("begin", work, call, k, member)

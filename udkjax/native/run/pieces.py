@@ -1,4 +1,4 @@
-"""Steps that leave the piece of the state in which the motion is smooth (a cubic of a cam's profile)."""
+"""Steps that leave a piece of the state space in which the motion is smooth (one cubic of a cam's profile)."""
 
 from collections.abc import Callable
 
@@ -10,10 +10,10 @@ from udkjax.native.base.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, H
 
 
 def write_leave(module: Module):
-    """Write `leave`: for lanes in `again`, whether a step that ends in another piece of the motion lands there.
+    """Write `leave`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
 
-    Else it is taken `again`, to end just before the piece does. The next step is a tiny one across,
-    behind which the run starts anew: so also what is known of accelerations at the ends of steps belongs to one piece.
+    It is repeated to end just before the end of the piece. A tiny step then leads across, and the run begins anew after it, so
+    that the accelerations of all points of an interpolation belong to one piece.
     """
     f, s = module.function("leave")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
@@ -70,7 +70,7 @@ def write_leave(module: Module):
 
 
 def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:
-    """Return q and v a share of the step ahead, on the polynomial through its two ends (one register)."""
+    """Return q and v at a fraction `share` of the step, on the polynomial through its two ends (one register)."""
     x, h = module.broadcast(f, share), module.broadcast(f, step)
 
     def along(*coefficients: float) -> Value:

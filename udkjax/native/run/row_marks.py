@@ -1,10 +1,10 @@
-"""Machine code that finds which rows of Psi are independent, for mechanisms whose numbers are known only when they run.
+"""Machine code that finds independent rows of Psi at run time, for mechanisms with traced numbers.
 
-Rows that depend on others everywhere have to be distinguished from those that do so at the initial position alone, in a singular
-configuration. So a mechanism takes one step aside, along its velocity or, at rest, along some direction that its constraints
-allow, with its drivers a little ahead; it is closed there by Newton's method, and rows are marked that elimination does not leave
-out. Where it does not close, or is led back, as at rest where two branches of its motion meet, all rows are marked: elimination
-then meets pivots that it must not trust, and every step is taken by the method that reveals the rank.
+Rows that depend on others everywhere must be distinguished from rows that do so only at the initial position, if it is singular.
+So the mechanism takes one step, along its velocity or, at rest, along some direction that its constraints allow, with its drivers
+slightly advanced; it is closed by Newton's method, and the rows that elimination retains are marked. If it does not close, or is
+led back, as at rest where two branches of its motion meet, all rows are marked: elimination then encounters small pivots, and the
+rank-revealing fallback takes every step.
 """
 
 from collections.abc import Callable
@@ -20,12 +20,12 @@ from udkjax.native.base.tableau import EULER
 from udkjax.native.run.manifold import iterate_newton, largest_violation
 from udkjax.native.run.members import write_begin, write_run
 
-# Of the scene's units: how far the step goes. A row that depends on others only where the step begins has behind it a pivot of
-# about the square, relative to its diagonal entry: far above the threshold of dependence, and Newton's method closes from there.
+# Length of the step in the scene's units. A row that depends on others only at the start of the step has a relative pivot of
+# about its square at the end: far above the threshold of dependence. It is also within the range of Newton's method.
 STEP = 0.03
-STAYS = 0.5  # of the step: where branches meet, Newton's method leads a position on neither of them back to where it began
-CORRECTIONS = 6  # of Newton's method, which doubles the digits in each: four are usual
-FREE = 1e-6  # of a direction or a velocity, in the scene's units: anything less is rounding, and constraints allow no motion
+STAYS = 0.5  # smallest distance from the start, as a fraction of the step: where branches meet, Newton's method may lead back
+CORRECTIONS = 6  # Newton steps; four are usual, as convergence is quadratic
+FREE = 1e-6  # smallest tangent part of a direction or a velocity, in the scene's units; less is rounding
 
 
 class RowMarks(Module):
@@ -55,7 +55,7 @@ class RowMarks(Module):
         return super().arrays | {"independent": ("work", self.places["independent"])}
 
     def _find(self):
-        """`find(work, call)`: the members in all lanes."""
+        """Write `find(work, call)`: mark the rows of the members in all lanes."""
         f, s = self.function("find", [(POINTER, "work"), (POINTER, "call")])
         width = self.plan.width
         direction = np.random.default_rng(0).uniform(-1.0, 1.0, self.n)
@@ -106,7 +106,7 @@ class RowMarks(Module):
         return of_register
 
     def step_all(self, f: Function, s: Lane, fill):
-        """Find the marks of the members in all lanes, and take the next."""
+        """Mark the rows of the members in all lanes, and load the next members."""
         f.call("find", f.given["work"], f.given["call"])
         s.active = f.const(0.0, DOUBLE, f.width)
         fill()

@@ -1,4 +1,4 @@
-"""One step of an explicit Runge-Kutta method, with the estimate of its error."""
+"""One step of an explicit Runge-Kutta method with error estimate."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from udkjax.native.run.manifold import newton, with_threshold
 
 
 def write_attempt(module: Module):
-    """Write `attempt`: from point 3 by `step` to `t1`, of lanes that are `stepping`.
+    """Write `attempt`: a step from point 3 to `t1`, of length `step`, in lanes that are `stepping`.
 
-    It leaves the state there as `state q`, `result v` and `result a`, with its `error` and `distance`.
+    It computes the state at `t1` as `state q`, `result v` and `result a`, with its `error` and `distance`.
     """
     f, s = module.function("attempt")
     method, stages = module.method, module.method.stages
@@ -29,7 +29,7 @@ def write_attempt(module: Module):
             module.record_stage(f, s, i)
 
     def clear_stages():
-        # They may hold what is no number, of a member that failed: no time at all would still multiply that.
+        # They may hold NaN of a failed member, which would survive the multiplication by a step of zero.
         with f.each(module.rowcount) as r:
             for i in range(1, stages):
                 module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
@@ -69,7 +69,7 @@ def write_attempt(module: Module):
 
 
 def _measure_error(module: Module, f: Function, s: Lane):
-    """Compute `error`, the largest of all coordinates over its tolerance: not a number where any of them is none."""
+    """Compute `error`, the maximum over coordinates of the error over its tolerance; NaN if any is NaN."""
     q0, v0, q1, v1 = "point3 q", "point3 v", "state q", "result v"
     rtol = module.broadcast(f, s.rtol)
     weight = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
@@ -84,7 +84,7 @@ def _measure_error(module: Module, f: Function, s: Lane):
             found.append(f.abs(left) / f.fma(rtol, size, module.vector(f, scale, r)))
         return found
 
-    # A number that is not finite is the largest of no comparison: zero times it is looked for instead.
+    # Maxima ignore NaN, so non-finite numbers are detected by their product with zero.
     check = f.variable(0.0, width=module.plan.vector)
     with f.each(module.rowcount) as r:
         for x in (*relative(r), module.vector(f, "result a", r)):
@@ -96,7 +96,7 @@ def _measure_error(module: Module, f: Function, s: Lane):
 
 
 def stage_state(module: Module, f: Function, s: Lane, i: int, start: str = "point3", step: Value | None = None):
-    """Compute the state of stage i, of the step from a point."""
+    """Compute the state of stage i of the step from a point."""
     step = s.step if step is None else step
     method, h, names = module.method, module.broadcast(f, step), [f"{start} a", *module.stage_accelerations[1:]]
     setattr(s, "state t", f.fma(step, float(method.nodes[i]), getattr(s, f"{start}_t")))
@@ -109,7 +109,7 @@ def stage_state(module: Module, f: Function, s: Lane, i: int, start: str = "poin
 
 
 def check_pivots(module: Module, f: Function, s: Lane, name: str):
-    """Compute accelerations whose pivots are too small to be trusted by the fallback, or give the attempt up."""
+    """If pivots are too small, compute accelerations by the fallback or abandon the attempt."""
     if not module.falls_back or module.is_formulated:
         return
     unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
@@ -122,7 +122,7 @@ def check_pivots(module: Module, f: Function, s: Lane, name: str):
 
 
 def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
-    """Of q and v, from the accelerations of all stages; `end`: those at the end, where they are the last stage's."""
+    """Estimate the errors of q and v from the accelerations of all stages; `end` names those of the last stage."""
     h = module.broadcast(f, s.step)
     names = list(module.stage_accelerations)
     if module.method.ends and end:

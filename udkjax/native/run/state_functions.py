@@ -1,10 +1,10 @@
-"""Machine code of functions of single states, for integrators of others: what a run does at a state, for batches in lanes.
+"""Machine code of functions of single states, for other integrators, in batches.
 
-StateAccelerations    a of a state, by elimination or a dense method; by the fallback where pivots are not to be trusted
-StateProjection       q and v returned to the constraint manifold
-StateTangentPart      the part of small changes of q and v within the manifold
-Evaluation            accelerations with the forces of rows, and energies, for pages
-ScaleCode             the characteristic scales (equations/scale_program.py), of numbers alone
+StateAccelerations    a of a state, by elimination or a dense method; by the fallback if pivots are too small
+StateProjection       q and v projected onto the constraint manifold
+StateTangentPart      the tangent part of small changes of q and v
+Evaluation            accelerations with multipliers, and energies, for pages
+ScaleCode             the characteristic scales (equations/scale_program.py), from the numbers of a scene
 """
 
 from abc import abstractmethod
@@ -31,7 +31,7 @@ class StateFunction(Trajectory):
 
     settings = ("length", "fallback_tol", "method")
     results = ("found",)
-    found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, one behind another
+    found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, concatenated
 
     def __init__(
         self, code: ScenePrograms, pseudoinverse: DenseMethod | None, formulation: FormulationCode | None, width: int, vector: int
@@ -67,7 +67,7 @@ class StateFunction(Trajectory):
         return self.module_text()
 
     def write_found(self, f: Function, s: Lane):
-        """Write what was found of the members in all lanes to the output."""
+        """Write the results of the members in all lanes to the output."""
         with self.each_lane(f, s.active) as k:
             to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), self.n * len(self.found))
             for j, name in enumerate(self.found):
@@ -75,10 +75,10 @@ class StateFunction(Trajectory):
 
     @abstractmethod
     def _evaluate(self, f: Function, s: Lane):
-        """Write the arrays `found`, of the state of each lane."""
+        """Write the evaluation of the arrays `found` at the state of each lane."""
 
     def step_all(self, f: Function, s: Lane, fill):
-        """Evaluate the members in all lanes, and take the next."""
+        """Evaluate the members in all lanes, and load the next members."""
         f.call("evaluate_states", f.given["work"], f.given["call"])
         s.active = f.const(0.0, DOUBLE, f.width)
         fill()
@@ -118,7 +118,7 @@ class StateProjection(StateFunction):
 
 
 class StateTangentPart(StateFunction):
-    """The part of small changes of states within the manifold, dq and dv as two further inputs."""
+    """The tangent part of small changes dq and dv of states, two further inputs."""
 
     inputs = ("dq", "dv")
     found = ("result dq", "result dv")
@@ -150,16 +150,16 @@ INPUTS = ("t", "q", "v")
 
 
 class Evaluation:
-    """The text of a module that evaluates a scene at single states, of loops whatever the size of the scene.
+    """The text of a module that evaluates a scene at single states, by loops for any size of the scene.
 
-    Its functions are called one by one, with addresses in one piece of memory:
+    Its functions are called directly, with addresses in one block of memory:
 
         numbers(parameters, numbers)      numbers of the scene that depend on parameters, into the vector of all numbers
-        prologue(numbers, work)           the constants of the scene, of its numbers
-        accelerations(work, work)         "a", and the solution "x0" of the linear system, of "t", "q" and "v"
-        energy(work, work)                "energy", kinetic and potential (J), of "q" and "v"
+        prologue(numbers, work)           the constants of the scene from its numbers
+        accelerations(work, work)         "a", and the solution "x0" of the linear system, from "t", "q" and "v"
+        energy(work, work)                "energy", kinetic and potential (J), from "q" and "v"
 
-    `places` are the places in `work` of the arrays of these names, in numbers; `work` begins with the constants.
+    `places` are the offsets of the arrays of these names in `work`, in numbers; `work` begins with the constants.
     """
 
     exports = ("prologue", "accelerations", "energy")
@@ -186,9 +186,9 @@ class Evaluation:
 
 
 class ScaleCode(Memory):
-    """The text of a module whose `run` finds the scales of members: in loops whatever the size of the scene, once a run.
+    """The text of a module whose `run` finds the scales of members, by loops for any size of the scene.
 
-    They are cold: optimized they take as long, and twice as long to compile.
+    Its functions are cold: optimization would not make them faster, but double the time of compiling.
     """
 
     settings = ()

@@ -1,19 +1,19 @@
-"""Whole trajectories as machine code: an explicit Runge-Kutta method for q'' = a(t, q, v), with all that a step takes.
+"""Trajectories as machine code: an explicit Runge-Kutta method for q'' = a(t, q, v) with step control and projection.
 
-A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages need the accelerations alone (Hairer, Norsett, Wanner, II.14):
+A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages only need accelerations (Hairer, Norsett, Wanner, II.14):
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j,        a_i = a(t + c_i h, q_i, v_i).
 
-Each accepted step is returned to the constraint manifold. Outputs lie on the polynomial that has the positions, velocities and
-accelerations of four consecutive accepted states (of degree 11: interpolated states are as exact as the states themselves, and
-cost no evaluation), and are returned to the manifold, too. Where the motion is not smooth a step ends, and the run starts anew.
+Each accepted step is projected onto the constraint manifold. Outputs lie on the polynomial of degree 11 through the positions,
+velocities and accelerations of four consecutive accepted states, which is as accurate as the states and costs no evaluation, and
+are projected as well. Where the motion is not smooth, a step ends and the run begins anew.
 
-W members run side by side in the lanes of vectors, each with a time, a step and a result of its own. A lane whose member is done
-takes the next one. Where elimination meets a pivot that it must not trust, a step is taken a little shorter; where that does not
-help it is taken again by a fallback: elimination of all rows, without those that depend on others (fallback.py).
+W members run in the lanes of vectors, each with its own time, step and result. A lane with a completed member loads the next one.
+If elimination encounters a pivot that is too small, the step is shortened slightly; if that does not help, it is repeated by a
+rank-revealing fallback (fallback.py).
 
-The functions of one module, all of them on one piece of memory (`Layout`): `run` takes members and calls `attempt` (one step),
-`decide` (whether it counts, and the next), `outputs` (states between steps).
+All functions of a module work on one block of memory (`Layout`): `run` loads members and calls `attempt` (one step), `decide`
+(acceptance and the next step) and `outputs` (states between steps).
 """
 
 from collections.abc import Callable, Sequence
@@ -60,10 +60,10 @@ class Trajectory(Module):
             self.copy(f, "saved v", "state v")
 
     def before_step(self, f: Function, s: Lane):
-        """Hook: called before each attempt at a step, once it is planned."""
+        """Hook: called before each attempt at a step, after `t1` has been set."""
 
     def after_step(self, f: Function, s: Lane):
-        """Hook: called behind each attempt at a step, once it is known up to when outputs are due."""
+        """Hook: called after each attempt at a step, when `until` has been set."""
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
@@ -86,7 +86,7 @@ class Trajectory(Module):
         return self.module_text()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Take one step in all lanes, and finish those that are done."""
+        """Take one step in all lanes, and finish completed members."""
         work, call, width = f.given["work"], f.given["call"], self.plan.width
         yes = f.const(1.0, DOUBLE, width)
         due_for_fallback = s.fallback_due > 0.5

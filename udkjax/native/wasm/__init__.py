@@ -1,7 +1,7 @@
-"""Modules of the engine as WebAssembly, for pages that simulate: the same text, compiled for another processor by the same LLVM.
+"""Modules of the engine as WebAssembly, for pages that simulate: the same text, compiled by the same LLVM for another target.
 
-`wasm_module` makes the module of an operation, `compile_wasm` compiles a text (target.py), and `link` makes a module that a page
-can load out of LLVM's object code (object_code.py): no linker is needed, since one object needs nothing of another one.
+`wasm_module` makes the module of an operation, `compile_wasm` compiles a text (target.py), and `link` converts LLVM's object code
+to a loadable module (object_code.py); no linker is needed, as modules consist of a single object.
 """
 
 from udkjax.native.wasm.target import WasmModule, compile_wasm, wasm_module

@@ -1,28 +1,28 @@
-"""LLVM's WebAssembly object code as a module that can be loaded: with exports, and without what is for linkers.
+"""Conversion of LLVM's WebAssembly object code to a loadable module, with exports and without sections for linkers.
 
-An object has all its functions under their final numbers and its data from address 0 on, so that nothing has to be relocated; its
-memory and the pointer to its stack are imports. It lacks a section of exports: the numbers of its functions are in the
-table of symbols, in the section "linking" (the tool conventions' Linking.md).
+In an object all functions have their final indices, and data begin at address 0, so nothing has to be relocated; the memory and
+the stack pointer are imports. It lacks an export section: the indices of its functions are in the symbol table, in the section
+"linking" (Linking.md of the tool conventions).
 """
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 MAGIC = b"\0asm\1\0\0\0"
-CUSTOM, IMPORTS, EXPORTS, DATA = 0, 2, 7, 11  # sections; those of a module are in this order, but the count of data, before code
-SYMBOL_TABLE = 8  # a part of "linking"
-FUNCTION_SYMBOL, DATA_SYMBOL, SECTION_SYMBOL = 0, 1, 3  # all others have a number, too
+CUSTOM, IMPORTS, EXPORTS, DATA = 0, 2, 7, 11  # section ids; sections are in this order, except the data count before the code
+SYMBOL_TABLE = 8  # subsection of "linking"
+FUNCTION_SYMBOL, DATA_SYMBOL, SECTION_SYMBOL = 0, 1, 3  # kinds of symbols; all others have an index like functions
 UNDEFINED, EXPLICIT_NAME = 0x10, 0x40  # flags of symbols
 I32_CONST = 0x41  # the opcode
 
 
 class LinkedModule(NamedTuple):
-    """A module that can be loaded, and what it takes.
+    """A loadable module and its imports.
 
     Attributes:
         code: its bytes.
-        imports: the names of functions that it calls, in the module "env".
-        data_end: the bytes of memory from 0 on that its constants take.
+        imports: the names of the functions that it imports from "env".
+        data_end: the end (bytes) of its constants in memory, which begin at 0.
     """
 
     code: bytes
@@ -31,7 +31,7 @@ class LinkedModule(NamedTuple):
 
 
 class Reader:
-    """A place in bytes, from which numbers and names are read one after another."""
+    """Sequential reading of numbers and names from bytes."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -44,12 +44,12 @@ class Reader:
         return self.take(1)[0]
 
     def take(self, count: int) -> bytes:
-        """Read so many bytes."""
+        """Read `count` bytes."""
         self.at += count
         return self.data[self.at - count : self.at]
 
     def number(self) -> int:
-        """Read a whole number in LEB128."""
+        """Read an unsigned integer in LEB128."""
         value = shift = 0
         while True:
             byte = self.byte()
@@ -58,16 +58,16 @@ class Reader:
                 return value
 
     def block(self) -> bytes:
-        """Read bytes whose count is before them."""
+        """Read bytes that follow their count."""
         return self.take(self.number())
 
     def name(self) -> str:
-        """Read a text whose length is before it."""
+        """Read a text that follows its length."""
         return self.block().decode()
 
 
 def leb128(value: int) -> bytes:
-    """Return a whole number that is not negative in LEB128."""
+    """Return a nonnegative integer in LEB128."""
     found = bytearray()
     while value > 127:
         found.append(value & 127 | 128)
@@ -76,10 +76,10 @@ def leb128(value: int) -> bytes:
 
 
 def link(code: bytes, exports: Sequence[str]) -> LinkedModule:
-    """Return an object as a module that exports functions by their names.
+    """Convert an object to a module that exports functions by name.
 
     Raises:
-        ValueError: a function is not there, or the bytes are no object code of LLVM's.
+        ValueError: a function is missing, or the bytes are not object code by LLVM.
     """
     sections = list(_sections(code))
     numbers = _function_numbers(sections)
@@ -99,13 +99,13 @@ def link(code: bytes, exports: Sequence[str]) -> LinkedModule:
 def _sections(code: bytes) -> Iterator[tuple[int, bytes]]:
     reader = Reader(code)
     if reader.take(len(MAGIC)) != MAGIC:
-        raise ValueError("these bytes are no WebAssembly")
+        raise ValueError("not a WebAssembly module: wrong magic bytes or version")
     while reader:
         yield reader.byte(), reader.block()
 
 
 def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
-    """Return the number of each function that is defined, from the table of symbols."""
+    """Return the index of each defined function, from the symbol table."""
     found = {}
     for kind, body in sections:
         reader = Reader(body)
@@ -124,7 +124,7 @@ def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
 
 
 def _symbol(table: Reader) -> tuple[int, str, int]:
-    """Read a symbol: its kind, its name if it is defined here, and its number."""
+    """Read a symbol: its kind, its name if it is defined in this object, and its index."""
     kind, flags = table.byte(), table.number()
     defined = not flags & UNDEFINED
     if kind == DATA_SYMBOL:
@@ -150,7 +150,7 @@ def _imported_functions(body: bytes) -> Iterator[str]:
 
 
 def _skip_type(reader: Reader, kind: int):
-    """Read the type of what is imported: of a function, a table, a memory or a global."""
+    """Skip the type of an import: a function, a table, a memory or a global."""
     if kind in (1, 2):
         if kind == 1:
             reader.byte()
@@ -165,11 +165,11 @@ def _skip_type(reader: Reader, kind: int):
 
 
 def _data_end(body: bytes) -> int:
-    """Return the end of the last segment of data."""
+    """Return the end of the last data segment."""
     reader, end = Reader(body), 0
     for _ in range(reader.number()):
         if reader.number() or reader.byte() != I32_CONST:
-            raise ValueError("data is expected at known places")
+            raise ValueError("the offset of a data segment is not constant")
         start = reader.number()
         reader.byte()  # the end of the expression
         end = max(end, start + len(reader.block()))

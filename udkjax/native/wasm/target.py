@@ -1,8 +1,7 @@
 """The compiler for WebAssembly: 32-bit addresses, registers of two float64, no fused multiply-add. Its code is stored on disk.
 
-The same text of LLVM holds there: the record that `run` is called with has fields of 8 bytes, of which addresses take
-four; a product and a sum are rounded each. Functions that are no instructions (exp, pow, atan2) and the memory of a run (malloc,
-free) are imports.
+LLVM's text is the same: the call record of `run` has fields of 8 bytes, of which addresses use four; products and sums are
+rounded separately. Functions without instructions (exp, pow, atan2) and memory management (malloc, free) are imports.
 """
 
 from functools import cache
@@ -14,20 +13,20 @@ from udkjax.native.operations import Operation
 from udkjax.native.wasm.object_code import LinkedModule, link
 
 TRIPLE = "wasm32-unknown-unknown"
-# Every browser of the last years has these: Chrome 91, Firefox 89, Safari 16.4.
+# Features of browsers since Chrome 91, Firefox 89 and Safari 16.4.
 FEATURES = "+simd128,+bulk-memory,+nontrapping-fptoint,+sign-ext,+mutable-globals"
 LANES = 2  # float64 numbers in a register
 
 
 class WasmModule(NamedTuple):
-    """A module of the engine: its code, and the module of which it knows how it is called."""
+    """The WebAssembly code of a module, and the module, which describes its call record."""
 
     linked: LinkedModule
     module: Memory
 
 
 def wasm_module(operation: Operation) -> WasmModule:
-    """Compile an operation of one member at a time; the module exports `run`, which takes the address of its record.
+    """Compile an operation for one member at a time; the module exports `run`, which takes the address of its call record.
 
     Args:
         operation: Any of `native.operations`.
@@ -36,7 +35,7 @@ def wasm_module(operation: Operation) -> WasmModule:
         The module; `module.call_fields` are the fields of the record, 8 bytes each (memory.py).
 
     Raises:
-        UnsupportedError: the operation takes what machine code has no instruction for.
+        UnsupportedError: machine code does not support the operation.
     """
     module = operation.module(1, 1, LANES)
     module.written_text = module.text()
@@ -44,7 +43,7 @@ def wasm_module(operation: Operation) -> WasmModule:
 
 
 def compile_wasm(text: str, exports: tuple[str, ...]) -> LinkedModule:
-    """Return a module that exports some functions of LLVM's text: from disk, or compiled and put there."""
+    """Return the module of LLVM's text with some functions exported, from disk or newly compiled."""
     key = machine.digest("\0".join((TRIPLE, FEATURES, text)))
     code = code_cache.read(key)
     if code is None:

@@ -1,4 +1,4 @@
-"""Intervals between nodes at which conditions are known: what becomes of them (watching.py)."""
+"""Classification of the intervals between nodes: no crossing, a crossing, or unresolved (watching.py)."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ from udkjax.native.watching.watch_memory import WatchMemory
 
 
 def write_classification(module: WatchMemory):
-    """`judge(work)`: in lanes where `low` is one, what becomes of the two intervals whose last node was looked at."""
+    """Write `judge(work)`: classify two intervals after their last node, in lanes where `low` is one, and act accordingly."""
     f, s = module.function("judge")
     mask, length = s.low > 0.5, s.look - s.first_t
     unresolved = [f.variable(0.0), f.variable(0.0)]
@@ -49,9 +49,9 @@ def write_classification(module: WatchMemory):
 
 
 def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved: list[Variable], hits: list[Variable]):
-    """Go on behind the intervals that are sure; locate what crosses in them; look closer at others, or stop."""
+    """Continue after resolved intervals, locate crossings in them, and refine or stop at unresolved ones."""
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
-    behind_break = s.fresh > s.first_t  # the polynomial is that of another piece of the motion
+    behind_break = s.fresh > s.first_t  # the polynomial belongs to another piece of the motion
     span = s.look - s.first_t
     length, jumps = span * s.omega, f.variable(0.0)
     may_jump = (length <= SHORT_PAIR) & (s.jumps < float(MOST_JUMPS)) & (s.stuck < float(MOST_STUCK))
@@ -84,7 +84,7 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved:
 
 
 def _refine(module: WatchMemory, f: Function, s: Lane, mask: Value, span: Value, k: int):
-    """Look again at two intervals, from the first node or the one in the middle on, at nodes that are closer."""
+    """Repeat two intervals with closer nodes, from the first or the middle node on."""
     with f.if_(f.any_of(mask)):
         if k == 1:
             module.move_conditions(f, mask, g1="g0", rate1="rate0")
@@ -100,7 +100,7 @@ def _sign(f: Function, x: Value) -> Value:
 
 
 def _error(f: Function, g: list[Value], rate: list[Value], length: Value, x: Value) -> Value:
-    """Return by how much Hermite's cubic over two intervals misses the condition, or its rate, in between."""
+    """Return the error of Hermite's cubic over two intervals, for the condition or its rate at the middle node."""
     a, da, b, db = g[0], rate[0] * length, g[2], rate[2] * length
     square, cube = (b - a) * 3.0 - da * 2.0 - db, (a - b) * 2.0 + da + db
     value = a + x * (da + x * (square + x * cube))
@@ -118,7 +118,7 @@ def _classify_interval(
     after: Value,
     floor: Value,
 ) -> tuple[Value, Value]:
-    """Tell whether a condition, of values and rates at both ends, changes its side in an interval, and whether that is sure."""
+    """Return whether a condition changes sign in an interval, and whether this is certain, from values and rates at its ends."""
     hit = after * before < 0.0
     side = f.select(before.is_(0.0), after, before)
     a, b = ends[0] * side, ends[2] * side

@@ -1,4 +1,4 @@
-"""Conditions that a run watches (watching.py): their program, what a run is given besides, and how finely it looks at them."""
+"""Conditions that a run watches (watching.py): their programs and inputs, and the resolution in time."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -8,21 +8,20 @@ from udkjax.expressions import ScalarProgram
 
 
 class Resolution(NamedTuple):
-    """How finely conditions are looked at; T is the shortest time in which anything changes.
+    """The resolution of conditions in time; T is the shortest time in which anything changes, the inverse of the scene's rate.
 
     Attributes:
-        per_time: intervals in T.
-        resolved: fraction of the change of a condition in an interval that the cubic's error may be; beyond it the interval is
+        per_time: number of intervals in T.
+        resolved: largest error of the cubic, as a fraction of the change of a condition in an interval; an interval with more is
             too coarse. An oscillation then has at least 7 intervals in a period, and no two of its zeros lie in one; a smaller
-            fraction takes more windows for the same events.
-        miss: fraction of the error over two intervals that counts for one. Of a cubic it is 1/16, by the fourth power of the
-            length, where the interval is fine; four times that is on the safe side where it is not yet. Where rates are
-            differences, the whole error counts.
-        far: multiple of the error; farther from zero a condition has no zero in an interval that is too coarse: a change large
-            enough to get there would be resolved.
-        finer: ratio of an interval that is too coarse to the next one.
-        short: T; within a window of that length a condition has a jump or a kink, or varies all along.
-        finest: T; changes within a window of that length are not resolved any more.
+            fraction needs more windows for the same events.
+        miss: error in one interval, as a fraction of the error over two. In a fine interval it is 1/16, by the fourth power of
+            the length; four times that is safe in coarser ones. Rates that are computed by differences count with the full error.
+        far: distance from zero, in errors, beyond which a condition has no zero even in an interval that is too coarse: a change
+            as large would be resolved.
+        finer: factor by which an interval that is too coarse is refined.
+        short: length of a window, in T, in which an unresolved condition has a jump or a kink, or varies throughout.
+        finest: length of a window, in T, in which changes are no longer resolved.
     """
 
     per_time: int = 16
@@ -35,34 +34,34 @@ class Resolution(NamedTuple):
 
 
 RESOLUTION = Resolution()
-SHORT_PAIR = RESOLUTION.short / 16  # T: two of the 32 intervals of a window of that length
-FINEST = 1e-9  # T: changes within a window of that length are not resolved any more
-MOST_JUMPS = 3  # of conditions, before intervals are as long again as they were: of more, some are oscillations
-# Two intervals meet at this share of them, and are shorter than they may be by up to another, which turns by the golden ratio, so
-# that no oscillation is zero at all nodes.
+SHORT_PAIR = RESOLUTION.short / 16  # length in T of two of the 32 intervals of such a window
+FINEST = 1e-9  # length of a window, in T, in which changes are no longer resolved
+MOST_JUMPS = 3  # jumps of conditions before intervals regain their length; more are an oscillation
+# Position of the middle node in two intervals; largest reduction of their length, as a fraction; and the increment of its phase,
+# the golden ratio, so that no oscillation is zero at all nodes.
 MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
-MOST_STUCK = 4  # times in a row that intervals become finer: before a jump, some of the finer ones are clear
-FIRST, SECOND, THIRD = range(3)  # the node of two intervals that is next
-LAST_CHANGE = 1e-7  # of the event time, in T: Taylor's step makes an error of its square
-MOST_LANDINGS = 5  # steps that end at a crossing: one, as a rule
-LEAST_STEP = 10  # times the smallest, to a crossing: the next may be a fifth as long
-WANTED, UNDER_WAY = 1, 2  # the states of a landing: from the point before the crossing a step is to be taken, or is being taken
-SHORTEST_SPAN = 100  # times the smallest step: shorter ones are not distinguished
-VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is not resolved, or not a number
-FORCE_STEP = 1e-7  # T: over which the rate of a contact force is its difference
+MOST_STUCK = 4  # successive refinements; before a jump, some of the finer intervals are resolved
+FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
+LAST_CHANGE = 1e-7  # largest last change of the event time, in T; Taylor's step has an error of its square
+MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; one is usual
+LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long
+WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before the crossing is requested, or has been planned
+SHORTEST_SPAN = 100  # shortest span, in smallest steps, that is refined
+VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is unresolved, or NaN
+FORCE_STEP = 1e-7  # time difference, in T, for the rate of a contact force
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions g(t, q, v), and contact forces, that a run watches; equal where `key` and `rows` are.
+    """Conditions g(t, q, v), and contact forces, that a run watches; compared by `key` and `rows`.
 
     Attributes:
         key: texts of the programs.
-        program: g and their rates, of t, q, v, a and numbers of their own.
-        at_state: g, rates, second rates, and the derivatives of all g by t, by q and by v, of the same.
-        number_count: of numbers of their own.
+        program: g and their rates, from t, q, v, a and the numbers of the conditions.
+        at_state: g, rates, second rates, and the derivatives of all g by t, by q and by v, from the same inputs.
+        number_count: number of numbers of the conditions.
         by_velocity: mask of the conditions that depend on velocities; they have no second rates.
-        rows: of Psi, whose multipliers, with the other sign, are watched behind the conditions.
+        rows: rows of Psi whose multipliers, with opposite sign, are watched after the conditions.
     """
 
     key: Hashable
@@ -72,7 +71,7 @@ class Conditions:
     by_velocity: tuple[bool, ...] = field(compare=False)
     rows: tuple[int, ...] = ()
 
-    # Numbers about the end of a run before its sides: the event, or -1; the time; the largest violation at a node.
+    # Number of values of the end of a run before the sides: the event, or -1; the time; the largest violation at a node.
     head: ClassVar[int] = 3
 
     @property
@@ -82,9 +81,9 @@ class Conditions:
 
     @property
     def count(self) -> int:
-        """The number of all that is watched."""
+        """The number of watched conditions and contact forces."""
         return self.own_count + len(self.rows)
 
     def output_count(self, n: int) -> int:
-        """Return the count of numbers that a run of n coordinates returns about its end."""
+        """Return the number of values that a run with n coordinates returns about its end."""
         return self.head + self.count + 2 * n

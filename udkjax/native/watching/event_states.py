@@ -1,14 +1,14 @@
-"""Machine code of what an event needs to know of single states: accelerations, conditions, and what impulses do.
+"""Machine code of the quantities that events need at single states: accelerations, conditions, and directions of impulses.
 
-Of a state (t, q, v) it returns, one behind another:
+For a state (t, q, v) it returns, concatenated:
 
     a                        the accelerations (n,)
     g, g_dot, g_ddot         conditions with first and second rates along the motion (E,) each
     g_t, g_q, g_v            their derivatives (E,), (E, n), (E, n)
-    d                        directions of impulses along g_q (E, n), of impacts alone
+    d                        directions of impulses along g_q, only of impacts, (impacts, n)
 
-A direction d = P M^(-1) g_q^T is the velocity that a unit impulse along g_q gives, with P the part that the constraints leave, so
-that W_ij = g_q,i d_j.
+A direction d = P M^(-1) g_q^T is the change of velocity by a unit impulse along g_q, with P the projector on the tangent space,
+so that W_ij = g_q,i d_j.
 """
 
 from udkjax.native.base.ir import Function, Value
@@ -21,7 +21,7 @@ from udkjax.native.watching.conditions import Conditions
 class EventStates(StateTangentPart, StateAccelerations):
     """The text of a module that evaluates conditions and directions of impulses at states.
 
-    Its further input holds the numbers of the conditions, and one over the mass of each coordinate.
+    Its further input holds the numbers of the conditions, and the inverse mass of each coordinate.
     """
 
     inputs = ("event_numbers",)

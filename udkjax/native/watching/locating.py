@@ -1,4 +1,4 @@
-"""Crossings of zero of conditions that a run watches: located on the polynomial of outputs, and by a step that ends there."""
+"""Location of zero crossings of conditions, on the polynomial of dense output and by a step that ends at the crossing."""
 
 from udkjax.native.base.ir import DOUBLE, Value
 from udkjax.native.base.steps import POINTS, UNIT, Status
@@ -7,12 +7,12 @@ from udkjax.native.watching.watch_memory import WatchMemory
 
 
 def write_locate(module: WatchMemory):
-    """`locate(work)`: the crossing between `low` and `high` of lanes that seek one, by bisection."""
+    """Write `locate(work)`: find the crossing between `low` and `high` by bisection, in lanes that seek one."""
     f, s = module.function("locate")
     work, one, zero = f.given["work"], f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
 
     def crossed() -> Value:
-        """The first condition beyond zero, or -1."""
+        """Return the first condition beyond zero, or -1."""
         found = f.variable(-1.0)
         with f.each(module.conditions.count) as c:
             beyond = (module.condition(f, "hit", c) * module.condition(f, "g", c) > 0.0) & (found.value < 0.0)
@@ -42,10 +42,10 @@ def write_locate(module: WatchMemory):
 
 
 def write_approach(module: WatchMemory):
-    """`approach(work)`: a step to the target, from the last point before it, of lanes that are landing."""
+    """Write `approach(work)`: plan a step to `target` from the last point before it, in lanes that are landing."""
     f, s = module.function("approach")
     wanted, zero = s.landing.is_(float(WANTED)), f.const(0.0, DOUBLE, f.width)
-    for k in range(POINTS):  # the latest of those that are early enough
+    for k in range(POINTS):  # the latest point before the target
         early = wanted & (s.target - getattr(s, f"point{k}_t") > s.smallest * LEAST_STEP)
         module.copy_point(f, early, f"point{k}", "before")
         s.where(early, low=getattr(s, f"point{k}_t"))
@@ -57,7 +57,7 @@ def write_approach(module: WatchMemory):
 
 
 def write_land(module: WatchMemory):
-    """`land(work)`: what becomes of lanes whose step has ended at its target."""
+    """Write `land(work)`: end or correct the landing of lanes whose step has ended at its target."""
     f, s = module.function("land")
     arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(Status.RUNNING))
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)

@@ -1,4 +1,4 @@
-"""The memory of runs that watch conditions (watching.py): what goes in and comes out, and how far the intervals go."""
+"""The memory of runs that watch conditions (watching.py): inputs and outputs, and the length of intervals."""
 
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
@@ -7,28 +7,28 @@ from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import MIDDLE, RESOLUTION, SECOND, TURN, VARIES, Conditions
 
 LANE_NUMBERS = {
-    "node": "the next node (s); infinite where there is none",
-    "which": "which of three it is",
-    "first_t": "the first of the three (s)",
-    "middle_t": "the one in the middle (s)",
-    "behind_middle": "the last of the three (s)",
-    "sure_t": "the time up to which all is certain (s)",
-    "turn": "by which intervals vary",
-    "share": "of an ordinary interval, that they take",
-    "jumps": "how many there were since they were ordinary",
-    "stuck": "how often they became finer since one was clear",
-    "fresh": "the time at which the run began anew (s)",
-    "event": "the condition that crosses, or -1",
+    "node": "time of the next node (s); infinite if there is none",
+    "which": "FIRST, SECOND or THIRD: its position in the two intervals",
+    "first_t": "time of the first node (s)",
+    "middle_t": "time of the middle node (s)",
+    "behind_middle": "time of the last node (s)",
+    "sure_t": "time up to which conditions are resolved (s)",
+    "turn": "phase of the variation of interval lengths",
+    "share": "length of the intervals, as a fraction of the unrefined length",
+    "jumps": "number of jumps since intervals had the unrefined length",
+    "stuck": "number of refinements since an interval was resolved",
+    "fresh": "time at which the run began anew (s)",
+    "event": "index of the condition that crosses, or -1",
     "slowest": "rate of the scene (1/s)",
-    "worst": "the largest violation of Psi at a node",
-    "look": "the time to look at (s)",
-    "low": "of a crossing: the time before it (s)",
-    "high": "the time behind it (s)",
+    "worst": "largest violation of Psi at a node",
+    "look": "time at which conditions are evaluated (s)",
+    "low": "lower bound of the time of a crossing (s)",
+    "high": "upper bound of the time of a crossing (s)",
     "seeks": "whether a crossing is being located",
-    "landing": "whether a step is to end at a crossing",
-    "landings": "how many have",
-    "target": "the end of that step (s)",
-    "stops": "whether the run ends here, as something may happen",
+    "landing": "whether a step is to end at a crossing: 0, WANTED or UNDER_WAY",
+    "landings": "number of steps that have ended at a crossing",
+    "target": "end of the step to a crossing (s)",
+    "stops": "whether the run ends at `sure_t`, at a crossing or unresolved",
 }
 
 
@@ -53,7 +53,7 @@ class WatchMemory(Trajectory):
         for name in ("force q", "sure q", "sure v", "middle q", "middle v", "node a", "before q", "before v", "before a"):
             self.places.add(name, self.n)
 
-    # --- what goes in and comes out
+    # --- inputs and outputs
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         given, start = self.member_address(f, "watch", member), 0
@@ -85,7 +85,7 @@ class WatchMemory(Trajectory):
             for j, x in enumerate("qv"):
                 self.copy_lane(f, to, Conditions.head + self.conditions.count + j * self.n, f"sure {x}", k)
 
-    # --- arrays of conditions, and states
+    # --- arrays of conditions and states
 
     def condition(self, f: Function, name: str, c: Value) -> Value:
         return self.entry(f, f"condition {name}", c)
@@ -95,7 +95,7 @@ class WatchMemory(Trajectory):
         self.put_entry(f, f"condition {name}", c, x)
 
     def move_conditions(self, f: Function, mask: Value, **names: str):
-        """Copy arrays of conditions to others, in some lanes."""
+        """Copy arrays of conditions to others, in the lanes of `mask`."""
         with f.each(self.conditions.count) as c:
             for source, to in names.items():
                 self.put_condition(f, to, c, self.condition(f, source, c), mask)
@@ -111,14 +111,14 @@ class WatchMemory(Trajectory):
         s.where(stops, until=f.min(s.until, s.sure_t), stops=0.0, landing=0.0)
 
     def begin_intervals(self, f: Function, s: Lane, mask: Value):
-        """Take the node that was looked at for the first of two intervals."""
+        """Begin two intervals at the node that was evaluated last."""
         self.move_conditions(f, mask, g="g0", rate="rate0")
         fastest = self.largest(f, lambda r: [f.abs(self.vector(f, "result v", r)) * self.vector(f, "inverse unit", r)])
         start, rest = s.look, s.end - s.look
         turn = s.turn + TURN
         turn = turn - f.intrinsic("floor", turn)
         span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / RESOLUTION.per_time) * s.share / f.max(fastest, s.slowest)
-        # No farther than the next step: whoever looks closer at them later needs the points that the first node lies between.
+        # Not longer than the next step: a later refinement needs the points on both sides of the first node.
         span = f.min(span, s.h)
         span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))
         inf = f.const(float("inf"), DOUBLE, f.width)

@@ -1,12 +1,12 @@
-"""Runs that watch conditions: they end at the first crossing of zero, or where one cannot be ruled out.
+"""Runs that watch conditions: they end at the first zero crossing, or where one cannot be ruled out.
 
-Conditions g(t, q, v) are programs, as accelerations are. They are looked at, with their rates along the motion, at nodes behind
-the accepted steps, two intervals at a time. Between two nodes a condition is Hermite's cubic up to E, by which the cubic over
-both intervals misses the value, or the rate, at the node in between: of one it is a sixteenth, so E is on the safe side. Where
-Bernstein's coefficients of the cubic plus and minus E do not change their sign, there is no crossing; where they change it once,
-there is one, which bisection finds on the polynomial that outputs lie on; a step is then taken to end there, and the last change
-of the time, by Newton's method, is a step of Taylor's. All else is looked at again, an eighth as far at a time; conditions that
-still vary then have a jump or a kink. Where there is one after another, or no number, the run ends: whoever called looks on.
+Conditions g(t, q, v) are programs, like accelerations. They are evaluated with their rates along the motion at nodes within the
+accepted steps, two intervals at a time. In an interval a condition is Hermite's cubic up to an error E, the error of the cubic
+over both intervals at the middle node; the error in one interval is a sixteenth of it, so E is a safe bound. If the Bernstein
+coefficients of the cubic plus and minus E do not change sign, there is no crossing; if they change it once, there is one, which
+is located by bisection on the polynomial of dense output. A step is then taken to end at the crossing, and the last change of
+the time, by Newton's method, is a Taylor step. All other intervals are refined by a factor of eight; conditions that still vary
+have a jump or a kink. If jumps repeat, or a condition is NaN, the run ends unresolved, and the caller continues.
 """
 
 from udkjax.native.base.ir import DOUBLE, INT, Function, Value
@@ -52,7 +52,7 @@ class Watching(WatchMemory):
         return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.rows else {})
 
     def _write_conditions(self):
-        """`conditions(work)`: all that is watched, and its rates, at `state t`, `state q`, `result v` and `node a`."""
+        """Write `conditions(work)`: the conditions and their rates, at `state t`, `state q`, `result v` and `node a`."""
         n, conditions, p = self.n, self.conditions, self.places
         inputs = [("work", p["state t"])]
         for name in ("state q", "result v", "node a"):
@@ -66,7 +66,7 @@ class Watching(WatchMemory):
             self._write_forces(f, s)
 
     def _write_forces(self, f: Function, s: Lane):
-        """The forces of contacts at rest, no numbers where a pivot is not to be trusted, and their rates, by differences."""
+        """Write the forces of contacts at rest, NaN if a pivot is too small, and their rates by differences."""
         self.copy(f, "state q", "force q")
         self.copy(f, "result v", "state v")
         step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
@@ -87,7 +87,7 @@ class Watching(WatchMemory):
         self.copy(f, "force q", "state q")
 
     def _write_look(self):
-        """`look(work)`: the state at the time `look`, projected in lanes that are `due`, and the conditions there."""
+        """Write `look(work)`: the state at the time `look`, projected in lanes that are `due`, and its conditions."""
         program = self.conditions.program
         f, s = self.function("look")
         work, following = f.given["work"], s.next
@@ -101,7 +101,7 @@ class Watching(WatchMemory):
         s.where((s.due > 0.5) & ~(s.violated <= s.worst), worst=s.violated)
 
     def _accelerate_between(self, f: Function, s: Lane):
-        """`node a`: the second derivative of the polynomial at the time `next`."""
+        """Compute `node a`, the second derivative of the polynomial at the time `next`."""
         ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
         with f.each(self.rowcount) as r:
             q, zero = self.vector(f, f"difference{3 * POINTS - 1}", r), f.const(0.0, DOUBLE, self.plan.vector)
@@ -114,7 +114,7 @@ class Watching(WatchMemory):
             self.put(f, "node a", r, a)
 
     def _write_watch(self):
-        """`watch(work)`: look at all nodes behind the steps that were accepted."""
+        """Write `watch(work)`: evaluate all nodes within accepted steps."""
         f, s = self.function("watch")
         work, one = f.given["work"], f.const(1.0, DOUBLE, f.width)
 
@@ -144,6 +144,6 @@ class Watching(WatchMemory):
                 with f.if_(f.any_of(s.seeks > 0.5)):
                     f.call("locate", work)
                 self.stop(f, s)
-                # Outputs before the crossing lie on the polynomial that is still known.
+                # Outputs before the crossing use the current polynomial.
                 wanted = s.landing.is_(float(WANTED))
                 s.where(wanted, until=f.min(s.until, s.sure_t), code=float(Status.RUNNING), node=float("inf"))

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.redundancy import ORDINARY_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
+from udkjax.equations.redundancy import GENERIC_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
 from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.positions.assembly import close, require_closed
@@ -139,7 +139,7 @@ class RedundantLoops:
         if not self.redundant:
             return
         self._drivers = mechanism.driver_names
-        self._positions = [p for p in found if p.smallest > ORDINARY_TOL] or found
+        self._positions = [p for p in found if p.smallest > GENERIC_TOL] or found
         self._names = [name for name, _ in rows.names]
         self._redundant_rows = list(choose_redundant_rows(rows, found))
         self._measure(rows, steps, _length(original))
