@@ -145,7 +145,7 @@ def _far_pins(places: Mapping[str, PointArray]) -> Iterator[str]:
         if distance > FAR_POINT_RATIO * size > 0:
             yield (
                 f"pins.{name}: is {distance:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
-                "is its unit the one that is meant?"
+                "is its unit right?"
             )
 
 
