@@ -16,7 +16,7 @@ def test_diagnose_prints_what_depends_on_what(capsys):
     shown = capsys.readouterr().out
     for words in (
         "Gruebler's count",
-        "A1, A2, A3, B1, B2, B3: 1 redundant row",
+        "A1, A2, A3, B1, B2, B3: 1 redundant constraint",
         "slot along 0 degrees",
         "next rank change on the path",
     ):

@@ -160,11 +160,11 @@ def _mobility(found: Diagnosis) -> list[str]:
 
 def _redundancy(r: Redundancy) -> list[str]:
     when = "in every position" if r.permanent else "in this configuration only"
-    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant row')} {when}"]
+    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant constraint')} {when}"]
     if r.fixes:
         lines[0] += "; any one of these changes removes it:" if r.count == 1 else "; any one of these changes helps:"
     for fix in r.fixes[:MOST_FIXES_SHOWN]:
-        more = f", removes {fix.removes} redundant rows" if fix.removes > 1 and fix.removes > r.count else ""
+        more = f", removes {fix.removes} redundant constraints" if fix.removes > 1 and fix.removes > r.count else ""
         lines.append(f"  {fix.constraint}: {fix.change} (condition number {1 / fix.conditioning:.3g}{more})")
     lines += [f"  ... {len(r.fixes) - MOST_FIXES_SHOWN} more"] if len(r.fixes) > MOST_FIXES_SHOWN else []
     if r.permanent and not r.fixes:
