@@ -57,7 +57,7 @@ class Choices(NamedTuple):
     @property
     def of_mechanism(self) -> tuple[Any, ...]:
         """The arguments of `compile_mechanism` except the mechanism and its analysis."""
-        return (*self[4:10], self.engine)
+        return self.method, self.stabilization, self.formulation, self.solver, self.adjoint, self.meter, self.engine
 
     @property
     def take_diffrax(self) -> bool:

@@ -70,7 +70,7 @@ def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
 
 
 def largest_violation(violated: Float[ArrayLike, "T m"]) -> Float[np.ndarray, " T"]:
-    """Return the largest violation of any constraint at each time (m or rad), from what `udkjax.violation` returns."""
+    """Return the largest violation of any constraint at each time (m or rad), from the result of `udkjax.violation`."""
     return np.abs(np.asarray(violated)).max(axis=1, initial=0.0)
 
 

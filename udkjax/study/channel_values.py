@@ -220,7 +220,7 @@ def _measure_joint(channel: Channel, motion: _Motion) -> Array:
 
 
 def _measure_driver(channel: Channel, motion: _Motion) -> Array:
-    """-lambda: the row of a driver is its coordinate minus what is prescribed."""
+    """Return -lambda: the row of a driver is its coordinate minus the prescribed value."""
     return -motion.dynamics.multipliers[:, motion.dynamics.row_owners.index(channel.owner)]
 
 

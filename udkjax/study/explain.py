@@ -97,26 +97,28 @@ def _symbols(
     }
 
 
-def _gauss(s: dict[str, np.ndarray], rank: int) -> Gauss:
-    root = np.sqrt(s["mass"])
-    deviation = root * (s["a"] - s["a_F"])  # M^(1/2) (a - a_F)
-    free = np.linalg.svd(s["D"])[2][rank:].T if len(s["D"]) else np.eye(len(root))  # M^(1/2) V
+def _gauss(symbols: dict[str, np.ndarray], rank: int) -> Gauss:
+    root = np.sqrt(symbols["mass"])
+    deviation = root * (symbols["a"] - symbols["a_F"])  # M^(1/2) (a - a_F)
+    free = np.linalg.svd(symbols["D"])[2][rank:].T if len(symbols["D"]) else np.eye(len(root))  # M^(1/2) V
     size = float(np.linalg.norm(deviation))
     slope = float(np.abs(free.T @ deviation).max(initial=0.0)) / (size if size > 0 else 1.0)
-    spread = max(size, float(np.linalg.norm(root * s["a_F"])), np.finfo(float).tiny) / 10
+    spread = max(size, float(np.linalg.norm(root * symbols["a_F"])), np.finfo(float).tiny) / 10
     steps = np.random.default_rng(0).standard_normal((N_RIVALS if free.shape[1] else 0, free.shape[1])) * spread
     rivals = 0.5 * np.sum((deviation + steps @ free.T) ** 2, axis=1)
     return Gauss(0.5 * size**2, free.shape[1], slope, float(rivals.min(initial=np.inf)), len(rivals))
 
 
-def _checks(s: dict[str, np.ndarray]) -> dict[str, float]:
+def _checks(symbols: dict[str, np.ndarray]) -> dict[str, float]:
     """Return the residuals of the identities, each relative to its largest term."""
-    inertia, reaction = s["mass"] * s["a"], s["psi_q"].T @ s["multipliers"]
-    required = s["b"] + s["D"] @ (np.sqrt(s["mass"]) * s["a_F"])  # of the rows of D, with Baumgarte's terms
-    D, plus = s["D"], s["D_plus"]
+    inertia, reaction = symbols["mass"] * symbols["a"], symbols["psi_q"].T @ symbols["multipliers"]
+    required = symbols["b"] + symbols["D"] @ (
+        np.sqrt(symbols["mass"]) * symbols["a_F"]
+    )  # of the rows of D, with Baumgarte's terms
+    D, plus = symbols["D"], symbols["D_plus"]
     return {
-        "M a + Psi_q^T lambda - F": _relative(inertia + reaction - s["force"], inertia, reaction, s["force"]),
-        "Psi_q a - gamma": _relative(D @ (np.sqrt(s["mass"]) * s["a"]) - required, required, s["b"]),
+        "M a + Psi_q^T lambda - F": _relative(inertia + reaction - symbols["force"], inertia, reaction, symbols["force"]),
+        "Psi_q a - gamma": _relative(D @ (np.sqrt(symbols["mass"]) * symbols["a"]) - required, required, symbols["b"]),
         "D D^+ D - D": _relative(D @ plus @ D - D, D),
         "D^+ D D^+ - D^+": _relative(plus @ D @ plus - plus, plus),
         "(D D^+)^T - D D^+": _relative((D @ plus).T - D @ plus, np.ones(1)),

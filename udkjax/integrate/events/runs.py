@@ -50,7 +50,8 @@ class EventRun(NamedTuple):
     totals: Int[Any, "*m 4"]  # steps tried, accepted, right-hand sides, projections
 
 
-RECORD = EventRun._fields[3:10]  # of which there is one for each event
+EVENT_STATES = ("event_time", "event_q", "event_v")
+RECORD = (*EVENT_STATES, "event_index", "event_phase", "together", "closed")  # fields of `EventRun` with an entry for each event
 
 
 def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
@@ -115,7 +116,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
     """Return runs before their start, each with its `Result` so far."""
     (B, n), E = state.q.shape, plan.count
     shapes = shapes_of_run(plan, T, n, plan.max_events + 1)._asdict()
-    values = dict.fromkeys(RECORD[:3], np.inf) | {"event_index": -1, "event_phase": -1, "together": False, "closed": 0}
+    values = dict.fromkeys(EVENT_STATES, np.inf) | {"event_index": -1, "event_phase": -1, "together": False, "closed": 0}
     no = xp.zeros((B, E), bool)
     return MemberRuns(
         *state,

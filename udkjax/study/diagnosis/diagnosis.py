@@ -153,8 +153,8 @@ def _mobility(found: Diagnosis) -> list[str]:
         extra = plural(found.rows - found.ordinary_rank, "row")
         lines.append(f"Gruebler's count treats every row as independent, but {extra} can be left out without any effect")
     if found.rows > found.joint_rows:
-        held = plural(found.joint_mobility - found.mobility, "degree")
-        lines.append(f"without drivers: {plural(found.joint_mobility, 'degree')} of freedom; drivers hold {held} of freedom")
+        driven = found.joint_mobility - found.mobility
+        lines.append(f"without drivers: {plural(found.joint_mobility, 'degree')} of freedom, of which drivers control {driven}")
     return lines
 
 

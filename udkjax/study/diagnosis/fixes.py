@@ -101,7 +101,7 @@ def _candidates(
 ) -> list[_ChangesOfConstraint]:
     found, stresses = [], [stress_of(position.left, owners, dependency.constraints) for position in at]
     for name in dependency.constraints:
-        options, own, places = [], _own(owners, name), _places(mechanism, name)
+        options, own, places = [], _rows_of(owners, name), _body_indices(mechanism, name)
         forces = [stress[own] / positions.row_unit[own, None] for stress in stresses]
         for change in changes_of(mechanism, name, at[0], forces[0]):
             removes, conditioning = _effect(own, places, change, at, positions.rank_tol)
@@ -141,11 +141,11 @@ def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechan
         return None
 
 
-def _own(owners: list[str], name: str) -> list[int]:
+def _rows_of(owners: list[str], name: str) -> list[int]:
     return [k for k, owner in enumerate(owners) if owner == name]
 
 
-def _places(mechanism: Mechanism, name: str) -> list[int | None]:
+def _body_indices(mechanism: Mechanism, name: str) -> list[int | None]:
     """Return the indices of a constraint's bodies; None for the ground."""
     bodies = mechanism.frames_of(mechanism.constraints[name])
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]

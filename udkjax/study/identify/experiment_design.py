@@ -119,7 +119,7 @@ def design_experiment(
         IdentificationError: with every mistake.
     """
     experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
-    problems = [] if experiments else ["candidates: there is none"]
+    problems = [] if experiments else ["candidates: the list is empty"]
     if not 1 <= pick <= max(len(experiments), 1):
         problems.append(f"pick must be from 1 to {len(experiments)}, the number of candidates, is {pick}")
     if problems:

@@ -204,7 +204,7 @@ def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
     return pad_times(ts[: last + 1], len(ts))
 
 
-# --- from what users give
+# --- from the arguments of `identify`
 
 
 def build_problem(

@@ -154,13 +154,13 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, 
     before = problem.sigma.copy()
     rows = len(problem.index)
     r = problem.evaluate(z[None], tol).r[0, :rows]
-    left, kept = r * problem.sigma, ~find_outlier_rows(problem, r)
+    residuals, inliers = r * problem.sigma, ~find_outlier_rows(problem, r)
     for c in range(len(problem.channels)):
-        own = (problem.index[:, 2] == c) & ~problem.noise_given & kept
+        own = (problem.index[:, 2] == c) & ~problem.noise_given & inliers
         if own.any():
             # Each channel loses its part of the degrees of freedom to the unknowns.
             freedom = own.sum() * (1.0 - (problem.K - problem.constrained) / rows)
-            size = np.sqrt(left[own] @ left[own] / max(freedom, 1.0))
+            size = np.sqrt(residuals[own] @ residuals[own] / max(freedom, 1.0))
             every = (problem.index[:, 2] == c) & ~problem.noise_given
             problem.sigma[every] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
     ratio = problem.sigma / before
@@ -176,7 +176,7 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
     weighted = loss(plain)
     outlying, robust = find_outlier_rows(problem, plain.r[0, :rows]), loss is not squares
     # Outliers hardly count in a robust loss and are left out here; least squares counts them, and so do standard errors.
-    kept = np.concatenate([~outlying | (not robust), np.ones(problem.extra_rows, bool)])
+    inliers = np.concatenate([~outlying | (not robust), np.ones(problem.extra_rows, bool)])
     groups = problem.noise_groups()
     values = UnknownValues(
         problem.all_names,
@@ -185,26 +185,26 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
         np.concatenate([unknowns.dx_dz(z[:P]), problem.state_sizes]),
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
-    J, r = weighted.J[0][kept], weighted.r[0][kept]
-    uncertainty = estimate_uncertainty(J, r, values, groups[kept], P, len(problem.priors))
+    J, r = weighted.J[0][inliers], weighted.r[0][inliers]
+    uncertainty = estimate_uncertainty(J, r, values, groups[inliers], P, len(problem.priors))
     scale = np.append(uncertainty.noise, 1.0)[groups]
-    projection = np.zeros((len(kept), uncertainty.projection.shape[1]))
-    projection[kept] = uncertainty.projection
-    left = -plain.r[0, :rows] * problem.sigma
-    sigma, seen = problem.sigma * scale[:rows], weighted.r[0, :rows]
+    projection = np.zeros((len(inliers), uncertainty.projection.shape[1]))
+    projection[inliers] = uncertainty.projection
+    residual = -plain.r[0, :rows] * problem.sigma
+    sigma, whitened = problem.sigma * scale[:rows], weighted.r[0, :rows]
     if outlying.any():
         others = _residuals_of_others(problem, plain, outlying)
         for g in np.unique(groups[:rows][outlying & (groups[:rows] >= 0)]):
             own = groups[:rows] == g
-            sigma[own] = problem.sigma[own] * np.sqrt(np.nanmean(others[own] ** 2) / (1.0 - problem.K / kept.sum()))
-        seen = others
+            sigma[own] = problem.sigma[own] * np.sqrt(np.nanmean(others[own] ** 2) / (1.0 - problem.K / inliers.sum()))
+        whitened = others
     white: dict[tuple[int, str], Whiteness] = {}
     for places in problem.series():
         record, _, channel = problem.index[places[0]]
-        if np.abs(left[places]).max() > INTEGRATION_ERROR * problem.channel_scale[channel]:
+        if np.abs(residual[places]).max() > INTEGRATION_ERROR * problem.channel_scale[channel]:
             times = problem.ts[record, problem.index[places, 1]]
             white[int(record), problem.channel_names[channel]] = whiteness_of(
-                times, (seen / scale[:rows])[places], projection[places]
+                times, (whitened / scale[:rows])[places], projection[places]
             )
     names = [name for state in problem.initial_states for name in state.names]
     return Estimate(
@@ -214,10 +214,10 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
         uncertainty=uncertainty,
         at_bounds=unknowns.at_bounds(x),
         initial_state_values=dict(zip(names, zip(states.tolist(), uncertainty.state_errors.tolist(), strict=True), strict=False)),
-        predicted=problem.by_record(problem.y[problem.present] - left),
-        residuals=problem.by_record(left),
+        predicted=problem.by_record(problem.y[problem.present] - residual),
+        residuals=problem.by_record(residual),
         noise=problem.by_record(sigma),
-        outliers=list_outliers(problem, outlying, left, sigma),
+        outliers=list_outliers(problem, outlying, residual, sigma),
         whiteness=white,
         converged=fit.converged,
         agreeing=found.agreeing,
@@ -235,6 +235,6 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
 
 def _residuals_of_others(problem: FitProblem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
     """Return the residuals of a fit without the outliers, to first order; NaN at the outliers."""
-    r, J, kept = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
-    left = r - J @ np.linalg.lstsq(J[kept], r[kept], rcond=INVISIBLE_RATIO)[0]
-    return np.where(outlying, np.nan, left[: len(outlying)])
+    r, J, inliers = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
+    residuals = r - J @ np.linalg.lstsq(J[inliers], r[inliers], rcond=INVISIBLE_RATIO)[0]
+    return np.where(outlying, np.nan, residuals[: len(outlying)])

@@ -181,7 +181,7 @@ def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
     return any(rule in metadata.get("require", ()) for rule in bounds)
 
 
-# --- what a parameter refers to
+# --- numbers that a parameter refers to
 
 
 def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:

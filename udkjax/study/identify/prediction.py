@@ -146,7 +146,6 @@ class _MemberRun:
 
 @lru_cache(maxsize=MOST_PROGRAMS)
 def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Program:
-    """Return the program for members with inputs of these shapes."""
     del shapes
     return Program(run, slopes, piece)
 

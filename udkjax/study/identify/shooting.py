@@ -134,7 +134,6 @@ class MultipleShooting(FitProblem):
         return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
 
     def _predict_piece(self, p: int, x: np.ndarray, shift: Float[np.ndarray, "B S"], tol: TolerancePair) -> Prediction:
-        """Predict a piece with parameters x from B initial states."""
         return self.predictor(self.members_of(np.full(len(shift), p), np.tile(x, (len(shift), 1)), shift), tol)
 
     def _residuals_of_piece(self, p: int, x: np.ndarray, tol: TolerancePair) -> Objective:

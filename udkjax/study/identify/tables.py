@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # imported only if one of their tables is given
 TableData: TypeAlias = "ByChannel[ArrayLike] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
 TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and the suffix of a channel's noise
 _DELIMITERS = (";", "\t", ",")
-# Coordinates of what `Solution.to_xarray` writes, as channels of bodies.
+# Coordinates in files written by `Solution.to_xarray`, as channels of bodies.
 _STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
 
 

@@ -142,18 +142,20 @@ class Dimension:
 
 def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
     """Return readable, unique names of choices: their types, with their numbers if the types are equal."""
-    plain = [_plain(setting, choice) for choice in choices]
-    names = [name if plain.count(name) == 1 else _full(name, choice) for name, choice in zip(plain, choices, strict=True)]
+    plain = [_short_label(setting, choice) for choice in choices]
+    names = [
+        name if plain.count(name) == 1 else _label_with_numbers(name, choice) for name, choice in zip(plain, choices, strict=True)
+    ]
     return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
 
 
-def _plain(setting: str, choice: AxisChoice) -> str:
+def _short_label(setting: str, choice: AxisChoice) -> str:
     if choice is None:
         return CHOICES[setting]
     return choice.name if isinstance(choice, Mechanism) else str(choice) if isinstance(choice, int) else type(choice).__name__
 
 
-def _full(name: str, choice: AxisChoice) -> str:
+def _label_with_numbers(name: str, choice: AxisChoice) -> str:
     """Return the name of a choice with its scalar fields."""
     numbers = {key: value for key, value in getattr(choice, "__dict__", {}).items() if eqx.is_array(value) and value.ndim == 0}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name

@@ -40,14 +40,14 @@ def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
     for name, info in outputs.items():
         if name in slopes:
             of, by = slopes[name]
-            label = Label(found[of].dims, _per(found[of].units, by, plan), f"derivative of {of} by {by}")
+            label = Label(found[of].dims, _derivative_unit(found[of].units, by, plan), f"derivative of {of} by {by}")
         else:
             label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
         found[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
     return found
 
 
-def _per(units: str, by: str, plan: SweepPlan) -> str:
+def _derivative_unit(units: str, by: str, plan: SweepPlan) -> str:
     """Return the unit of a derivative; empty if it is unknown."""
     below = next((column.units for column in plan.columns if column.name == by), None)
     below = units_of(plan.mechanism, by) if below is None else below
@@ -85,12 +85,12 @@ def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Map
     import xarray
 
     variables = variables_of(plan)
-    places = _places(plan)
+    places = _body_places(plan)
     flat = {name: np.full((plan.size, *v.shape), _fill_value(name, v), v.dtype) for name, v in variables.items()}
     for members, data in finished:
         group = plan.groups[plan.group_of(int(members[0]))]
         for name, values in data.items():
-            _put(flat[name], variables[name], members, values, places.get(group.index))
+            _write_members(flat[name], variables[name], members, values, places.get(group.index))
     dims = tuple(dimension.name for dimension in plan.dimensions)
     found = {
         name: ((*dims, *v.dims), flat[name].reshape(*plan.shape, *v.shape), {"units": v.units, "long_name": v.long_name})
@@ -112,7 +112,7 @@ def _fill_value(name: str, variable: StoredVariable) -> float | int | bool:
     return np.nan if variable.dtype.kind in "fc" else False if variable.dtype.kind == "b" else -1
 
 
-def _put(
+def _write_members(
     into: np.ndarray, variable: StoredVariable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None
 ) -> None:
     """Write the values of members; values of bodies go to their places among all bodies."""
@@ -124,7 +124,7 @@ def _put(
         into[(members, *(slice(n) for n in values.shape[1:]))] = values
 
 
-def _places(plan: SweepPlan) -> dict[int, list[int]]:
+def _body_places(plan: SweepPlan) -> dict[int, list[int]]:
     """Return the places of a group's bodies among all bodies, for groups that do not have all of them."""
     everyone = list(plan.bodies)
     own = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}

@@ -183,7 +183,7 @@ def _message(
     failures: Mapping[str, int], slowest: tuple[int, int] | None = None, slowest_chunk: tuple[int, float] | None = None
 ) -> str:
     failed = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failures.items())
-    parts = [f"failed: {failed}" if failed else "none failed"]
+    parts = [f"failed: {failed}" if failed else "no failures"]
     parts += [] if slowest_chunk is None else ["slowest chunk {}: {:.1f} s".format(*slowest_chunk)]
     parts += [] if slowest is None else ["slowest member {}: {} steps".format(*slowest)]
     return "; ".join(parts)
