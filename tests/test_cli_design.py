@@ -1,4 +1,4 @@
-"""`udkjax design`: goals in files, what it writes, and what it says about mistakes."""
+"""`udkjax design`: goals in files, written files, and messages about mistakes."""
 
 import json
 from pathlib import Path

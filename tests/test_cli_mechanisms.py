@@ -1,4 +1,4 @@
-"""The commands that ask what a mechanism does: each against what the functions return, as JSON and as a file."""
+"""Commands about a mechanism, each against the results of the functions, as JSON and as a file."""
 
 import csv
 import json
@@ -191,7 +191,7 @@ def test_inverse_and_simulate_draw_what_they_find(tmp_path, capsys):
 
 
 def test_kinematics_says_what_the_links_do(tmp_path, capsys):
-    """Of a crank of 50 and a ground of 100 between arms of 125, by hand; and what still moves where positions do not follow."""
+    """A crank of 50 and a ground of 100 between arms of 125, by hand; and a mechanism whose positions are undetermined."""
     hoeken = """
 format = 2
 units = {length = "mm"}

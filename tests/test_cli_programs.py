@@ -1,4 +1,4 @@
-"""Where commands let JAX store what it compiles."""
+"""Folders in which commands let JAX store compiled programs."""
 
 import os
 import sys

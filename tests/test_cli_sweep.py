@@ -47,7 +47,7 @@ def test_a_sweep_is_run_and_refused_where_it_is_another(tmp_path, grid, capsys):
     assert {"result.png", "end_time.png"} <= pictures and "q_end.png" not in pictures
     assert json.loads((out / "sweep.json").read_text())["settings"]["max_steps"] == 5
 
-    assert udkjax("sweep", PENDULUM, grid, "--out", out, "--quiet", "--json") == 0  # from what is there
+    assert udkjax("sweep", PENDULUM, grid, "--out", out, "--quiet", "--json") == 0  # continues from the files
     found = json.loads(capsys.readouterr().out)
     assert found["results"] == {"successful": 9 - failed, "step_limit": failed} and found["members"] == 9
     assert found["ranges"]["end_time"]["largest"] == 0.5 and "sweep.nc" in found["files"]

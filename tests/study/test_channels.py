@@ -1,4 +1,4 @@
-"""Channels by name, and what is measured of a motion."""
+"""Channels by name, and their values along a motion."""
 
 import pickle
 import re
@@ -22,7 +22,7 @@ DISTANCES = ["distance.ground(0, 0.5).slider(0, 0)", "distance.crank(0.25, 0).sl
 
 
 class Motion(NamedTuple):
-    """The states of a motion, as a solution has them."""
+    """The states of a motion, with the fields of a solution."""
 
     ts: Any
     q: Any
@@ -30,7 +30,7 @@ class Motion(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """A driven slider-crank, its exact motion, and what is measured of it, (T,) by channel."""
+    """A driven slider-crank, its exact motion, and its channels' values, (T,) by name."""
 
     mechanism: udk.Mechanism
     motion: Motion

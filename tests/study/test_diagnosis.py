@@ -1,4 +1,4 @@
-"""Freedoms, redundancy, branches and rank changes, against closed forms, exact arithmetic and Jacobians written by hand."""
+"""Mobility, redundancy, branches and rank changes, against closed forms, exact arithmetic and Jacobians written by hand."""
 
 import json
 from fractions import Fraction
@@ -145,7 +145,7 @@ def test_in_line_the_paper_s_linkage_has_one_branch_and_two_mobilities():
 
 
 def test_branches_of_square_four_bars_in_line():
-    """a (b - a) = 0 of each: of one the parallelogram (1, 1) and the fold (0, 1); of two (1, 1, 1), (0, 1, 1) and (0, 0, 1)."""
+    """a (b - a) = 0 for each: one has the parallelogram (1, 1) and fold (0, 1); two have (1, 1, 1), (0, 1, 1) and (0, 0, 1)."""
     one = udk.diagnose(udk.library.n_four_bar(1, 0.0))
     assert {tuple(np.round(b.tangent[:2, 2] / b.tangent[1, 2], 6)) for b in one.branches} == {(1.0, 1.0), (0.0, 1.0)}
     assert all(branch.followed for branch in one.branches)
@@ -172,7 +172,7 @@ def test_a_duplicated_joint_is_removed():
 
 
 def test_a_double_parallelogram_in_exact_arithmetic():
-    """Of each stage its own six pins: rank 22, by elimination in rational numbers at 3-4-5; and so each set without a pin."""
+    """Each stage has its own six pins: rank 22, by rational elimination at 3-4-5; also for each set without a pin."""
     mechanism = double_parallelogram()
     rotations = {n: (COS, SIN) if n.startswith("link") else (Fraction(1), Fraction(0)) for n in mechanism.body_names}
     exact = exact_jacobian(mechanism, rotations)
@@ -250,7 +250,7 @@ def test_a_shaky_structure_moves_to_first_order_only():
 
 
 def test_drivers_that_ask_for_the_same_are_found():
-    """Two motors that turn one crank: either of them is enough; and what drivers hold is said."""
+    """Two motors that turn one crank: either of them is enough; and the degrees of freedom that drivers control are printed."""
     plain = udk.library.slider_crank(0.7)
     mechanism = udk.Mechanism(plain.bodies, plain.joints, {**plain.drivers, "second": plain.drivers["motor"]})
     found = udk.diagnose(mechanism, walk=False)

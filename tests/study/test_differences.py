@@ -20,7 +20,7 @@ def ladder(function):
 
 
 def chosen(found):
-    """The size of what differences at the best step are off by, in each series, and the errors predicted there."""
+    """Return the actual errors of differences at the best step, in each series, and the predicted ones."""
     errors = found.noise + found.truncation
     best = np.nanargmin(errors, axis=0)
     off = np.array([sizes(found.values[k] - SLOPE, SERIES)[s] for s, k in enumerate(best)])
@@ -36,7 +36,7 @@ def test_of_a_smooth_function_they_are_as_exact_as_rounding_lets_them_be():
 @pytest.mark.parametrize("level", [1e-12, 1e-8, 1e-4])
 @pytest.mark.parametrize("kind", ["jumping", "moving"])
 def test_noise_is_told_before_they_are_compared(level, kind):
-    """Errors that are other ones at each step, as where step control decides otherwise; and such as move with the parameter."""
+    """Errors that differ at each step, as from a step controller; and errors that vary with the parameter."""
     random = np.random.default_rng(0)
     errors = level * random.standard_normal((len(DIFFERENCE_STEPS), 2, len(TS)))
     if kind == "moving":

@@ -1,4 +1,4 @@
-"""What drivers must exert, against closed forms, power and forward dynamics."""
+"""Efforts of drivers, against closed forms, power and forward dynamics."""
 
 import jax
 import jax.numpy as jnp

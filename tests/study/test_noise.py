@@ -1,4 +1,4 @@
-"""The test for white noise: how often it is right, and what it notices."""
+"""The test for white noise: its error rate, and its power."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ SEEDS = 300
 
 
 def left(kind, samples, unknowns, correlation, seed):
-    """Times, residuals of a fit of cosines to noise, and what the fit took away. `correlation` is that of regular neighbours."""
+    """Times, residuals of a fit of cosines to noise, and the fit's projection. `correlation` is that of neighbours."""
     random = np.random.default_rng(seed)
     t = np.sort(random.uniform(0.0, 10.0, samples)) if kind == "irregular" else np.linspace(0.0, 10.0, samples)
     if kind == "gaps":

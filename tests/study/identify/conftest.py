@@ -1,4 +1,4 @@
-"""A pendulum with a damped torsion spring, and what was measured of it: one compiled program for all who look at it."""
+"""A pendulum with a damped torsion spring, and measurements of it: all tests share one compiled program."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tables and texts of an estimate that is made up; what an identification writes is tested with the command line."""
+"""Tables and texts of an artificial estimate; the files of an identification are tested with the command line."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -46,7 +46,7 @@ def test_records_without_a_name_of_their_own_are_numbered():
 
 @pytest.fixture
 def estimate() -> Estimate:
-    """Four parameters, of which one does not show, and two only together; and a start."""
+    """Four parameters, one undetermined and two determined only together; and an initial state."""
     names = ("a", "b", "c", "d")
     channels = [SimpleNamespace(name=f"y{k}", units="rad") for k in range(8)]
     index = np.array([[0, t, c] for t in range(5) for c in range(8)])

@@ -1,4 +1,4 @@
-"""Experiments are ranked by what they tell: as differences say, and as everybody knows of pendulums."""
+"""Ranking of experiments, against differences and well-known properties of pendulums."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ def test_other_criteria(candidates, criterion):
 
 
 def test_parameters_that_do_not_matter(candidates, design):
-    """What is not asked for is eliminated: errors stay as they are, and the score is that of one parameter."""
+    """Nuisance parameters are eliminated: errors stay the same, and the score is that of one parameter."""
     found = design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=NAMES[:1])
     assert found.names == NAMES[:1]
     assert found.standard_errors[1:, 0] == pytest.approx(design.standard_errors[1:, 0], rel=1e-6)
@@ -104,7 +104,7 @@ def test_what_a_prior_tells_counts(candidates):
 
 
 def test_an_estimate_counts_as_made(candidates):
-    """Its records add their information: with the standard errors that it tells, a candidate that says nothing changes none."""
+    """Its records add their information: a candidate without information leaves its standard errors unchanged."""
     q = prediction(1 / 12, 0.1, ANGLES[1], 0.0) + NOISE * np.random.default_rng(0).standard_normal(len(TS))
     data = udk.Record(TS, {CHANNEL: q}, NOISE, released(ANGLES[1]), conditions={AMPLITUDE: 0.0})
     estimate = udk.identify(scene(), data, NAMES, progress=False)

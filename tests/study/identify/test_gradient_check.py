@@ -1,4 +1,4 @@
-"""Derivatives against differences: those that are right agree at any tolerance, wrong ones are found, with their place."""
+"""Derivatives against differences: right ones agree at any tolerance, wrong ones are found, with their place."""
 
 import jax
 import numpy as np
@@ -65,7 +65,7 @@ def test_a_table_says_it(measured):
 
 
 def wrong(by, value=lambda x: x):
-    """A function that has another derivative than it should have."""
+    """A function with a wrong derivative."""
     function = jax.custom_jvp(value)
 
     @function.defjvp
@@ -121,7 +121,7 @@ def test_wrong_derivatives_are_found(wrong_problem):
 
 
 def test_what_is_wrong_is_told_with_its_place(wrong_problem, monkeypatch):
-    """Of the series that agrees worst: here of two."""
+    """The place is that of the series with the worst agreement, here of two."""
     series = wrong_problem.series()[:2]
     monkeypatch.setattr(wrong_problem, "series", lambda: series)
     check = compare_gradients(wrong_problem, np.zeros(2), (1e-11, 1e-11))
@@ -187,8 +187,8 @@ def test_mistakes_are_those_of_an_identification():
 def test_redundant_linkages_and_singular_configurations(angle):
     """From pi/3 the parallelogram passes through the configuration where it could change over to its other branch.
 
-    From pi/3 itself an output lies 2e-5 rad beside it, where derivatives through its projection lose a digit. From there on to
-    0.03 rad beside it, tighter tolerances gain nothing below some 1e-5: 2e-6 to 1.3e-5 were seen at 1e-11.
+    From pi/3 itself an output lies 2e-5 rad from it, where derivatives through its projection lose a digit. From there on to
+    0.03 rad from it, tighter tolerances gain nothing below some 1e-5: 2e-6 to 1.3e-5 were seen at 1e-11.
     """
     least = 3e-5 if angle > 0.0 else 0.0
     ts = np.linspace(0.0, 5.0, 101)
@@ -201,7 +201,7 @@ def test_redundant_linkages_and_singular_configurations(angle):
 
 @pytest.mark.slow
 def test_along_chaotic_motion_nothing_is_claimed_but_of_pieces():
-    """Derivatives of 1e8: what differs in the ninth digit ends elsewhere. A piece of it is as tame as any other motion."""
+    """Derivatives are 1e8: a change in the ninth digit leads to another motion. A piece is as regular as any other motion."""
     mech, tol = udk.library.double_pendulum(), (1e-11, 1e-11)
     for end, ok in ((3.0, True), (20.0, False)):
         ts = np.linspace(0.0, end, 200)

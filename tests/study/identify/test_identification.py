@@ -1,4 +1,4 @@
-"""Parameters found from records: exactly without noise, within their errors with it, and not at all where nobody can."""
+"""Parameters from records: exact without noise, within their errors with it, and undetermined where they must be."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_values_are_found_again(measured, factors):
 
 
 def test_a_long_record_from_far_away():
-    """Twenty swings: from twice the inertia the guess falls many of them behind, and a fit of the whole record loses its way."""
+    """Twenty swings: with twice the inertia the guess lags by many of them, and a fit of the whole record fails."""
     ts = np.linspace(0.0, 40.0, len(TS))
     truth = pendulum(damping=0.005)
     data = {"time": ts, ANGLE: swing(truth, ts)}
@@ -98,7 +98,7 @@ def test_wrong_numbers_count_less(measured, loss, noise):
 
 
 def test_one_wrong_number_is_named_and_is_no_noise(measured):
-    """Of two records, one begins before its first sample; squares count the wrong number, and say so."""
+    """One of two records begins before its first sample; least squares counts the outlier, and reports it."""
     sigma, rng = 0.003, np.random.default_rng(7)
     angles = {first: measured[1][first:] + sigma * rng.standard_normal(len(TS) - first) for first in (0, 3)}
 
@@ -141,7 +141,7 @@ def test_a_prior_counts_as_one_more_measurement(measured):
 
 
 def test_a_common_factor_of_masses_is_not_known(measured):
-    """Of a pendulum without a spring the motion shows the ratio of mass and inertia, and the force on its pin the mass."""
+    """The motion of a pendulum without a spring determines the ratio of mass and inertia, the force on its pin the mass."""
     mech = udk.library.compound_pendulum()
     ts = np.linspace(0.0, 3.0, 40)
     solution = udk.simulate(mech, ts, rtol=1e-12, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Records of many swings, from first guesses that are off by a factor: found wherever the data tell the answer."""
+"""Records of many swings, from first guesses wrong by a factor: found if the data determine the answer."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_noise_is_seen_before_anything_is_fitted():
 
 
 def test_a_record_grows_as_far_as_it_is_predicted():
-    """Twenty swings, twice the inertia and a degree of noise: a few parts, each many times as long as the one before."""
+    """Twenty swings, twice the inertia and a degree of noise: a few parts, each many times as long as the previous one."""
     truth, ts = pendulum(damping=0.005), np.linspace(0.0, 40.0, len(TS))
     angle = swing(truth, ts) + 0.02 * np.random.default_rng(1).standard_normal(len(ts))
     first = pendulum(0.75, 0.01)
@@ -40,7 +40,7 @@ def test_a_record_grows_as_far_as_it_is_predicted():
 
 
 def test_a_record_that_begins_late():
-    """The motion began several swings before the first sample: guesses beside the first are ranked and tried."""
+    """The motion began several swings before the first sample: further guesses are ranked and tried."""
     truth, ts = pendulum(damping=0.02), np.linspace(10.0, 20.0, len(TS) - 1)
     angle = swing(truth, np.append(0.0, ts))[1:] + 0.01 * np.random.default_rng(2).standard_normal(len(ts))
     estimate = identify(pendulum(0.2, 0.04), Record(ts, {ANGLE: angle}, t0=0.0), NAMES, progress=False)
@@ -72,7 +72,7 @@ def test_noise_that_is_given_is_taken():
 def test_two_hundred_pendulums():
     """A pendulum at 20 Hz for 25 s, 14 swings, with a degree of noise; guesses are off by up to a factor of two.
 
-    A fit has arrived where the noise that it leaves is that which was added, and both values are within five standard errors.
+    A fit is right if its residuals are the added noise, and both values are within five standard errors.
     """
     names, truth, sigma = ("joint.pin.points[1][1]", "force.d.damping"), np.array([0.75, 0.09 * 0.75**2]), np.radians(1.0)
     angle, ts = np.radians(55.0), np.arange(0.0, 25.001, 0.05)

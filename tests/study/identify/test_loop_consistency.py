@@ -1,4 +1,4 @@
-"""Which parameters of overconstrained mechanisms may move."""
+"""Parameters of overconstrained mechanisms that may vary."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +27,7 @@ def numbers(*names):
 
 
 def asked(mechanism, *names):
-    """What is wrong with moving some numbers of a scene."""
+    """Return the problems of varying some numbers of a scene."""
     return loop_problems(mechanism, numbers(*names), [entry(mechanism.parameters(), name) for name in names], names)
 
 
@@ -44,7 +44,7 @@ CHOICES = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3
 
 @pytest.fixture(scope="module")
 def problems(linkage):
-    """What is wrong with three free cranks, and with three that are tied."""
+    """Return the problems of three free cranks, and of three tied ones."""
     return [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(CHOICES, (3, 1), strict=True)]
 
 
@@ -175,7 +175,7 @@ def test_bars_of_a_scissor_lift_stay_equal_in_pairs():
 
 
 def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
-    """Four-bars in a row have rows that depend on each other in singular configurations alone: nothing is looked at."""
+    """Four-bars in a row have dependent rows in singular configurations only: nothing is checked."""
     bars = udk.library.n_four_bar(3)
     assert udk.analyse(bars).redundant_rows == ()
     apply = lengths("link0", "link1", "coupler2")
@@ -184,7 +184,7 @@ def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
 
 
 def test_loops_side_by_side_are_told_apart(linkage):
-    """Of two linkages in one scene, each has its own tie, and names its own joints."""
+    """Two linkages in one scene have their own ties, and name their own joints."""
     bodies, joints = {}, {}
     for k in (0, 1):
         bodies |= {f"{name}/{k}": body for name, body in linkage.bodies.items()}

@@ -50,7 +50,7 @@ def test_optimizers_end_where_least_squares_do(noisy, optimizer, step_tol, withi
 
 
 def test_a_loss_of_the_users_own(noisy):
-    """Absolute residuals, rounded off at zero, are not moved by what is a hundred standard deviations wrong; squares are."""
+    """Smoothed absolute residuals are insensitive to an outlier of a hundred standard deviations; squares are not."""
     noisy = noisy.copy()
     noisy[5::10] += 0.1
     problem = problem_of(noisy)

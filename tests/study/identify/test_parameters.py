@@ -1,4 +1,4 @@
-"""What a parameter is of, the text of it, and the values that it may take."""
+"""Targets, texts and allowed values of parameters."""
 
 import jax.numpy as jnp
 import numpy as np

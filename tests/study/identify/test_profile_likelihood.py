@@ -1,4 +1,4 @@
-"""Profile likelihoods, against linear regression and curves that are known."""
+"""Profile likelihoods, against linear regression and known curves."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likeli
 
 
 def linear(J, r0):
-    """Fits of r = r0 + J z with one unknown held, and how many were made."""
+    """Fits of r = r0 + J z with one unknown fixed, and their number."""
     count = []
 
     def fit(index, held, z0):
@@ -67,7 +67,7 @@ def test_other_levels_and_noise_that_was_estimated(regression):
 
 
 def test_a_flat_direction_is_open():
-    """Two unknowns of which their sum is known: whatever one is, the other makes up for it."""
+    """Two unknowns of which only the sum is determined: each compensates for the other."""
     J = np.array([[1.0, 1.0], [2.0, 2.0]])
     fit, count = linear(J, np.array([0.1, -0.05]))
     found = trace_profile(fit, 0, np.zeros(2), 0.00625, 1.0, value=lambda z: 3.0 * np.exp(z), name="a", units="kg")
@@ -79,7 +79,7 @@ def test_a_flat_direction_is_open():
 
 
 def test_one_end_may_be_open():
-    """A friction that is hardly there: in its logarithm the curve falls off to a level below the quantile."""
+    """A very small friction: in its logarithm the curve falls off to a level below the quantile."""
     found = trace_profile(
         curve(lambda z: 1.0 * (np.exp(z) - 1.0) ** 2), 0, np.zeros(1), 0.0, 0.5, value=np.exp, name="b", units="N s/m"
     )
@@ -134,7 +134,7 @@ OFFSET, SCALE = np.array([2.0, -1.0]), np.array([0.5, 3.0])
 
 
 class Linear:
-    """r = r0 + J z; the last unknown is that of a start."""
+    """r = r0 + J z; the last unknown is that of an initial state."""
 
     def __init__(self, K: int = 3):
         random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Measurements from files, mappings, pandas and xarray: one reading for all, every mistake told."""
+"""Measurements from files, mappings, pandas and xarray: the same records from all, and every mistake reported."""
 
 import math
 
@@ -35,14 +35,14 @@ def file(tmp_path):
 
 
 def problems(mech, data, **settings) -> list[str]:
-    """What is wrong with data."""
+    """Return the mistakes in data."""
     with pytest.raises(IdentificationError) as error:
         records_of(mech, data, **settings)
     return error.value.problems
 
 
 def sigma(record: Record, channel: str | Quantity) -> np.ndarray:
-    """The standard deviation of a channel, which is known."""
+    """Return the given standard deviation of a channel."""
     found = record.noise[channel]
     assert found is not None
     return found

@@ -1,4 +1,4 @@
-"""Records: what a table of measurements must be."""
+"""Requirements on records."""
 
 import numpy as np
 import pytest

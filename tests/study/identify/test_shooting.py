@@ -1,4 +1,4 @@
-"""Records in pieces: exact derivatives, the fit of whole records where that exists, and a fit of chaos where it does not."""
+"""Records in pieces: exact derivatives, the fit of whole records if there is one, and otherwise a fit of chaotic motion."""
 
 from itertools import pairwise
 
@@ -54,7 +54,7 @@ def test_derivatives(pieces):
 
 
 def test_a_first_guess_follows_what_was_measured(pieces):
-    """With an inertia that is a third too large, each piece begins beside where the motion was then."""
+    """With an inertia a third too large, each piece begins near the measured motion."""
     found = pieces.evaluate(pieces.guess[None], TOL)
     assert np.sqrt(np.mean(found.r[0, : len(TS)] ** 2)) < 30.0  # 0.03 rad of 1.2
     assert 1e-3 < pieces.gaps(pieces.guess[None], TOL)[0] < 1.0
@@ -85,7 +85,7 @@ def test_an_unknown_strategy_is_refused(problem):
 
 @pytest.mark.slow
 def test_chaos():
-    """A double pendulum for 25 s, in which errors grow by 1e12: no whole run stays with what was measured, however exact."""
+    """A double pendulum for 25 s, in which errors grow by 1e12: no whole run follows the measurements, however exact."""
     noise, ts = 0.01, np.linspace(0.0, 25.0, 501)
     truth = udk.library.double_pendulum(angles=(np.pi / 2, 0.0))
     names = ("body.lower.mass", "length(upper)", "joint.elbow.points[1][0]")

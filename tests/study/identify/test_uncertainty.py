@@ -1,4 +1,4 @@
-"""What residuals and their Jacobian say of the unknowns, against linear regression."""
+"""Uncertainty from residuals and their Jacobian, against linear regression."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def positive(*names, x=None, units="kg"):
 
 
 def problem(R=60, K=3, seed=0, noise=1.0):
-    """A regression at its minimum: the Jacobian, and the residuals that are left of white noise."""
+    """A regression at its minimum: the Jacobian, and residuals of white noise."""
     random = RNG(seed)
     J = random.standard_normal((R, K)) * 10.0 ** random.uniform(0.0, 1.0, K)
     e = noise * random.standard_normal(R)
@@ -53,7 +53,7 @@ def test_exact_data_have_no_noise():
 
 
 def test_each_group_has_its_own_noise_and_priors_have_theirs():
-    """Two channels, one five times as noisy, and a prior: estimates agree with the noise there is, on average without bias."""
+    """Two channels, one five times as noisy, and a prior: estimates of the noise are unbiased."""
     random, found = RNG(1), []
     J = random.standard_normal((80, 4))
     group = np.repeat([0, 1, -1], [30, 50, 1])
@@ -70,7 +70,7 @@ def test_each_group_has_its_own_noise_and_priors_have_theirs():
 
 
 def test_errors_are_as_large_as_the_standard_errors_say():
-    """Of estimates from 400 measurements, 95 % are within 1.96 standard errors."""
+    """95 % of estimates from 400 measurements are within 1.96 standard errors."""
     random, hits = RNG(2), 0
     J, _ = problem(R=40, K=2, seed=2)
     for _ in range(400):
@@ -91,7 +91,7 @@ def test_unknowns_of_starts_are_eliminated():
 
 
 def test_a_common_factor_is_found_and_said():
-    """J (1, 1, 0) = 0 up to the errors of derivatives: of two masses their ratio is known; the third is as if one were fixed."""
+    """J (1, 1, 0) = 0 up to the errors of derivatives: only the ratio of two masses is determined."""
     J, r = problem()
     J[:, 1] = -J[:, 0] + 1e-9 * RNG(3).standard_normal(60)
     known = estimate_uncertainty(J, r, positive("body.link1.mass", "body.coupler.mass", "c", x=[1.0, 4.0, 2.0]))

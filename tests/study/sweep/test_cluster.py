@@ -113,7 +113,7 @@ def test_workers_with_other_versions_are_refused(client, monkeypatch):
 
 @pytest.mark.slow
 def test_a_chunk_that_kills_its_workers_is_named():
-    """In processes of their own, whose deaths the scheduler forgives less often here."""
+    """In separate processes, with a scheduler that tolerates fewer deaths."""
 
     class Deadly:
         @property

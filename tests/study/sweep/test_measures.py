@@ -1,4 +1,4 @@
-"""What is kept of a member, and its derivatives."""
+"""Stored variables of a member, and their derivatives."""
 
 import pickle
 

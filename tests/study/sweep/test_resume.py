@@ -1,4 +1,4 @@
-"""Sweeps that are interrupted go on where they stopped, and give what an uninterrupted one gives, bit by bit."""
+"""Interrupted sweeps continue where they stopped, with results identical to the last bit."""
 
 import errno
 import os
@@ -30,7 +30,7 @@ def sweep(inertia: Any = None, **choices: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def whole() -> Any:
-    """What the sweep gives when nothing happens to it."""
+    """The result of the uninterrupted sweep."""
     return sweep()
 
 

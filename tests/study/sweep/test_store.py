@@ -1,4 +1,4 @@
-"""What a sweep has written: whole, never twice, never mixed with another sweep."""
+"""Files of a sweep are complete, written once, and never mixed with those of another sweep."""
 
 import json
 import os

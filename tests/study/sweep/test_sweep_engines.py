@@ -117,7 +117,7 @@ def spread():
 
 @pytest.mark.slow
 def test_a_sweep_takes_what_a_plain_batch_takes(spread):
-    """A sweep assembles each member, and so does the plain batch, which is given no states: that takes twice what the runs do."""
+    """A sweep assembles each member, and so does the plain batch, which is given no states: in twice the time."""
     group, members = group_run(spread, 0), members_to_compute(spread)[0]
     chunks = [Chunk(k, 0, members[at : at + 512], 1.0) for k, at in enumerate(range(0, len(members), 512))]
     numbers = group.own(members)
@@ -163,7 +163,7 @@ def test_mechanisms_with_other_bodies_states_and_formulations_beside_each_other(
 
 
 def test_methods_gains_tolerances_and_thresholds_are_one_program(compilations):
-    """Five pseudoinverses, by a number of one program, with all that else differs: each member as by itself."""
+    """Five pseudoinverses, by a number of one program, with all other varied numbers: each member equals a separate run."""
     linkage, ts = udk.library.parallelogram(), np.linspace(0.0, 0.5, 3)
     methods = [udk.SVD(1e-3), udk.Varga(1e-3), udk.Greville(1e-3), udk.Householder(1e-3), udk.GramSchmidt(1e-3)]
     axes = {

@@ -1,4 +1,4 @@
-"""What is said of a sweep while it runs."""
+"""Progress reports of sweeps."""
 
 from importlib import import_module
 
@@ -19,7 +19,7 @@ def result(*codes):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that is put by hand."""
+    """A clock that is set by the test."""
 
     class Clock:
         now = 100.0
