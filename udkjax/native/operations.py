@@ -53,12 +53,12 @@ class Operation(ABC):
         return 0
 
     @abstractmethod
-    def module(self, width: int, beside: int, vector: int) -> Memory:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Memory:
         """Return the module for a number of lanes.
 
         Args:
             width: The number of lanes.
-            beside: Number of directions of a single member in the lanes of a tangent.
+            tangent_lanes: Number of directions of a single member in the lanes of a tangent.
             vector: Number of float64 numbers in a register.
         """
 
@@ -135,7 +135,7 @@ class StateOperation(Operation):
         """Return the operation that evaluates conditions and, for some of them, directions of impulses."""
         return EvaluateEvents(self.code, self.pseudoinverse, self.formulation, conditions, impacts)
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
@@ -167,7 +167,7 @@ class EvaluateEvents(StateOperation):
     conditions: Conditions | None = None
     impacts: tuple[int, ...] = ()  # indices of the conditions with directions of impulses
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         assert self.conditions is not None
         plan = self.pseudoinverse, self.formulation, width, vector
         return EventStates(self.code, self.conditions, self.impacts, *plan)
@@ -184,7 +184,7 @@ class MarkRows(Operation):
 
     settings: ClassVar[tuple[str, ...]] = RowMarks.settings
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return RowMarks(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
@@ -200,7 +200,7 @@ class FindScales(Operation):
     results: ClassVar[int] = len(ScaleCode.results)
     share: ClassVar[int] = 32 * SHARE  # a member takes a microsecond
 
-    def module(self, width: int, beside: int, vector: int) -> Memory:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Memory:
         return ScaleCode(self.code)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:

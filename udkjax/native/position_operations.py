@@ -31,7 +31,7 @@ class Close(Operation):
         """Return the operation that walks back to the active numbers and the guess."""
         return CloseCotangents(self.code, active)
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Closing(self.code, vector)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
@@ -48,7 +48,7 @@ class CloseTangents(Close):
     def tangents(self) -> int:
         return 3
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return ClosingForward(self.code, vector, self.active)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
@@ -63,7 +63,7 @@ class CloseSecondTangents(CloseTangents):
     def tangents(self) -> int:
         return 6
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return ClosingTwice(self.code, vector, self.active)
 
 
@@ -73,7 +73,7 @@ class CloseCotangents(Close):
 
     active: tuple[bool, ...] = ()
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return ClosingReverse(self.code, vector, self.active)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
@@ -87,7 +87,7 @@ class March(Operation):
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Marching(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:

@@ -40,12 +40,12 @@ FEW = 2  # maximum number of members that run one after another: eight lanes tak
 
 
 @lru_cache(maxsize=256)
-def generate(operation: Operation, width: int, beside: int) -> Memory:
+def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
     """Write the module of an operation in `width` lanes; raise `UnsupportedError` if machine code does not support it.
 
-    `beside` is the number of directions of a single member in the lanes of a tangent.
+    `tangent_lanes` is the number of directions of a single member in the lanes of a tangent.
     """
-    module = operation.module(width, beside, machine.lanes())
+    module = operation.module(width, tangent_lanes, machine.lanes())
     handlers = handler(module, "call_frame")
     declared = sorted(set().union(*(f.declared for f in handlers)))
     module.written_text = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])
@@ -74,8 +74,8 @@ class LoadedCode:
     have few members and steps, as it runs slowly. Both round equally.
     """
 
-    def __init__(self, operation: Operation, width: int, beside: int):
-        self._module, self._in_passes = generate(operation, width, beside), operation.is_reverse
+    def __init__(self, operation: Operation, width: int, tangent_lanes: int):
+        self._module, self._in_passes = generate(operation, width, tangent_lanes), operation.is_reverse
         self._field_count, self._share = len(self._module.call_fields), operation.share
         settings = operation.all_settings
         self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
@@ -202,9 +202,9 @@ def load(text: str, level: int = machine.LEVEL) -> Code:
 
 
 @lru_cache(maxsize=256)
-def machine_code(operation: Operation, width: int, beside: int) -> LoadedCode:
+def machine_code(operation: Operation, width: int, tangent_lanes: int) -> LoadedCode:
     """Return the machine code of an operation."""
-    return LoadedCode(operation, width, beside)
+    return LoadedCode(operation, width, tangent_lanes)
 
 
 def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
@@ -218,8 +218,8 @@ def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int
 def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     few = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
     directions = inputs[-1].shape[1] if operation.tangents and few and operation.code.is_small else 1
-    beside = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are faster
-    return machine_code(operation, 1 if few else machine.lanes(), beside)
+    tangent_lanes = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are faster
+    return machine_code(operation, 1 if few else machine.lanes(), tangent_lanes)
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:

@@ -83,7 +83,7 @@ class RunStates(Operation):
         """The fields of the same operation with derivatives."""
         return {each.name: getattr(self, each.name) for each in fields(self)} | {"code": self.code.for_derivatives}
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
@@ -97,7 +97,7 @@ class RunWatched(RunStates):
 
     conditions: Conditions | None = None
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         assert self.conditions is not None
         return Watching(self.plan(width, vector), self.conditions)
 
@@ -116,8 +116,8 @@ class RunTangents(RunStates):
     def tangents(self) -> int:
         return 4 if self.sampled else 3
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return Forward(self.plan(width, vector), self.active, max(width, beside))
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
+        return Forward(self.plan(width, vector), self.active, max(width, tangent_lanes))
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         directions, n = inputs[-1].shape[1], self.code.coordinate_count
@@ -133,8 +133,8 @@ class RunSecondTangents(RunTangents):
     def tangents(self) -> int:
         return 2 * super().tangents
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
-        return ForwardTwice(self.plan(width, vector), self.active, max(width, beside))
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
+        return ForwardTwice(self.plan(width, vector), self.active, max(width, tangent_lanes))
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class RunCotangents(RunStates):
     points: int = record.STORED  # capacity of the record of a run
     is_reverse: ClassVar[bool] = True
 
-    def module(self, width: int, beside: int, vector: int) -> Module:
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Reverse(self.plan(width, vector), self.active)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
