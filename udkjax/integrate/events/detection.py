@@ -33,6 +33,12 @@ INTERVALS_OF_JUMP = 6  # intervals too coarse to resolve a jump or a kink, at ev
 REDONE = 4  # intervals before a coarse one that are repeated
 
 
+class _Arithmetic:
+    """The arithmetic of arrays for `classify_interval`."""
+
+    min, max = staticmethod(jnp.minimum), staticmethod(jnp.maximum)
+
+
 class Nodes(NamedTuple):
     """The conditions and contact forces at the nodes of a window."""
 
@@ -95,11 +101,9 @@ def detect(
     error = _errors(t, g, slope, has_rates)
 
     side = jnp.where(before != 0, before, after)
-    low, high = (_coefficients(cubic, side, 8 / 3 * x) for x in (error, -error))  # 16 x^2 (1 - x)^2 is 8/3 of the middle one
-    resolved = error <= RESOLUTION.resolved * (jnp.max(high, 0) - jnp.min(low, 0))
     hits = (after == -before) & (before != 0)
-    single = (_sign_changes(low) == 1) & (_sign_changes(high) == 1) & resolved
-    away = (jnp.min(low, 0) >= -ZERO * scale) & (resolved | (jnp.min(low, 0) >= RESOLUTION.far * error - ZERO * scale))
+    ends = g[:-1], slope[:-1], g[1:], slope[1:]
+    single, away = RESOLUTION.classify_interval(_Arithmetic, ends, step, error, side, ZERO * scale)
     usable = good[1:, None] & watched
     coarse = (usable & ~unresolved & ~jnp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
     # A few coarse intervals in a short window contain a jump or a kink: finer windows would not help.
@@ -157,16 +161,3 @@ def _errors(
     miss = jnp.where(has_rates, jnp.maximum(RESOLUTION.miss * miss, of_rate), miss)
     beside = jnp.pad(miss, ((1, 1), (0, 0)))
     return jnp.repeat(jnp.maximum(jnp.maximum(beside[:-2], beside[2:]), miss), 2, axis=0)
-
-
-def _coefficients(cubic: Cubic, side: Int[Array, "I C"], error: Float[Array, "I C"]) -> Float[Array, "5 I C"]:
-    """Return the Bernstein coefficients of degree 4 of the cubic, times its side of zero, minus an error in the middle one."""
-    a, da, b, db = (side * x for x in cubic)
-    one, two = a + da / 3, b - db / 3
-    return jnp.stack([a, (a + 3 * one) / 4, (one + two) / 2 - error, (3 * two + b) / 4, b])
-
-
-def _sign_changes(x: Float[Array, "5 I C"]) -> Int[Array, "I C"]:
-    """Return the number of sign changes of the coefficients, with the first one taken as positive."""
-    signs = (x > 0).at[0].set(True)
-    return jnp.sum(signs[1:] != signs[:-1], axis=0)

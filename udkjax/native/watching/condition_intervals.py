@@ -1,7 +1,5 @@
 """Classification of the intervals between nodes: no crossing, a crossing, or unresolved (watching.py)."""
 
-from itertools import pairwise
-
 from udkjax.native.base.ir import DOUBLE, Function, Value, Variable
 from udkjax.native.base.layout import Lane
 from udkjax.native.watching.conditions import (
@@ -121,20 +119,5 @@ def _classify_interval(
     """Return whether a condition changes sign in an interval, and whether this is certain, from values and rates at its ends."""
     hit = after * before < 0.0
     side = f.select(before.is_(0.0), after, before)
-    a, b = ends[0] * side, ends[2] * side
-    one, two = a + ends[1] * side * step * (1 / 3), b - ends[3] * side * step * (1 / 3)
-    second, fourth, middle, e = (a + one * 3.0) * 0.25, (two * 3.0 + b) * 0.25, (one + two) * 0.5, error * (8 / 3)
-    low, high = f.min(f.min(a, b), f.min(second, fourth)), f.max(f.max(a, b), f.max(second, fourth))
-    low, high = f.min(low, middle - e), f.max(high, middle + e)
-    resolved = error <= (high - low) * RESOLUTION.resolved
-    away = (low >= -floor) & (resolved | (low >= error * RESOLUTION.far - floor))
-
-    def changes_once(x: Value) -> Value:
-        signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]
-        found = ~signs[-1]
-        for now, later in pairwise(signs):
-            found = found & (now | ~later)
-        return found
-
-    single = changes_once(middle - e) & changes_once(middle + e) & resolved
+    single, away = RESOLUTION.classify_interval(f, ends, step, error, side, floor)
     return hit, (hit & single) | (~hit & away)
