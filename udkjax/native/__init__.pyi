@@ -38,7 +38,7 @@ from udkjax.native.runs import RunStates as RunStates
 from udkjax.native.runs import RunWatched as RunWatched
 from udkjax.native.wasm import compile_wasm as compile_wasm
 from udkjax.native.wasm import wasm_module as wasm_module
-from udkjax.native.watching.conditions import Conditions as Conditions
 from udkjax.native.watching.conditions import RESOLUTION as RESOLUTION
+from udkjax.native.watching.conditions import Conditions as Conditions
 
 __all__: list[str]
