@@ -112,6 +112,7 @@ class ParameterCheck(NamedTuple):
 
 def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
     found: list[ParameterCheck] = []
+    checks = CHECKS | {"mechanism": require_single}
     for name, parameter in signature(function).parameters.items():
         annotation = parameter.annotation
         if get_origin(annotation) is Literal:
@@ -120,9 +121,9 @@ def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
             found.append(ParameterCheck(name, _instance(classes)))
         if name in ("solution", "motion") and parameter.default is parameter.empty:
             found.append(ParameterCheck(name, require_history))
-        elif name in CHECKS:
+        elif name in checks:
             may_be_none = parameter.default is None or type(None) in get_args(annotation)
-            found.append(ParameterCheck(name, CHECKS[name], "passes" if may_be_none else "refuses"))
+            found.append(ParameterCheck(name, checks[name], "passes" if may_be_none else "refuses"))
     return found
 
 
@@ -180,6 +181,13 @@ def _choice(known: tuple[Any, ...]) -> ArgumentCheck:
             raise ArgumentError(f"{name} must be one of {listed}, {describe(value)}{suggestion(value, texts)}")
 
     return check
+
+
+def require_single(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a single mechanism, not a batch."""
+    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
+        cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
+        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
 
 
 def require_mechanism(value: Any) -> Mechanism:

@@ -53,13 +53,6 @@ def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
     return f" ({COORDINATES[coordinate]} of {quote(names[body])})"
 
 
-def require_single(name: str, value: Any, given: GivenArguments) -> None:
-    """Require a single mechanism, not a batch."""
-    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
-        cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
-        raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
-
-
 def require_history(name: str, value: Any, given: GivenArguments) -> None:
     """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
     mechanism = given["mechanism"]
@@ -190,7 +183,6 @@ CHECKS: dict[str, ArgumentCheck] = {
     ),
     "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
     "optimizer": _of_kind("be an optimizer of optax's, or None", lambda x: isinstance(x, str) or _has("update")(x)),
-    "mechanism": require_single,
     "method": _check_thresholds,
     "stabilization": _check_thresholds,
     "t": require_number,
