@@ -82,6 +82,6 @@ def test_what_is_missing_is_named():
 
 @pytest.mark.parametrize("code", [b"", b"\x7fELF\x02\x01\x01\x00"])
 def test_what_is_no_webassembly_is_refused(code):
-    with pytest.raises(ValueError, match="no WebAssembly"):
+    with pytest.raises(ValueError, match="not a WebAssembly module"):
         link(code, ("run",))
     assert code != MAGIC
