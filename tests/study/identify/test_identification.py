@@ -11,6 +11,7 @@ from udkjax.study.identify.identification import identify
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.search import horizons
 from udkjax.study.identify.unknowns import sample_guesses, state_unknowns
+from udkjax.study.noise import whiteness_of
 
 TRUE = {"body.rod.inertia": 0.375, "force.spring.damping": 0.2}
 
@@ -84,6 +85,11 @@ def test_noise_that_is_given_and_noise_that_is_estimated(measured):
     assert estimated.noise[0][ANGLE][0] == pytest.approx(sigma, rel=0.3)
     ratio = estimated.noise[0][ANGLE][0] / sigma
     assert estimated.uncertainty.standard_errors == pytest.approx(ratio * given.uncertainty.standard_errors, rel=1e-6)
+    # The test for white noise knows which part of the residuals the fit has removed.
+    for estimate in (given, estimated):
+        left, U = estimate.residuals[0][ANGLE], estimate.uncertainty.projection
+        assert estimate.whiteness[0, ANGLE].statistic == pytest.approx(whiteness_of(TS, left, U).statistic, rel=1e-9)
+        assert abs(whiteness_of(TS, left).statistic / whiteness_of(TS, left, U).statistic - 1.0) > 1e-3
 
 
 @pytest.mark.parametrize(("loss", "noise"), [("huber", 0.003), ("soft_l1", None)])
