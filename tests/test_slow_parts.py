@@ -17,6 +17,7 @@ pytestmark = pytest.mark.skipif(not SCRIPT.exists(), reason="the script is no pa
 def slow(monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     spec = spec_from_loader("slow", SourceFileLoader("slow", str(SCRIPT)))
+    assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -101,7 +101,7 @@ class Drift:
     def tuned(self) -> list[Fit]:
         """Fits from all guesses."""
         self.calls = 0
-        return [minimize_squares(self.evaluate, guess, settled=SETTLED) for guess in np.log(GUESSES)]
+        return [minimize_squares(self.evaluate, guess, step_tol=SETTLED) for guess in np.log(GUESSES)]
 
     def last(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
         """The length of Psi (B, 2) at the end of the run, and its derivative by the logarithm of both gains."""
