@@ -1,14 +1,16 @@
 """Tableaus of explicit Runge-Kutta methods for q'' = a(t, q, v), including the default method."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 
-class Method(NamedTuple):
-    """A tableau for q'' = a, without stages that only serve interpolation."""
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A tableau for q'' = a, without stages that only serve interpolation; `of` returns the same object for equal numbers."""
 
     nodes: np.ndarray  # c, and in the last row 1, the end of the step
     v: np.ndarray  # A, and in the last row b
@@ -18,6 +20,8 @@ class Method(NamedTuple):
     order: float
     ends: bool  # whether the last stage is the first of the next step
 
+    _methods: ClassVar[dict[tuple[bytes, ...], "Method"]] = {}  # by their numbers: operations are looked up by identity
+
     @classmethod
     def of(
         cls, c: np.ndarray, stages: Sequence[Any], b: np.ndarray, error: np.ndarray, order: float, ends: bool = False
@@ -26,20 +30,8 @@ class Method(NamedTuple):
         A = np.zeros((len(c), len(c)))
         for i, coefficients in enumerate(stages):
             A[i + 1, : i + 1] = coefficients
-        return cls(np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A, float(order), ends)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Method) and self._key == other._key
-
-    def __ne__(self, other: object) -> bool:
-        return not self == other
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    @property
-    def _key(self) -> tuple[bytes, ...]:
-        return tuple(np.asarray(x).tobytes() for x in self)
+        numbers = np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A, float(order), ends
+        return cls._methods.setdefault(tuple(np.asarray(x).tobytes() for x in numbers), cls(*numbers))
 
     @property
     def stages(self) -> int:
