@@ -2,7 +2,6 @@
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 # All of these runs have events; wrong arguments are meant.
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 import udkjax as udk
 from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, ROOM, TS, G, floor
+from tests.integrate.exact_motions import Table
 
 
 def test_gradients_of_a_bouncing_ball():
@@ -76,21 +76,12 @@ def test_gradients_of_what_comes_to_rest():
     assert np.abs(np.array(jax.grad(end, (0, 1, 2))(*x)) - np.array([1.0, 0.0, 0.0])).max() < 1e-9
 
 
-class Table(eqx.Module):
-    """How high the ball is above a table that shakes."""
-
-    amplitude: jax.Array
-
-    def __call__(self, t, at):
-        return at["ball"].y - self.amplitude * jnp.sin(15.0 * t)
-
-
 def test_gradients_of_a_contact_that_lets_go():
     """A shaking table throws the ball where its own acceleration is -g; the time of that, and the end, by its amplitude."""
     ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})
 
     def run(a):
-        table = udk.Event(Table(a), udk.Impact(0.0), name="table")
+        table = udk.Event(Table(jnp.asarray(a)), udk.Impact(0.0), name="table")
         sol = udk.simulate(ball, np.linspace(0.0, 0.2, 3), events=table, max_events=2)
         return jnp.stack([sol.events.time[1], sol.q[-1, 0, 1]])
 
