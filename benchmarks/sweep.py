@@ -16,7 +16,7 @@ import numpy as np
 import udkjax as udk
 from benchmarks.batch import MEMBERS, angles, states
 from benchmarks.common import Compiled
-from udkjax.study.members import cores
+from udkjax.threads import thread_count
 
 LINKS = ("link1", "link2", "link3")
 END = 10.0  # s
@@ -88,14 +88,14 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
         "throughput": whole["members"] / whole["cpu"] / alone["per_second"],
         "throughput_of_steps": whole["steps"] / whole["cpu"] / alone["steps_per_second"],
         "wall_s": whole["wall"],
-        "cores": cores(),
+        "cores": thread_count(),
         "gib": max(whole["bytes"], resumed["bytes"]) / 2**30,
         "kept_when_killed": len(kept),
         "resumed_members": resumed["members"],
         "identical": int(identical),
     }
     rate, share = row["per_second"], row["throughput"]
-    print(f"{count} members of {end:g} s: {rate:.0f} a second and core, {row['wall_s']:.1f} s in all on {cores()} cores")
+    print(f"{count} members of {end:g} s: {rate:.0f} a second and core, {row['wall_s']:.1f} s in all on {thread_count()} cores")
     print(f"by vmap alone {alone['per_second']:.0f}: {share:.2f} of that, {row['throughput_of_steps']:.2f} by steps")
     print(f"{row['gib']:.2f} GiB at most")
     print(f"killed with {len(kept)} chunks finished; resumed with {resumed['members']} members left; the same, bit by bit")

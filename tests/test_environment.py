@@ -1,10 +1,12 @@
 """What importing the package sets up: float64, an end without a search for garbage, and nothing else."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from tests.fresh_process import python
+from udkjax import threads
 
 CONFTEST = str(Path(__file__).with_name("conftest.py"))
 SHOW = "import os; print(jax.numpy.result_type(float), jax.config.jax_compilation_cache_dir, os.environ.get('XLA_FLAGS'))"
@@ -75,6 +77,27 @@ def test_the_environment_says_where_machine_code_is_kept(tmp_path, choice):
     if choice == "0":
         python(code, HOME=home)
         assert list((home / ".cache" / "udkjax").iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system knows no affinity")
+def test_threads_follow_the_affinity_of_the_process_and_the_setting():
+    code = """
+import os
+from udkjax.threads import cores, thread_count
+from udkjax.study.members import concurrent_chunks
+first, *rest = os.sched_getaffinity(0)
+print(cores() == 1 + len(rest), thread_count() == min(2, cores()))
+os.sched_setaffinity(0, {first})
+print(cores(), thread_count(), concurrent_chunks())
+"""
+    assert python(code, UDKJAX_THREADS=2).split() == ["True", "True", "1", "1", "1"]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "four", "2.5", "²"])
+def test_a_number_of_threads_that_is_none_is_an_error(monkeypatch, text):
+    monkeypatch.setenv("UDKJAX_THREADS", text)
+    with pytest.raises(ValueError, match=f"UDKJAX_THREADS must be a whole number of threads, 1 or more, not '{text}'"):
+        threads.thread_count()
 
 
 def test_without_a_cache_the_tests_keep_none_either(tmp_path):

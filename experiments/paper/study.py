@@ -25,7 +25,7 @@ from udkjax.positions.assembly import State, assemble
 from udkjax.scene import Mechanism
 from udkjax.scene.library import parallelogram
 from udkjax.study.accuracy import exact_coordinates
-from udkjax.study.members import cores
+from udkjax.threads import thread_count
 
 from . import vode
 from .cases import FIRST_STEP, FULL, RANK_HELD, Case, Program, Scope, plan
@@ -51,7 +51,7 @@ def study(
     mech = parallelogram(np.radians(start))
     state = assemble(mech)
     cases = plan(scope, solver)
-    waiting = sum(program.seconds for program in {case.program for case in cases}) / cores()
+    waiting = sum(program.seconds for program in {case.program for case in cases}) / thread_count()
     total = waiting + sum(case.seconds for case in cases)
     programs = _compiled(mech, state, cases, scope.max_steps, lambda what, part: tell(what, part * waiting / total))
     compiled = time.perf_counter() - begun
@@ -88,7 +88,7 @@ def _compiled(mech: Mechanism, state: State, cases: list[Case], max_steps: int, 
 
     programs = sorted({case.program for case in cases})
     done, total = 0.0, sum(program.seconds for program in programs)
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         made = {pool.submit(build, program): program for program in programs}
         for number, future in enumerate(as_completed(made), 1):
             done += made[future].seconds

@@ -1,6 +1,7 @@
 """Runs by machine code compose with every transformation of JAX, and what is compiled is kept safely on disk."""
 
 import os
+import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +13,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from udkjax import threads
+from udkjax.native import primitive
 from udkjax.native.base import code_cache, machine
+from udkjax.native.base.ffi import handler
+from udkjax.native.base.memory import Memory
 from udkjax.native.derivatives import record
 
 TS = np.array([0.0, 0.2, 0.4, 0.6])
@@ -171,6 +176,18 @@ def test_threads_of_xla_share_a_large_batch():
     with ThreadPoolExecutor(8) as pool:
         for found in pool.map(lambda _: run(xs), range(64)):
             assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("limit", [None, 3])
+def test_a_limit_of_threads_holds_inside_and_outside_of_compiled_programs(monkeypatch, limit):
+    monkeypatch.setattr(threads, "cores", lambda: 8)
+    monkeypatch.setenv("UDKJAX_THREADS", str(limit or ""))
+    used, call = [], primitive.PreparedCall.__call__
+    monkeypatch.setattr(primitive.PreparedCall, "__call__", lambda self: used.append(self.threads) or call(self))
+    jax.vmap(angles)(jnp.linspace(0.3, 0.45, 800))
+    assert used == [limit or 8]
+    compared = re.findall(r"icmp slt i64 %\w+, 3\b", handler(Memory(), "call_frame")[-1].text())
+    assert len(compared) == (limit is not None)
 
 
 # --- object code on disk

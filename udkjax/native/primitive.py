@@ -2,7 +2,6 @@
 
 import ctypes
 import math
-import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -30,11 +29,11 @@ from udkjax.native.base.steps import Status
 from udkjax.native.operations import FindScales, Operation
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
+from udkjax.threads import cores, thread_count
 
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls for each line of text: a tenth of the time of compiling a line
-CORES = os.cpu_count() or 1  # maximum number of threads of a call
 TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
 FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
@@ -98,7 +97,7 @@ class LoadedCode:
         return load(self._module.written_text, machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-        """Return outputs of these shapes, computed by one thread for each core."""
+        """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
         if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and not self._quick.library.is_optimized:
             found = self._call_quickly(inputs, shapes)
             if found is not None:
@@ -140,7 +139,7 @@ class LoadedCode:
         )
         assert len(record) == self._field_count
         call = (ctypes.c_int64 * len(record))(*record)
-        threads = max(1, min(members // self._share, CORES))
+        threads = max(1, min(members // self._share, thread_count()))
         return PreparedCall(code.run, call, following, threads, inputs, found)
 
 
@@ -167,7 +166,7 @@ class PreparedCall(NamedTuple):
 @cache
 def _pool() -> ThreadPoolExecutor:
     """Return the threads that calls share, as starting a thread takes longer than short runs."""
-    return ThreadPoolExecutor(CORES)
+    return ThreadPoolExecutor(cores())
 
 
 class Code(NamedTuple):

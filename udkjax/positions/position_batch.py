@@ -95,7 +95,7 @@ class PositionBatch:
             parameters: the free numbers of each member by name, (M, ...).
             values: values of the driver (rad, m; s if all drivers follow time), shared by all members or one row for each, in the
                 order in which they are reached.
-            threads: number of threads; by default the number of cores.
+            threads: number of threads; by default the number of cores, or `UDKJAX_THREADS`.
 
         Raises:
             SceneError: a free number is missing or has another shape.

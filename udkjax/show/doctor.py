@@ -16,7 +16,8 @@ from udkjax.integrate.solution import versions
 from udkjax.native.base.code_cache import cache_folder, cached_files
 from udkjax.native.base.machine import lanes
 from udkjax.scene.library import double_pendulum
-from udkjax.study.members import cores, processor
+from udkjax.study.members import processor
+from udkjax.threads import cores, thread_count
 
 FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
@@ -32,6 +33,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
         "processor": processor(),
         "cores": cores(),
         "cores_of_machine": os.cpu_count(),
+        "threads": thread_count(),
         "devices": [f"{device} ({device.device_kind})" for device in jax.devices()],
         "precision": f"{jnp.result_type(float)}",
         "engine": engine,
@@ -66,6 +68,7 @@ def summary(found: dict[str, Any]) -> str:
         "system": found["system"],
         "processor": found["processor"],
         "cores": f"{found['cores']} of {found['cores_of_machine']}",
+        "threads": f"{found['threads']} (a limit can be set by UDKJAX_THREADS)",
         "devices": ", ".join(found["devices"]),
         "precision": found["precision"],
         "engine": f"{found['engine']}: {found['engine_reason']}",

@@ -34,7 +34,6 @@ from udkjax.study.inverse_dynamics import Effort as Effort
 from udkjax.study.inverse_dynamics import InverseDynamics as InverseDynamics
 from udkjax.study.inverse_dynamics import feed_forward as feed_forward
 from udkjax.study.inverse_dynamics import inverse_dynamics as inverse_dynamics
-from udkjax.study.members import cores as cores
 from udkjax.study.members import processor as processor
 from udkjax.study.power_balance import PowerBalance as PowerBalance
 from udkjax.study.power_balance import power_balance as power_balance

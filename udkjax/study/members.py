@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from udkjax.threads import cores, thread_count
+
 MOST_PROGRAMS = 64  # programs of identifications, and of sweeps, kept in memory: each holds the scene that it was made for
 
 T = TypeVar("T")
@@ -50,7 +52,7 @@ class Program:
         def compute(first: int) -> tuple[Outputs, Outputs]:
             return jax.tree.map(np.asarray, program(shared, _rows(own, first, self.size)))
 
-        each: Callable[..., Iterable] = _threads(os.getpid()).map if on_threads and count > self.size else map
+        each: Callable[..., Iterable] = _threads(os.getpid(), thread_count()).map if on_threads and count > self.size else map
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *each(compute, range(0, count, self.size)))
 
     def place(self, shared: T, own: PyTree) -> T:
@@ -125,27 +127,22 @@ def _rows(own: T, first: int, count: int) -> T:
 
 
 @lru_cache(maxsize=1)
-def _threads(process: int) -> ThreadPoolExecutor:
+def _threads(process: int, count: int) -> ThreadPoolExecutor:
     """Return the thread pool of this process: starting threads anew would take as long as a short run."""
-    return ThreadPoolExecutor(cores(), thread_name_prefix="members")
+    return ThreadPoolExecutor(count, thread_name_prefix="members")
 
 
 CHUNKED_PLATFORMS = ("cpu",)  # platforms that compute a batch in pieces; others compute it whole
 PIECE_MEMBERS = 64  # members of a piece on these platforms
 
 
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def concurrent_chunks() -> int:
     """Return the number of chunks that are computed concurrently.
 
-    One CPU device runs one program per core; several devices share each chunk.
+    One CPU device runs one program per thread; several devices share each chunk.
     """
     devices = jax.local_devices()
-    return cores() if len(devices) == 1 and devices[0].platform in CHUNKED_PLATFORMS else 1
+    return thread_count() if len(devices) == 1 and devices[0].platform in CHUNKED_PLATFORMS else 1
 
 
 def machine() -> str:

@@ -83,7 +83,7 @@ class DesignSearch:
             starts: number of mechanisms to start from.
             seed: seed of the random mechanisms; the same seed gives the same result.
             results: largest number of designs to return.
-            threads: number of threads; by default the number of cores.
+            threads: number of threads; by default the number of cores, or `UDKJAX_THREADS`.
         """
         for name, value in (("starts", starts), ("results", results)):
             require_count(name, value)

@@ -13,6 +13,7 @@ from typing import Any
 from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.layout import INPUTS, SHARE
 from udkjax.native.base.memory import Memory
+from udkjax.threads import thread_limit
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, then the arguments and the results, 40 bytes each:
 # size, extensions, count, types, buffers.
@@ -103,13 +104,18 @@ def _is_null(f: Function, pointer: Value) -> Value:
 
 
 def _thread_count(f: Function, frame: Value) -> Value:
-    """Count the threads of XLA's pool; one if there is none."""
+    """Count the threads of XLA's pool, at most `UDKJAX_THREADS`; one if there is none.
+
+    The pool has a thread for each core that the process may use. The limit is a constant of the text, as XLA calls the handler
+    without Python.
+    """
     count = Value(f, f.reserve(INT), POINTER)
     f.store(1, count, base=INT)
     error = _of_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
     with f.if_(~_is_null(f, error)):
         _of_api(f, frame, DESTROY_ERROR, error)
-    return f.load(count, base=INT)
+    found, limit = f.load(count, base=INT), thread_limit()
+    return found if limit is None else f.select(found < limit, found, f.const(limit, INT))
 
 
 def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:

@@ -1,4 +1,4 @@
-"""Machine code for this processor from LLVM's text, compiled on all cores and stored on disk.
+"""Machine code for this processor from LLVM's text, compiled in parallel and stored on disk.
 
 A module is compiled in parts, with each large function as a part of its own, so that modules share the code of equal functions.
 """
@@ -6,7 +6,6 @@ A module is compiled in parts, with each large function as a part of its own, so
 import ctypes
 import hashlib
 import itertools
-import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -15,6 +14,7 @@ from functools import cache
 from typing import Any
 
 from udkjax.native.base import code_cache
+from udkjax.threads import thread_count
 
 LEVEL = 1  # level of code generation; level 2 takes a fifth longer to compile, with equal run time
 QUICK = 0  # level for first calls: a quarter of the compile time; runs take twice as long, five times in lanes, and round equally
@@ -98,7 +98,7 @@ class Library:
 
 def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
     """Load a module with the functions `names`, from disk or newly compiled."""
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         codes, levels = zip(*pool.map(lambda part: _stored_code(part, level), split_module(text)), strict=True)
     return Library(codes, names, is_optimized=min(levels) == LEVEL)
 

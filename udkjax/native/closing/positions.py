@@ -5,7 +5,6 @@ after another. A march follows positions from the drawn one on; otherwise each p
 """
 
 import ctypes
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from udkjax.equations.position_programs import PositionPrograms
 from udkjax.native.base import machine
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.base.program import consecutive, write
+from udkjax.threads import thread_count
 
 # A Newton step shorter than this, in units of the coordinates, is the last: the next one would be its square.
 LAST_STEP = 1e-7
@@ -72,7 +72,7 @@ class PositionCode:
             data: Data of the positions, for all members (J, D) or for each (M, J, D).
             guess: Initial guesses (M, J, n); None: a march from the drawn position.
             longest: Longest step of s in a march.
-            threads: Number of threads that share the members; by default one for each core.
+            threads: Number of threads that share the members; by default one for each core, or `UDKJAX_THREADS`.
 
         Returns:
             The positions; NaN where one was not reached.
@@ -91,7 +91,7 @@ class PositionCode:
         fields |= {"members": members, "count": count, "marches": guess is None, "longest": np.float64(longest).view(np.int64)}
         fields |= {"s stride": count if s.ndim > 1 else 0, "data stride": count * sizes.data if data.ndim > 2 else 0}
         call = (ctypes.c_int64 * len(FIELDS))(*(int(fields[name]) for name in FIELDS))
-        threads = min(threads or os.cpu_count() or 1, -(-members // self.width)) if members else 0
+        threads = min(threads or thread_count(), -(-members // self.width)) if members else 0
         if threads == 1:
             self._run(ctypes.addressof(call))
         elif threads:

@@ -13,9 +13,10 @@ import numpy as np
 from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
-from udkjax.study.members import concurrent_chunks, cores
+from udkjax.study.members import concurrent_chunks
 from udkjax.study.sweep.groups import RESULT, GroupRun, group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
+from udkjax.threads import thread_count
 
 if TYPE_CHECKING:
     import distributed
@@ -137,10 +138,10 @@ def dask_engine(client: "distributed.Client | None" = None) -> Executor:
 
 @contextmanager
 def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]:
-    """Start a client of the scheduler at an address, or of one worker process per core, which end with the client."""
+    """Start a client of the scheduler at an address, or of one worker process per thread, which end with the client."""
     with OptionalImport():
         import distributed
-    cluster = {"n_workers": cores(), "threads_per_worker": 1, "dashboard_address": ":0"}
+    cluster = {"n_workers": thread_count(), "threads_per_worker": 1, "dashboard_address": ":0"}
     with nullcontext(scheduler) if scheduler is not None else distributed.LocalCluster(**cluster) as where:
         try:
             client = distributed.Client(where)
