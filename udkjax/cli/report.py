@@ -56,7 +56,7 @@ def report(
     if not folder.is_dir():
         refuse(f"cannot write {out.name}: there is no folder {folder}")
     if not -180 < start < 0 or start == -90:
-        refuse(f"--start {start:g} must be between -180 and 0 degrees, so that the links never become collinear, and not -90")
+        refuse(f"--start {start:g}: must be between -180 and 0 degrees (no collinear links); at -90 they hang at rest")
 
     from udkjax.progress import report_progress
 
