@@ -25,7 +25,7 @@ class Progress:
         done: amount done, in the units of `total`.
         total: amount to do; None if unknown.
         seconds: time since the computation began (s).
-        message: a text about its state.
+        message: a description of its state.
     """
 
     what: str

@@ -27,7 +27,7 @@ def make():
         mech, places = search(results=1)[0].mechanism, search.problem.goal.targets
         path = np.asarray(udk.path(mech, udk.simulate(mech, np.linspace(0.0, TURN, 7201)), "P"))
         off = np.linalg.norm(path[:, None] - places, axis=2).min(axis=0).max()
-        facts[f"{name}: farthest of the places from the path of the run (mm)"] = 1e3 * float(off)
+        facts[f"{name}: greatest distance of a given place from the path of the run (mm)"] = 1e3 * float(off)
         panel.plot(*(1e3 * path.T))
         panel.plot(*(1e3 * places.T), "k.")
         panel.set(title=name, aspect="equal", xlabel="x, mm", ylabel="y, mm")

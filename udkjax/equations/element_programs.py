@@ -73,8 +73,8 @@ class ConstraintPrograms(ElementPrograms):
         self.outputs["b"] = [g - sum((s * free[k] for k, s in row.items()), zero) for g, row in zip(gamma, slopes, strict=True)]
         if self.gains:
             alpha, beta = self.gains
-            fed = zip(self.outputs["b"], rate, value, strict=True)
-            self.outputs["b"] = [b - alpha * 2.0 * one - beta * beta * two for b, one, two in fed]
+            rows = zip(self.outputs["b"], rate, value, strict=True)
+            self.outputs["b"] = [b - alpha * 2.0 * psi_dot - beta * beta * psi for b, psi_dot, psi in rows]
         self._find_constants()
 
 

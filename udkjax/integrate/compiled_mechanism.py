@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The part of a run that follows from the structure of a mechanism and the choices, whatever the numbers are."""
+    """The part of a run that follows from the structure of a mechanism and the choices, not from numbers."""
 
     solver: "diffrax.AbstractSolver | None"
     projected: bool
-    operation: RunStates | None  # of machine code that integrates it
-    evaluation: Accelerate | None  # of machine code that evaluates its equations for diffrax; None: the textbook's own
-    why_not_native: str  # why there is none, or it is not taken; empty where it is
-    independent_rows: int = 0  # the number of rows that the method takes
+    operation: RunStates | None  # the machine code that integrates the mechanism
+    evaluation: Accelerate | None  # the machine code that evaluates its equations for diffrax; None: `TextbookEquations` in JAX
+    why_not_native: str  # why there is no machine code, or why it is not used; empty where it is used
+    independent_rows: int = 0  # the number of rows that the method uses
 
     @cached_property
     def is_native(self) -> bool:
@@ -62,7 +62,7 @@ class RunPlan:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class CompiledMechanism:
-    """A mechanism as runs take it, whatever their times, states and tolerances: found once, and handed down.
+    """A mechanism prepared for runs with any times, states and tolerances: made once, and passed on.
 
     The arrays of the equations and the breakpoints may be traced or batched.
     """
@@ -73,7 +73,7 @@ class CompiledMechanism:
 
     @property
     def samples(self) -> SampleRows:
-        """The rows of all that has samples."""
+        """The rows of all sampled numbers."""
         return SampleRows(self.textbook.mechanism, self.breakpoints)
 
     @cached_property

@@ -16,9 +16,9 @@ class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
     With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would store for the next
-    step (FSAL) belongs to the state before projection; a solver that learns of the jump takes a new one. (A multistep method
-    would forget its whole history and does not learn of it: it sees for itself that its newest point was moved.) The part of an
-    error that projection removes hardly counts. Where only some coordinates are integrated, errors are those of these alone.
+    step (FSAL) belongs to the state before projection; a solver that is told of the jump computes a new one. (A multistep method
+    would forget its whole history and is not told: it notices by itself that its newest point was moved.) The part of an
+    error that projection removes hardly counts. Where only some coordinates are integrated, only their errors count.
     Error estimates, with their counts, and interpolation are the wrapped solver's.
     """
 
@@ -31,7 +31,7 @@ class Constrained(Wrapper):
         equations, solver = args.fix_partition(t0, *jnp.split(y0, 2)), self.solver
         judged = None if equations.independent is None else jnp.tile(equations.independent, 2)
         if judged is not None:
-            solver = _with_norm_of(solver, judged)
+            solver = _with_partial_norm(solver, judged)
         y1, error, dense, state, result = solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
         if self.projected:
             y1 = project(equations, t1, y1)
@@ -42,8 +42,8 @@ class Constrained(Wrapper):
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result
 
 
-class _NormOf(eqx.Module):
-    """A norm of some components."""
+class _PartialNorm(eqx.Module):
+    """A norm of vectors in which only some `components` count."""
 
     norm: Callable[[Float[Array, "2n"]], Float[Array, ""]]
     components: Bool[Array, "2n"]
@@ -52,8 +52,8 @@ class _NormOf(eqx.Module):
         return self.norm(jnp.where(self.components, y, 0))
 
 
-def _with_norm_of(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> diffrax.AbstractSolver:
+def _with_partial_norm(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> diffrax.AbstractSolver:
     """Return a multistep method, which judges its errors itself, with a norm of some components alone."""
     if not isinstance(solver, Multistep):
         return solver
-    return eqx.tree_at(lambda s: s.root_finder.norm, solver, _NormOf(solver.root_finder.norm, components))
+    return eqx.tree_at(lambda s: s.root_finder.norm, solver, _PartialNorm(solver.root_finder.norm, components))

@@ -1,8 +1,8 @@
 """Derivatives of a run, forward and reverse, of any order.
 
 A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and in reverse w -> J^T w, are machine
-code where that serves, else diffrax's. Both together are one linear map with its transpose, to JAX a primitive (linear_map.py),
-so that no derivative is ever transposed operation by operation.
+code if it supports them, else diffrax's. The two form one linear map with its transpose, which is a primitive for JAX
+(linear_map.py): no derivative is ever transposed operation by operation.
 """
 
 import operator
@@ -31,8 +31,8 @@ SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))
 def differentiable(problem: Problem, has_concrete_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
-    None are taken along numbers that do not depend on what is differentiated, nor along those of the step controller: steps are
-    taken as they are; nor along times that were known before the problem was traced.
+    Numbers that do not depend on the variables are not differentiated, nor are those of the step controller (the sizes of steps
+    are held constant), nor times that were known before the problem was traced.
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)
@@ -92,7 +92,7 @@ def _(primals, tangents):
 
 
 class DifferentiableRun(DifferentiableFunction):
-    """Positions and velocities at the output times, and at the end, of the numbers of a problem.
+    """Positions and velocities at the output times, and at the end, as a function of the numbers of a problem.
 
     Derivatives beyond the second are those of diffrax alone.
     """
@@ -106,7 +106,7 @@ class DifferentiableRun(DifferentiableFunction):
         return 0 if operation is None else 1 if operation.sampled else 2
 
     def fast(self, inputs: list[Array]) -> IntegratorOutput:
-        """Return the run by machine code, which has no derivatives, if that serves."""
+        """Return the run without derivatives: by machine code if it can integrate the problem, else by diffrax."""
         problem = self.problem(inputs)
         return native_engine.integrate(problem) if self.native else _integrate_by_diffrax(problem)
 
@@ -146,7 +146,7 @@ class DifferentiableRun(DifferentiableFunction):
         return list(native_engine.second_derivative(problem, which, *changes))
 
     def run_and_jvp(self, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
-        """Return the run, and the change of its states along v of those of x that are active: by machine code, if that serves."""
+        """Return the run, and the change of its states along tangents of the active inputs, by machine code if it can."""
         if self._is_native(inputs, active):
             change = self.problem.changes(active, tangents)
             raw, found = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
@@ -155,9 +155,9 @@ class DifferentiableRun(DifferentiableFunction):
         return raw, [change[k] for k in SMOOTH]
 
     def recorded(self, inputs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
-        """Return the run and what it leaves to walk back from, by the machine code of reverse mode, if that serves.
+        """Return the run, and the record of it that reverse mode goes back through; diffrax records nothing.
 
-        No other is compiled. Diffrax leaves nothing.
+        Only the machine code of reverse mode is compiled.
         """
         if self._is_native(inputs, active):
             return native_engine.integrate_for_vjp(self.problem(inputs), self.problem.marks(active))

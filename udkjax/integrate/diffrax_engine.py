@@ -24,7 +24,7 @@ from udkjax.transforms.gradients import stop_gradients
 def integrate_by_diffrax(
     problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
 ) -> IntegratorOutput:
-    """Integrate one problem with any solver of diffrax (default Dopri8), in reverse mode by checkpoints unless said otherwise."""
+    """Integrate one problem with any solver of diffrax (default Dopri8), and by default with checkpoints for reverse mode."""
     ts = _leave_breakpoints(problem)
     y0 = given = jnp.concatenate([problem.q, problem.v])
     equations = equations_for_diffrax(problem)

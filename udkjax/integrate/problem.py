@@ -60,7 +60,7 @@ class IntegratorOutput(NamedTuple):
     q: Float[Array, "T n"]  # NaN where it was not reached, or after the first lost output
     v: Float[Array, "T n"]
     reached: Bool[Array, "T"]
-    lost: Float[Array, ""]  # the number of the first output at which Psi is violated by more than `drift_tol`; infinite: none
+    lost: Float[Array, ""]  # index of the first output at which Psi is violated by more than `drift_tol`; infinite: none
     status: Int[Array, ""]
     t: Float[Array, ""]  # the end
     y: Float[Array, "2n"]  # at t

@@ -38,18 +38,18 @@ class Operation(ABC):
     input_names: ClassVar[tuple[str, ...]] = INPUTS  # names of the first inputs
     settings: ClassVar[tuple[str, ...]] = SETTINGS  # names of the settings of this kind of operation
     in_lanes: ClassVar[bool] = True  # whether members run in lanes
-    results: ClassVar[int] = len(OUTPUTS)  # number of the first outputs, which have no directions
+    results: ClassVar[int] = len(OUTPUTS)  # number of outputs without directions: the first ones
     share: ClassVar[int] = SHARE  # minimum number of members of a thread
     is_reverse: ClassVar[bool] = False  # whether two passes integrate and backpropagate, each with a part of the outputs
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        """The names of the settings."""
+        """The names of the settings, those of the formulation included."""
         return self.settings
 
     @property
     def tangents(self) -> int:
-        """The number of the last inputs, which have directions."""
+        """The number of inputs that have directions: the last ones."""
         return 0
 
     @abstractmethod

@@ -275,7 +275,8 @@ def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
     return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
 
 
-# Fraction of a body's size, as rough drawings and numbers of three digits leave open. A mistyped number closes silently.
+# Fraction of a body's size: rough drawings and numbers of three digits leave smaller gaps. Without a warning a mistyped number
+# would be closed silently.
 WORTH_SAYING = 0.01
 
 

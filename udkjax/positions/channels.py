@@ -242,7 +242,7 @@ _PARSERS: dict[str, Callable[[Mechanism, str], Channel]] = {
 
 
 def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
-    """Split a text into the longest of these names that it begins with, and the rest."""
+    """Split a string into the longest of these names that it begins with, and the rest."""
     fitting = [name for name in names if text.startswith(name) and text[len(name) :].startswith((".", "("))]
     if fitting or text in names:
         name = max(fitting, key=len, default=text)
@@ -255,7 +255,7 @@ def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
 
 
 def _split_point(text: str, default: LocalPoint | None = None) -> tuple[LocalPoint, str]:
-    """Split a text into the point that it begins with, and the rest."""
+    """Split a string into the point that it begins with, and the rest."""
     if not text.startswith("("):
         if default is None:
             raise ValueError("must be distance.BODY(px, py).BODY2(px, py): each body needs a point, in its own frame (m)")

@@ -222,7 +222,11 @@ def _advance(
     clearance: Float[Array, ""],
     most: int,
 ) -> _State:
-    """Return the state after a step of length eta to `at`, if the step is accepted."""
+    """Return the state after a step of length eta, if the step is accepted.
+
+    `ahead` is the prediction, `at` the point corrected from it, with the tangent `turned`. `way` is the sign of the direction in
+    which the target lies; a step that `lands` has the target's value.
+    """
     xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
     rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
     near = xp.linalg.norm(at - ahead) <= PREDICTION_TOL * eta + rounding

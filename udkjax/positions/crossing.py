@@ -1,11 +1,11 @@
 """A point of a curve at or near a meeting of branches, from points of the same branch on both sides.
 
-At a meeting E has a second null vector: Newton's method leaves the root of rounding in q, over the distance in q', over its
-square in q''. The branch itself is smooth. It is therefore followed to twelve values around the point, two to seven steps h away
-on either side, where E is well conditioned, and q, q' and q'' are taken from the polynomials through these, with errors of order
-h^12. The difference from the polynomials through ten values bounds the errors; the h with the smallest bound is taken, and
-accepted if the bound is small and the position closes to rounding. It does not close where branches merely come close to each
-other, since the curve turns between them.
+At a meeting E has a second null vector: the errors of Newton's method are the square root of rounding in q, this over the
+distance in q', and this over the square of the distance in q''. The branch itself is smooth. It is therefore followed to twelve
+values around the point, two to seven steps h away on either side, where E is well conditioned, and q, q' and q'' are taken from
+the polynomials through these, with errors of order h^12. The difference from the polynomials through ten values bounds the
+errors; the h with the smallest bound is taken, and accepted if the bound is small and the position closes to rounding. It does
+not close where branches merely come close to each other, since the curve turns between them.
 """
 
 from typing import NamedTuple
@@ -15,19 +15,22 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.positions.curve import AbstractCurve
 
-# Singular values of E, relative to the largest. Rounding errors of q, 1e-16 over sigma, are over sigma once more in q' and over
-# its square in q'': below NEAR_LOSS q'' has lost more than its sixth digit and is found from both sides; below LOST_RANK all.
+# Bounds on singular values sigma of E, relative to the largest. Rounding errors are 1e-16 / sigma in q, 1e-16 / sigma^2 in q' and
+# 1e-16 / sigma^3 in q''. Below NEAR_LOSS, fewer than ten digits of q'' are left, and it is found from both sides; below
+# LOST_RANK none is left.
 NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
-CLOSE_DISTANCE = 0.02  # scaled: largest distance of the previous point, whose tangent leads across; it turns by about a degree
-# h, scaled values. If the next singularity of q(s) is one unit away, the polynomials err by 3e-10, 3e-15 and less; rounding
-# leaves 2e-13, 2e-12 and 1e-11 in q'' if sigma grows by one per unit, and with the smallest h the nearest point is at NEAR_LOSS.
+# Largest scaled distance from the previous point to a meeting that its tangent leads across; the tangent turns by about a degree.
+CLOSE_DISTANCE = 0.02
+# Values of h, scaled. Errors of the polynomials are 3e-10, 3e-15 and less with these, if the next singularity of q(s) is one unit
+# away, and rounding errors of q'' are 2e-13, 2e-12 and 1e-11, if sigma grows by one per unit. With the smallest h the nearest
+# point is at NEAR_LOSS.
 SPACINGS = (0.04, 0.015, 0.005)
-# Steps h from the point to the nearest and to the farthest of the others, twelve in all: they multiply errors by 13. With fewer
-# the polynomials err more, with more or nearer ones rounding does.
+# Distances from the point to the nearest and the farthest of the twelve others, in steps of h. The weights of these multiply
+# errors by 13. With fewer points the polynomials are less accurate; with more or nearer ones rounding errors grow.
 NEAREST_NODE, FARTHEST_NODE = 2, 7
 # Bounds on how the polynomials through twelve and ten values differ in q, q' and q'', scaled: a hundred times their error.
 ACCEPTED_DIFFERENCES = (1e-9, 1e-7, 1e-5)
-ROOT_STEPS = 6  # of Newton's method to the extremum of a polynomial: it doubles the digits, from two on
+ROOT_STEPS = 6  # of Newton's method to the extremum of a polynomial: each doubles the number of digits, two at the start
 
 
 def weights(last: int) -> np.ndarray:

@@ -21,7 +21,7 @@ END_TOL = 1e-12  # last Newton step, relative to the unknowns; rounding alone ex
 END_CORRECTIONS = 12  # Newton steps at the end: far more than a regular solution takes
 GROWTH = 2.0  # largest growth of a step
 # Near the end of a path to infinity an unknown varies as a power of 1 - t, an integer or a fraction such as 1/3; on a path to a
-# finite point it does not. A power within these bounds, at 1 - t below NEAR_END, tells a path to infinity.
+# finite point it does not. If the power is within these bounds, at 1 - t below NEAR_END, the path goes to infinity.
 POWERS = (0.1, 3.0)
 NEAR_END = 0.05
 ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3  # codes of the ends of paths

@@ -31,7 +31,7 @@ from udkjax.programs.control_flow import sequential
 from udkjax.programs.varying_axes import result_type
 from udkjax.transforms.gradients import stop_gradients
 
-# Relative to the largest (s - s*) dq/dp: a smaller residue is rounding, which E^+ multiplies by a hundred at most.
+# Relative to the largest (s - s*) dq/dp: smaller residues are rounding errors, which E^+ multiplies by a hundred at most.
 RESIDUE = 1e-6
 MOST_MEETINGS = 8  # of branches, in one call: at further ones, derivatives by numbers of the constraints are NaN
 

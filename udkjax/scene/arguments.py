@@ -159,7 +159,7 @@ def _meant(cls: type) -> str:
 
 
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
-    """Return the cure for a class, or its name as a text, in place of an instance; else an empty text."""
+    """Return the advice to give an instance, if the value is a class or its name; else an empty string."""
     called = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
     found = {x.__name__.lower(): x.__name__ for x in _family(classes)}.get(called.strip("() ").lower())
     return f"; give an instance: {name}=udk.{found}()" if found and found not in ("Mechanism", "State", "Analysis") else ""

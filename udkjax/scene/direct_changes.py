@@ -32,7 +32,7 @@ class Marked(Sections, Protocol):
 
 
 def count_marks(mechanism: Sections) -> int:
-    """Return the number of entries of all numbers of the elements."""
+    """Return the number of marks: one for each entry of each number of the elements."""
     return sum(np.size(field.value) for field in _present(groups_of(mechanism)).values())
 
 
@@ -48,7 +48,7 @@ def marks_by_name(mechanism: Marked) -> dict[str, Any]:
 
 
 def mark_changes(mechanism: Marked, groups: ElementGroups, names: Collection[str]) -> Float[Array, "K"]:
-    """Return the marks of new elements of a mechanism, after the named numbers, or entries of numbers, were set."""
+    """Return the marks of elements with new values of the named numbers, or entries of numbers; older marks are kept."""
     before, found = marks_by_name(mechanism), {}
     for name, field in _present(groups).items():
         mark, shape = before.get(name), np.shape(field.value)

@@ -66,7 +66,7 @@ def vector_as_angle(value: Any) -> Any:
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
-    """Convert a name or a list of names to a tuple; raise a `TypeError` if an entry is not a text."""
+    """Convert a name or a list of names to a tuple; raise a `TypeError` if an entry is not a string."""
     found = (value,) if isinstance(value, str) else tuple(value)
     if not all(isinstance(name, str) for name in found):
         raise TypeError("must be a name, or a list of names")

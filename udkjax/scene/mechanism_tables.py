@@ -160,5 +160,5 @@ def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
 
 
 def is_xml(text: str) -> bool:
-    """Return True if a text begins like XML."""
+    """Return True if a string begins like XML."""
     return text.removeprefix("\ufeff").lstrip().startswith("<")

@@ -150,12 +150,12 @@ def _field_of_held(values: NumberField) -> NumberField:
 
 
 def value_of(known: Mapping[str, NumberField], name: str, groups: Mapping[str, Mapping[str, Any]]) -> Any:
-    """Return the value of a number, a `Held` if it is sampled, or of one of its entries, by name."""
+    """Return the value of a number, or of one of its entries, by name; a `Held` if the number is sampled."""
     if name in held_names(known):
         section, owner, path, *_ = _field_of_held(known[f"{name}.values"])
         return _at(groups[section][owner], path)
-    owner, index = split_index(name, known)
-    value = known[owner].value
+    parameter, index = split_index(name, known)
+    value = known[parameter].value
     assert value is not None  # only existing numbers have been set
     return value[index] if index else value
 
@@ -163,7 +163,7 @@ def value_of(known: Mapping[str, NumberField], name: str, groups: Mapping[str, M
 def _fit(
     given: str, value: Numbers, name: str, index: tuple[int, ...], shape: tuple[int, ...] | None, old: Array | None
 ) -> tuple[Array | None, str]:
-    """Return the new value of a parameter, or None and why the value does not fit."""
+    """Return the new value of a parameter, or None and the reason why it does not fit."""
     try:
         new = None if isinstance(value, bool) else number(value)
     except (TypeError, ValueError, OverflowError):

@@ -153,7 +153,7 @@ _USUAL = (
 
 
 def read_quantity(text: str, wanted: str) -> float:
-    """Convert a text such as "60 rpm" to a number in the SI units `wanted`.
+    """Convert a string such as "60 rpm" to a number in the SI units `wanted`.
 
     Raises:
         ValueError: it is not a number with a unit, or its unit is unknown or has another dimension.

@@ -65,9 +65,9 @@ def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)).ravel()
     colours = _codes() if name == RESULT_VARIABLE else _scale(data[name].values)
     drawn = None
-    for axes, (chosen, said) in zip(grid, panels, strict=False):
+    for axes, (chosen, title) in zip(grid, panels, strict=False):
         drawn = _panel(axes, data.isel(chosen), name, across, colours)
-        axes.set_title(said, fontsize="small")
+        axes.set_title(title, fontsize="small")
     for axes in grid[:count][-columns:]:  # the lowest panel of each column
         axes.tick_params(labelbottom=True)
         axes.set_xlabel(words(data, across[-1]) if len(across) == 2 else axes.get_xlabel())
@@ -75,8 +75,8 @@ def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
         axes.set_axis_off()
     if drawn is not None:
         _key(figure, drawn, data, name)
-    whole = prod(data.sizes[d] for d in others)
-    remarks = [f"the first {count} of {whole} panels"] if count < whole else []
+    all_panels = prod(data.sizes[d] for d in others)
+    remarks = [f"the first {count} of {all_panels} panels"] if count < all_panels else []
     remarks += ["grey: missing values"] if drawn is not None and not np.isfinite(data[name].values).all() else []
     figure.suptitle("; ".join([words(data, name), *remarks]))
     return figure

@@ -36,7 +36,7 @@ class MemberFunction(Protocol):
 
 
 class Program:
-    """A function of members, compiled for `piece` members on each device, with derivatives (slopes) by K numbers."""
+    """A function of members, compiled for `piece` members on each device, with derivatives by K = `slopes` numbers."""
 
     def __init__(self, function: MemberFunction, slopes: int, piece: int, devices: Sequence[Any] = ()):
         self.function, self.slopes, self.piece, self.devices = function, slopes, piece, tuple(devices)
@@ -83,10 +83,10 @@ class Program:
                 found = jax.vmap(lambda own: self.function(shared, own, shift))(own)
             return {name: x for name, x in found.items() if jnp.issubdtype(x.dtype, jnp.floating)}, found
 
-        at = jnp.zeros(self.slopes)
+        no_shift = jnp.zeros(self.slopes)
         if not self.slopes:
-            return values(at)[1], {}
-        slopes, found = jax.jacfwd(values, has_aux=True)(at)
+            return values(no_shift)[1], {}
+        slopes, found = jax.jacfwd(values, has_aux=True)(no_shift)
         return found, slopes
 
     def _on_devices(self) -> Callable[[PyTree, PyTree], tuple[Outputs, Outputs]]:

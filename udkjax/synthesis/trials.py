@@ -13,7 +13,7 @@ class Trials(NamedTuple):
     q: np.ndarray
 
     def take(self, which: np.ndarray) -> "Trials":
-        """Return some of them."""
+        """Return the trials that `which`, a mask or indices, selects."""
         return Trials(*(a[which] for a in self))
 
 
@@ -45,7 +45,7 @@ class TrialResiduals(NamedTuple):
     exists: np.ndarray
 
     def take(self, which: np.ndarray) -> "TrialResiduals":
-        """Return some of them."""
+        """Return the trials that `which`, a mask or indices, selects."""
         return TrialResiduals(*(a[which] for a in self))
 
 

@@ -47,7 +47,7 @@ def split_jvp(
 
 
 class SplitForms:
-    """Both forms as functions of arrays: first `start` arrays of the point, then those of the direction, of shapes `ways`."""
+    """The forms `seen` and `run` as functions of arrays: `start` arrays of the point, then the direction, of shapes `ways`."""
 
     def __init__(
         self,

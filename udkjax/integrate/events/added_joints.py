@@ -29,7 +29,7 @@ class NumberOf(NamedTuple):
 
 
 def joint_numbers(phases: Phases) -> list[Array]:
-    """Return the numbers of all joints that events add, as far as the state does not decide them."""
+    """Return the numbers of all joints that events add, except those that the state decides."""
     return jax.tree.leaves(eqx.filter(phases.added, eqx.is_inexact_array))
 
 

@@ -20,7 +20,7 @@ def number_if_any(value: Any) -> Any:
 
 
 def require_name_text(name: str, value: object, may_be_empty: bool = False) -> None:
-    """Raise ArgumentTypeError if a name is not a text, ValueError if it is empty."""
+    """Raise ArgumentTypeError if a name is not a string, ValueError if it is empty."""
     if not isinstance(value, str):
         raise ArgumentTypeError(f"{name} must be a text, {describe(value)}")
     if not value and not may_be_empty:

@@ -97,7 +97,7 @@ def _first_of_equals(functions: _Functions) -> _Functions:
 
 
 def with_cached_functions(events: Sequence[Event], programs: Conditions) -> tuple[Event, ...]:
-    """Return events with functions of earlier ones that have the same programs: code that is compiled for those serves these.
+    """Return events with functions of earlier ones that have the same programs, so that code compiled for those is used again.
 
     A function that is written within another is a new one in each call.
     """

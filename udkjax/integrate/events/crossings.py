@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-# Relative to a condition's scale, its change by a displacement of L or a turn of one radian: smaller conditions are zero, and so
-# are their first and second rates, per T and T^2. Rounding errors of a state are some 1e-15.
+# Conditions smaller than ZERO are zero, and so are smaller first and second rates, per T and T^2; all are relative to the
+# condition's scale, its change by a displacement of L or a turn of one radian. Rounding errors of a state are some 1e-15.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
 PARTS, DIVISIONS = 32, 6  # parts of the bracket of a cubic's root, and number of subdivisions: down to 1e-9 of it
 NO_EVENT = -1

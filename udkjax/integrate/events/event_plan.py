@@ -17,7 +17,7 @@ from udkjax.integrate.events.phases import Phases, Tables
 
 @dataclass(frozen=True)
 class EventPlan:
-    """The events and phases of a run, as far as no number changes them; equal ones have the same code."""
+    """The part of a run's events and phases that does not depend on numbers; runs with equal plans share their code."""
 
     tables: Tables
     directions: tuple[int, ...]  # of each event

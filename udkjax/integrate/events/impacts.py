@@ -42,21 +42,22 @@ from udkjax.integrate.events.complementarity import diagonal, solve_complementar
 from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
 from udkjax.transforms.gradients import stop_gradients
 
-# (u . u) / (n M^(-1) n): the square of the sine between a contact's row and those of the constraints, in the metric of M. At a
-# sine of 1e-8, half of the digits, u is the rounding error of the difference of two rows, and no impulse follows from it.
+# Bound on (u . u) / (n M^(-1) n), the square of the sine of the angle between a contact's row and those of the constraints, in
+# the metric of M. At a sine of 1e-8, half of the digits, u is merely the rounding error of a difference of two rows, and no
+# impulse follows from it.
 BLOCKED = 1e-16
-# CLOSED, relative to a condition's scale: contacts this close to zero are hit together with another one. It exceeds the errors of
-# a symmetric mechanism at usual tolerances, and advances a hit by 1e-9 T at most. STILL, relative to the fastest approach in an
-# impact or the strongest pull: smaller ones of other contacts are zero, to the accuracy of the rows of these contacts.
+# CLOSED, relative to a condition's scale: contacts this close to zero are hit together with another one. This bound exceeds the
+# errors of a symmetric mechanism at usual tolerances, and advances a hit by 1e-9 T at most. STILL, relative to the fastest
+# approach in an impact, or to the strongest pull: smaller values of other contacts are zero, to the accuracy of their rows.
 CLOSED = STILL = 1e-9
-# Squared sine between the row of a contact and those of held contacts, below which these hold it, too. A dependent row has a sine
-# of some CLOSED over the distance of the contacts, here down to a thousandth of L.
+# Bound on the squared sine of the angle between the row of a contact and those of held contacts: below it, they hold this
+# contact, too. A dependent row has a sine of about CLOSED over the distance of the contacts, here down to a thousandth of L.
 CARRIED = (1e3 * CLOSED) ** 2
-# Relative to a condition's scale per T: a slower impact of a pressed contact is rest. Its rebound rises by 1e-10 of that scale, a
-# hundredth of the accuracy at usual tolerances.
+# Speed of impact, relative to a condition's scale per T: a pressed contact that is slower is at rest. Its rebound would rise by
+# 1e-10 of that scale, a hundredth of the accuracy at usual tolerances.
 REST = 1e-5
-# Relative to |u_i| |u_j|: contacts with a smaller W_ij do not act on one another, and each has its own event. It is a cosine,
-# with rounding errors of 1e-15 times the condition number of the constraints, up to a thousand.
+# Bound on W_ij, relative to |u_i| |u_j|: below it, contacts i and j do not act on one another, and each has its own event. This
+# ratio is a cosine, with rounding errors of 1e-15 times the condition number of the constraints, up to a thousand.
 COUPLED = 1e-12
 
 ATTACHABLE = 1e-6  # relative to L, or rad: largest gap of an attached joint
@@ -194,7 +195,7 @@ def hit_contacts(
 
     Args:
         contacts: properties that no state changes.
-        k: the number of the event; from E on, of the contact that lets go.
+        k: the index of the event; E + i where contact i lets go.
         v: the velocities, in the phase that is to follow but for contacts.
         held: mask of the contacts that were held before.
         before: the conditions before the event.

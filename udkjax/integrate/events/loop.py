@@ -1,6 +1,6 @@
-"""The loop of runs with events: go on to the next crossing, apply what happens there, go on.
+"""The loop of runs with events: integrate to the next crossing, apply what happens there, and repeat.
 
-The members of a batch go together, as far as they have the same to do. What takes them to their next crossings is a `System`:
+Members of a batch that are at the same stage go on together. What takes them to their next crossings is a `System`:
 machine code, all members at once, or the plain form, one window of one member at a time.
 """
 

@@ -53,7 +53,7 @@ class MachineSystem:
         units: numbers of each member.
         restitution: of all events (B, E).
         inverse_mass: of all coordinates (B, n).
-        joint_numbers: the numbers of joints that events add, as far as no state decides them (B, k).
+        joint_numbers: the numbers of joints that events add, except those that the state decides (B, k).
     """
 
     xp = np
@@ -138,8 +138,8 @@ class MachineSystem:
 
     def _run_phase(self, runs: MemberRuns, phase: int, some: Int[np.ndarray, "b"]):
         ts, start, tol = self.ts[some], runs.t[some], self._units.drift_tol[some, None]
-        # The state here is an output, too, behind an event; machine code writes others up to the first that is infinite, and
-        # then the end.
+        # The state after an event may itself be due as an output. Machine code writes the later outputs, up to the first that is
+        # infinite, and then the end.
         b, k = np.nonzero(ts == start[:, None])
         if b.size:
             runs.qs[some[b], k], runs.vs[some[b], k] = runs.q[some[b]], runs.v[some[b]]

@@ -27,7 +27,7 @@ MOST_PHASES = 32  # each is compiled
 
 
 class Tables(NamedTuple):
-    """The phases that events lead to, as [phase][event]: hashable, so that what is compiled for them is found again."""
+    """The phases that events lead to, as [phase][event]: hashable, so that programs compiled for them are reused."""
 
     after: tuple[tuple[int, ...], ...]  # the phase that follows an event
     resting: tuple[tuple[int, ...], ...]  # the phase after a contact has come to rest

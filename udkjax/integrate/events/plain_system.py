@@ -48,7 +48,7 @@ def run_plain(hybrid: Hybrid) -> EventRun:
     window = Window(ts[-1] - ts[0], jnp.array(NO_EVENT), ts[0], jnp.array(False), ts[0], never)
     start = with_member(hybrid.first_state())
     runs = run_loop(system, runs_before(hybrid.plan, start, len(ts), hybrid.code[None], jnp, window))
-    # A condition may vary quickly before it becomes NaN: the result of the run tells that.
+    # A condition may vary quickly before it becomes NaN; the result of the run already tells of the NaN.
     unresolved = jnp.where(runs.undefined, jnp.inf, runs.window.unresolved[: hybrid.count])
     return jax.tree.map(lambda x: x[0], results(hybrid.plan, runs, ts[None], unresolved, jnp))
 
@@ -117,7 +117,7 @@ class PlainSystem:
         return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
 
     def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
-        """Integrate a window, and go on to its end; or to the last node before something crosses, or may; or to the crossing."""
+        """Integrate a window: to its end, to the last node before a certain or possible crossing, or to the crossing itself."""
         hybrid, ts, window, state = self.hybrid, self.hybrid.ts, runs.window, without_member(runs.state(None))
         t, E, T = state.t, hybrid.count, len(ts)
         output = jnp.searchsorted(ts, t) + np.arange(min(MOST_OUTPUTS, T))
@@ -130,7 +130,7 @@ class PlainSystem:
         nodes = (t + (end - t) * NODES).at[-1].set(end)
         times = jnp.sort(jnp.concatenate([nodes, jnp.clip(due, t, end)]))
         length = end - t
-        # Too short to integrate, or of no length, as of a member of a batch that something else happens to.
+        # Windows too short to integrate; those of members of a batch that are at another stage have no length at all.
         short = length <= 2 * hybrid.smallest
         clear = jnp.where(short, t + 100 * hybrid.smallest * np.arange(len(times)), times)
         raw = hybrid.flow(clear, state, derivatives=False)
@@ -168,7 +168,7 @@ class PlainSystem:
 
         node = jnp.where(stays, jnp.where(found.is_coarse, found.last_sure, place), len(nodes) - 1)
         last_good = jnp.where(jnp.all(good), len(times) - 1, jnp.maximum(jnp.sum(good) - 1, 0))
-        # Where a condition jumps, the event is the first time behind that.
+        # Where a condition jumps, the event happens at the first time after the jump.
         k = jnp.where(stays, at[jnp.where(is_located, found.behind, node)], last_good)
         t_new = times[k]
         rows = jnp.where((output < T) & (due < t_new), output, T)

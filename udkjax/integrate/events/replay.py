@@ -139,7 +139,7 @@ def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
     q, v = (jnp.full((T, n), jnp.inf).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
     last = (ts == found.time)[:, None]
     q, v = jnp.where(last, end.state.q, q), jnp.where(last, end.state.v, v)
-    first = jnp.cumsum(~found.together) - 1  # the number of the event that each happens with, and of itself if it is the first
+    first = jnp.cumsum(~found.together) - 1  # of each event, the rank of the group of simultaneous events to which it belongs
     first = jnp.flatnonzero(~found.together, size=K, fill_value=0)[first]
     times = jnp.full(K, jnp.inf).at[out.event].set(out.event_time, mode="drop")[first]
     qs, vs = (jnp.full((K, 2, n), jnp.inf).at[out.event].set(x, mode="drop")[first] for x in (out.event_q, out.event_v))
@@ -151,7 +151,7 @@ def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
 def _integrate_piece(
     system: PlainSystem, ts: Float[Array, "T"], found: EventRun, width: int, start: PieceStart
 ) -> tuple[PieceStart, PieceOutput]:
-    """Integrate to the next event, or as far as there is room for outputs, and apply the event."""
+    """Integrate to the next event, or until the space for outputs is full, and apply the event."""
     hybrid, (state, written, event, shift) = system.hybrid, start
     T, K = len(ts), len(found.event_time)
     output = written + np.arange(width)
@@ -190,7 +190,7 @@ def _apply_at_fixed_time(
     Args:
         system: the system.
         found: the run.
-        j: the number of the event in it.
+        j: the index of the event in the run.
         state: the state before it.
         shift: the change d of the time of the event before.
         again: whether no time has passed since then.

@@ -142,7 +142,7 @@ def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents], analysis: A
 
 
 def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
-    """Run, and return with the result why machine code does not serve each phase."""
+    """Run; return the result, and for each phase why machine code cannot integrate it."""
     phases, events, ts, state, closure, choices, max_events, conditions = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)

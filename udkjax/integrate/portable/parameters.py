@@ -1,4 +1,4 @@
-"""Parameters of a mechanism one number at a time, and the program that makes the numbers of its equations of them."""
+"""Parameters of a mechanism one number at a time, and the program that computes the numbers of its equations from them."""
 
 from collections.abc import Callable, Mapping, Sequence
 

@@ -22,11 +22,11 @@ EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
 DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 64, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
-# In an extension that requests metadata: the pointer to them, and in them the version of the interface that the handler uses.
+# In an extension that requests metadata: the pointer to the metadata; in the metadata: the version of the interface in use.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)  # major, minor
-# Words of the work that threads share: the number of threads that may still access it, the number that have started (and whether
-# it is closed), the number that have finished, the next member, and the call record of `run`.
+# Words of the work that threads share: the number of threads that may still access the work, the number that have started (plus
+# CLOSED once no more may start), the number that have finished, the next member, and the call record of `run`.
 USERS, BEGUN, ENDED, NEXT, CALL = range(5)
 CLOSED = 2**32
 
@@ -104,7 +104,7 @@ def _is_null(f: Function, pointer: Value) -> Value:
 
 
 def _thread_count(f: Function, frame: Value) -> Value:
-    """Count the threads of XLA's pool, at most `UDKJAX_THREADS`; one if there is none.
+    """Return the number of threads in XLA's pool, at most `UDKJAX_THREADS`; one if there is no pool.
 
     The pool has a thread for each core that the process may use. The limit is a constant of the text, as XLA calls the handler
     without Python.

@@ -111,6 +111,7 @@ class Function:
         return self.op(f"shufflevector {kind} {one.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
 
     def both(self, a: Operand, b: Operand) -> tuple[Value, Value]:
+        """Convert two operands to one type with the same number of lanes."""
         if isinstance(a, Value) and isinstance(b, Value) and a.base == b.base and a.width == b.width:
             return a, b
         width = max(x.width for x in (a, b) if isinstance(x, Value))

@@ -34,8 +34,8 @@ ROUNDING_GROWTH = 3e-14
 # configuration is still ahead: then the distance at the end is less than EXPECTED times the extrapolated one.
 SURE, EXPECTED = 0.85, 0.3
 
-# Breakpoints: a step ends two units of rounding of the time before a breakpoint, and the next begins a unit after it. Breakpoints
-# closer to one another than the smallest step count as one.
+# Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
+# Breakpoints closer to one another than the smallest step count as one.
 SMALLEST_STEP = 100.0  # in units of rounding of the end time; time would not advance by shorter steps
 UNIT = 1 / SMALLEST_STEP  # a unit of rounding, as a fraction of the smallest step
 ENDS_BEFORE, BEGINS_BEHIND = 2 * UNIT, UNIT
@@ -43,7 +43,7 @@ GAP = ENDS_BEFORE + BEGINS_BEHIND
 
 # Pieces of the state.
 EDGE = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of the square
-# Fraction of a step. Nearer to either end than this, the end of a piece is located to rounding from the state at that end.
+# Fraction of a step. The end of a piece nearer than this to an end of the step is located to rounding from the state there.
 NEAR_END = 0.01
 # A repeated step ends slightly beyond the end of a piece; or just before it, once it has been located; or leads across it.
 AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
@@ -51,8 +51,9 @@ HALVINGS = 40
 TRIES = 8  # successive attempts to end a step at the end of a piece: at rest there, rounding decides which piece applies
 
 POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
-# Fraction of a step. If less remained for the last step, the remaining time is halved instead. Outputs of the first step wait for
-# the second, and interpolation through a pair of close points amplifies rounding: to 1e-4 m/s if the last step is 1 / 300.
+# Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the
+# first step wait for the second, and interpolation through a pair of close points amplifies rounding: to 1e-4 m/s if the last
+# step is 1 / 300.
 SHORTEST_LAST = 0.25
 STRETCH = 12.0  # largest ratio of the last step to those before: steps grow at most tenfold
 
@@ -73,14 +74,15 @@ LOST_TOL = 1e-2
 
 LOOK_AHEAD = 1e-6  # fraction of the span after the end of a stopped run that is searched for non-finite numbers
 
-# Weight of the error component normal to the manifold. Projection removes it, so only its effect within the step remains. Near
-# singular configurations it is the stages' distance from the manifold over a small singular value: with weight one, runs took up
-# to six times as many steps at tolerances of 1e-11. A weight of 1e-2 keeps some of these steps; with zero, runs across singular
-# configurations are less accurate than their tolerance.
+# Weight of the error component normal to the manifold. Projection removes this component, so that only its effect within the step
+# remains. Near singular configurations it is the stages' distance from the manifold over a small singular value: with weight one,
+# runs took up to six times as many steps at tolerances of 1e-11. With 1e-2 some of these steps are left; with zero, runs across
+# singular configurations are less accurate than their tolerance.
 NORMAL_ERROR_WEIGHT = 1e-3
 
-# Thresholds of a pivot, relative to its diagonal entry of D D^T. Below the first it is rounding. Rows of outputs with pivots
-# below the second, the root of a unit of rounding, are not projected: rounding errors would dominate their velocities.
+# Thresholds of a pivot, relative to its diagonal entry of D D^T. A pivot below the first is a rounding error. Rows of outputs
+# with pivots below the second, the root of a unit of rounding, are not projected: rounding errors would dominate their
+# velocities.
 ROUNDING_PIVOT, OUTPUT_PIVOT_TOL = 1e-14, 1e-8
 
 OUTPUT_STEPS = 7  # Newton steps for an output: where two branches of the manifold meet, each only halves the distance
@@ -90,5 +92,5 @@ NEWTON_TOL = 1e-8
 # Tolerance of Psi at an output after its projection, each row over its scale: Newton's last step leaves far less, and
 # interpolation without projection far more. If it is exceeded, the output is closed on all rows.
 OPEN_OUTPUT = 1e-9
-# Outputs nearer to the manifold take a single Newton step in q and v: its residual is the square of the distance.
+# Outputs nearer to the manifold take a single Newton step in q and v, which leaves a residual of the distance squared.
 SINGLE_STEP_TOL = 1e-7

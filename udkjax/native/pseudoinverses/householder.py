@@ -16,7 +16,9 @@ from udkjax.native.pseudoinverses.qr import (
 
 @dataclass(frozen=True)
 class HouseholderCode(DenseMethod):
-    """D = Q T G, with T the pivot columns of R and G = T^(-1) R: rows e_f - sum_i G_if e_(pivot i) span the null space of D.
+    """D = Q R = Q T G, with T the pivot columns of R and G = T^(-1) R.
+
+    The null space of D is spanned by a row for each column f without a pivot: e_f - sum_i G_if e_(pivot i).
 
     The basic solution solves with T; reflections of the basis of the null space then remove its component in the null space.
     """

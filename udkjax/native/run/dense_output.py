@@ -14,21 +14,22 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
     inverse, used = _spacing(module, f, s)
     with f.each(module.registers(pointer)) as r:
         known = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
-        column = [x for x in known["q"] for _ in range(3)]
+        column = [x for x in known["q"] for _ in range(3)]  # each point is a triple node, of its q, v and a (Hermite)
         given = {1: known["v"], 2: [a * 0.5 for a in known["a"]]}
         module.put(f, "difference0", r, column[0], pointer)
         for degree in range(1, 3 * POINTS):
             following = []
             for i in range(3 * POINTS - degree):
-                one, two = i // 3, (i + degree) // 3
-                following.append(given[degree][one] if one == two else (column[i + 1] - column[i]) * inverse[one, two])
+                first, last = i // 3, (i + degree) // 3  # points
+                difference = given[degree][first] if first == last else (column[i + 1] - column[i]) * inverse[first, last]
+                following.append(difference)
             column = following
             mask = used[degree // 3]
             module.put(f, f"difference{degree}", r, column[0] if mask is None else f.select(mask, column[0], 0.0), pointer)
 
 
 def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int], Value], list[Value | None]]:
-    """Return the inverse of the time between each two points, and whether the polynomial uses each point (None: always)."""
+    """Return the inverse of the time between any two points, and whether the polynomial uses each point (None: always)."""
     times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
     step = times[0] - times[1]
     inverse: dict[tuple[int, int], Value] = {}
@@ -37,11 +38,11 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
             d = times[j] - times[i]
             inverse[i, j] = module.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
     used: list[Value | None] = [None, None]
-    sofar: Value | None = None
+    all_near: Value | None = None
     for k in range(1, POINTS - 1):
         near = (times[k] - times[k + 1]) * STRETCH >= step
-        sofar = near if sofar is None else sofar & near
-        used.append(sofar)
+        all_near = near if all_near is None else all_near & near
+        used.append(all_near)
     return inverse, used
 
 
@@ -58,12 +59,12 @@ def write_differences_back(module: Module):
             mine = mine if mask is None else f.select(mask, mine, 0.0)
             here = [zero] * (count - degree)
             for i, bar in enumerate(column):  # cotangents of the next column
-                one, two = i // 3, (i + degree + 1) // 3
-                if one == two:
+                first, last = i // 3, (i + degree + 1) // 3  # points
+                if first == last:
                     x, share = ("v", bar) if degree == 0 else ("a", bar * 0.5)
-                    bars[x][one] = bars[x][one] + share
+                    bars[x][first] = bars[x][first] + share
                 else:
-                    part = bar * inverse[one, two]
+                    part = bar * inverse[first, last]
                     here[i + 1] = here[i + 1] + part
                     here[i] = here[i] - part
             here[0] = here[0] + mine

@@ -73,14 +73,14 @@ def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: 
     """Return q and v at a fraction `share` of the step, on the polynomial through its two ends (one register)."""
     x, h = module.broadcast(f, share), module.broadcast(f, step)
 
-    def along(*coefficients: float) -> Value:
+    def polynomial(*coefficients: float) -> Value:
         total = f.const(coefficients[-1], DOUBLE, module.plan.vector)
         for c in reversed(coefficients[:-1]):
             total = f.fma(total, x, c)
         return total
 
     ends = [module.vector(f, name, r) for name in ("point3 q", "corrected q", "point3 v", "result v", "point3 a", "result a")]
-    weights = [
+    hermite = [  # coefficients of the quintic polynomial that belongs to each end value, the constant first
         (1.0, 0.0, 0.0, -10.0, 15.0, -6.0),
         (0.0, 0.0, 0.0, 10.0, -15.0, 6.0),
         (0.0, 1.0, 0.0, -6.0, 8.0, -3.0),
@@ -90,8 +90,8 @@ def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: 
     ]
     scales = (None, None, h, h, h * h, h * h)
     q = v = f.const(0.0, DOUBLE, module.plan.vector)
-    for end, c, scale in zip(ends, weights, scales, strict=True):
+    for end, c, scale in zip(ends, hermite, scales, strict=True):
         scaled = end if scale is None else end * scale
-        q = f.fma(along(*c), scaled, q)
-        v = f.fma(along(*(k * c[k] for k in range(1, 6))), scaled, v)
+        q = f.fma(polynomial(*c), scaled, q)
+        v = f.fma(polynomial(*(k * c[k] for k in range(1, 6))), scaled, v)
     return q, v / h

@@ -62,7 +62,7 @@ class Reader:
         return self.take(self.number())
 
     def name(self) -> str:
-        """Read a text that follows its length."""
+        """Read a string that follows its length."""
         return self.block().decode()
 
 

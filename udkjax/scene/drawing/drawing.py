@@ -63,7 +63,7 @@ class Drawing(AbstractDrawing):
         velocities: Initial velocities of pins (m/s); the others are at rest. A link moves as its first two pins do.
         gravity: The acceleration of gravity, by default 9.81 m/s^2 along -y.
         name: The name of the mechanism.
-        units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a text with
+        units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a string with
             its unit, such as "60 rpm".
 
     Raises:

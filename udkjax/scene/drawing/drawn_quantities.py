@@ -67,7 +67,7 @@ class Units:
                     self.problems.append(f"units.{kind}: {problem}")
 
     def convert(self, path: str, value: object, unit: str, problems: list[str]) -> object:
-        """Convert a number, a text with its unit, or nested lists of them, to SI units; None if it is added to the problems."""
+        """Convert a number, a string with its unit, or nested lists of them, to SI units; None if it is added to the problems."""
         if isinstance(value, list | tuple):
             found = [self.convert(f"{path}[{i}]", item, unit, problems) for i, item in enumerate(value)]
             return None if any(x is None for x in found) else found

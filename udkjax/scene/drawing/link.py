@@ -172,5 +172,5 @@ class DrawnBody(NamedTuple):
 
 
 def with_concrete_numbers(tree):
-    """Return a tree with NumPy arrays in place of concrete ones, so that results of these alone stay concrete."""
+    """Return a tree with NumPy arrays in place of concrete ones, so that results of concrete numbers only stay concrete."""
     return jax.tree.map(lambda x: x if isinstance(x, Tracer) else np.asarray(x), tree)

@@ -112,7 +112,7 @@ class DrawnElement(PrintsLine):
 
     @abstractmethod
     def mistakes(self, layout: PinLayout) -> Iterator[str]:
-        """Iterate over its mistakes in a layout, each a key and a text; all names exist."""
+        """Iterate over its mistakes in a layout, each a key and a message; all names exist."""
 
     @abstractmethod
     def parts(self, placement: Placement) -> Parts:

@@ -29,7 +29,7 @@ COMPLEX_STEP = 1e-100  # its square is negligible relative to 1, and its product
 
 
 def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Pass concrete numbers to a function of the library as NumPy arrays, so that results of these alone stay concrete."""
+    """Pass concrete numbers to a function of the library as NumPy arrays, so that results of only these stay concrete."""
     parameters, build_deferred = signature(build), deferred_if_traced(build)
 
     @wraps(build)

@@ -30,7 +30,7 @@ MOST_REFUSED_STEPS = 8  # successive rejected steps before a fit is given up
 ROUNDING = 4 * float(np.finfo(float).eps)  # relative to the unknowns: shorter steps are rounding
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
-ReportStep: TypeAlias = Callable[[str], None]  # called with a text after each step
+ReportStep: TypeAlias = Callable[[str], None]  # called with a message after each step
 CostHistory: TypeAlias = list[tuple[float, float]]  # after each step: cost, and largest change of an unknown in the next step
 
 

@@ -139,7 +139,7 @@ def estimate_uncertainty(
 
     `noise_group` is the group (0, 1, ...) of residuals with a common unknown noise, or -1 if the noise is known (the default).
     The first `parameters` unknowns, by default all, are the parameters. The last rows are those of `priors`: directions that only
-    they determine have the priors' uncertainty, however much better others are measured.
+    they determine have the priors' uncertainty, however well the other directions are measured.
     """
     K, P = len(values.names), len(values.names) if parameters is None else parameters
     size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
@@ -156,11 +156,11 @@ def estimate_uncertainty(
     directions, flats = (_insert_columns(rows, alive, K) for rows in (vt, free))
     lost = np.any(flats != 0.0, axis=0)
     lost[np.setdiff1d(np.arange(K), alive)] = True
-    root = directions[shown].T / sigma[shown] * np.asarray(values.dx_dz)[:, None]  # (K, D)
-    every = root @ root.T * (1.0 if noise_known else np.nan)
-    every[lost] = every[:, lost] = np.nan
-    every_error = np.where(lost, np.inf, np.sqrt(np.diag(every)))
-    errors, covariance = every_error[:P], every[:P, :P]
+    factor = directions[shown].T / sigma[shown] * np.asarray(values.dx_dz)[:, None]  # (K, D)
+    of_all = factor @ factor.T * (1.0 if noise_known else np.nan)  # covariance of parameters and initial states
+    of_all[lost] = of_all[:, lost] = np.nan
+    all_errors = np.where(lost, np.inf, np.sqrt(np.diag(of_all)))
+    errors, covariance = all_errors[:P], of_all[:P, :P]
     correlation = covariance / np.outer(errors, errors)
     np.fill_diagonal(correlation, 1.0)
     np.fill_diagonal(covariance, errors**2)
@@ -177,7 +177,7 @@ def estimate_uncertainty(
         degrees_of_freedom=len(r) - int(shown.sum()),
         noise=noise,
         projection=u[:, shown],
-        state_errors=every_error[P:],
+        state_errors=all_errors[P:],
     )
 
 
@@ -202,7 +202,7 @@ def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.nda
 
 
 def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the factor s of each group of residuals; NaN if it has no more residuals than unknowns that it determines."""
+    """Return the factor s of each group of residuals; NaN if a group has no more residuals than unknowns that it determines."""
     groups = [np.flatnonzero(group == g) for g in range(group.max(initial=-1) + 1)]
     sums, counts = np.array([r[g] @ r[g] for g in groups]), np.array([len(g) for g in groups], float)
     # The factor R of QR replaces the rows of a group: only their J^T J is needed.

@@ -170,7 +170,7 @@ def initial_state_unknowns(
     mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
 ) -> tuple[tuple[InitialStateUnknowns, ...], Int[np.ndarray, "records S"], Float[np.ndarray, "records 2 n S"]]:
     """Return the unknowns of all initial states, their indices in z for each record (-1: unused), and the changes of q and v."""
-    found: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # by the name of a start, or the number of its record
+    found: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # by the name of a start, or the index of its record
     at, problems = len(unknowns.names), []
     for k, record in enumerate(records):
         start, key = record.start, record.start.name or k

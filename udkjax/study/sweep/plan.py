@@ -202,7 +202,7 @@ def make_plan(
 
 
 def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:
-    """Return the number of the structure of each choice of an axis."""
+    """Return, for each choice of an axis, the index of the first choice with the same structure."""
     structures = [
         (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in values
     ]

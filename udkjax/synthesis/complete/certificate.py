@@ -41,7 +41,7 @@ class Certificate(NamedTuple):
     is_proven: np.ndarray
 
     def take(self, which: np.ndarray) -> "Certificate":
-        """Return some of them."""
+        """Return the boxes that `which`, a mask or indices, selects."""
         return Certificate(*(a[..., which] for a in self))
 
     @property

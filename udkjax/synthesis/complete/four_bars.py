@@ -41,7 +41,7 @@ class FourBars(NamedTuple):
     P: np.ndarray
 
     def take(self, which: np.ndarray) -> "FourBars":
-        """Return some of them."""
+        """Return the four-bars that `which`, a mask or indices, selects."""
         return FourBars(self.O[which], self.C[which], self.A[which], self.B[which], self.P)
 
     def swapped(self) -> "FourBars":
