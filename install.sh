@@ -25,7 +25,7 @@ s.exit(not ok or bool(c.get_config_var("Py_GIL_DISABLED")) or s.argv[1][:2] == "
 suits() { "$1" -c "$check" "${2:-any}" 2>/dev/null </dev/null; }
 found() { # constraints.txt was tested up to 3.13; for 3.11 there is an older JAX only
     for version in ${wanted:-3.13 3.12 3.14 3.11}; do
-        for name in "python$version" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version".*/bin/python3 "$other"; do
+        for name in "python$version" "${PYENV_ROOT:-${HOME:-}/.pyenv}/versions/$version".*/bin/python3 "$other"; do
             suits "$name" "$version" && return
         done
     done && return 1

@@ -1,9 +1,11 @@
 """Runs by machine code compose with every transformation of JAX, and what is compiled is kept safely on disk."""
 
+import itertools
 import os
 import re
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -19,6 +21,7 @@ from udkjax.native.base import code_cache, machine
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.memory import Memory
 from udkjax.native.derivatives import record
+from udkjax.show import doctor
 
 TS = np.array([0.0, 0.2, 0.4, 0.6])
 PENDULUM = udk.library.compound_pendulum()
@@ -220,10 +223,50 @@ def test_a_file_that_is_not_whole_is_made_again(folder, spoil):
 
 
 def test_the_folder_stays_bounded(folder, monkeypatch):
-    monkeypatch.setattr(code_cache, "MAX_FILES", 3)
+    assert answer() == 42.0
+    monkeypatch.setattr(code_cache, "MAX_BYTES", 3 * code_cache.cached_files()[0][1])
+    monkeypatch.setattr(code_cache, "WRITES_OF_CHECK", 1)
     for k in range(5):
         assert answer(TEXT.replace("4.2e1", f"{k}.0")) == k
     assert len(list(folder.iterdir())) == 3
+
+
+def test_the_least_recently_used_files_are_deleted(folder, monkeypatch):
+    """Reading a file marks it as used, at most once a day."""
+    monkeypatch.setattr(code_cache, "_writes", iter([1, 2, 3, 0]))
+    for name, days in (("daily", 40), ("never", 30), ("today", 0)):
+        code_cache.write(name, bytes(1000))
+        os.utime(folder / name, (time.time(), time.time() - days * 86_400 - 60))
+    before = (folder / "today").stat().st_mtime
+    assert code_cache.read("daily") == code_cache.read("today") == bytes(1000)
+    assert (folder / "today").stat().st_mtime == before
+    monkeypatch.setattr(code_cache, "MAX_BYTES", 3500)
+    code_cache.write("new", bytes(1000))
+    assert {file.name for file in folder.iterdir()} == {"daily", "today", "new"}
+
+
+def test_the_folder_is_listed_once_in_many_writes(folder, monkeypatch):
+    listed = []
+    monkeypatch.setattr(code_cache, "cached_files", lambda: listed.append(0) or [])
+    monkeypatch.setattr(code_cache, "_writes", itertools.count())
+    for k in range(code_cache.WRITES_OF_CHECK + 1):
+        code_cache.write(str(k), b"")
+    assert len(listed) == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="homes are found otherwise")
+@pytest.mark.parametrize("choice", ["", "~/code"])
+def test_a_user_without_a_home_gets_no_cache(tmp_path, monkeypatch, choice):
+    import pwd
+
+    monkeypatch.setattr(pwd, "getpwuid", dict[int, object]().__getitem__)  # KeyError, as for a user without a name
+    monkeypatch.setenv("UDKJAX_CACHE", choice)
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert answer() == 42.0
+    assert code_cache.cache_folder() is None and list(tmp_path.iterdir()) == []
+    assert any("set UDKJAX_CACHE to a folder" in line for line in doctor._advice("native", ""))
 
 
 def test_a_folder_that_cannot_be_written_is_no_obstacle(folder, monkeypatch):

@@ -13,7 +13,7 @@ import numpy as np
 from udkjax.extras import EXTRAS
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native.base.code_cache import cache_folder, cached_files
+from udkjax.native.base.code_cache import cache_folder, cached_files, is_writable
 from udkjax.native.base.machine import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor
@@ -61,7 +61,9 @@ def summary(found: dict[str, Any]) -> str:
     """Describe the findings of `facts`."""
     cached = f"{found['cached_programs']} in {found['cache']}, {found['cached_bytes'] / 2**20:.1f} MiB"
     if found["cache"] is None:
-        cached = "nothing, because UDKJAX_CACHE=0 is set"
+        cached = "nothing, because " + (
+            "UDKJAX_CACHE=0 is set" if os.environ.get("UDKJAX_CACHE") == "0" else "there is no home folder"
+        )
     lines = {
         **found["versions"],
         "missing extras": ", ".join(found["missing_extras"]) or "none",
@@ -85,3 +87,7 @@ def _advice(engine: str, reason: str) -> Iterator[str]:
         yield "float64 is off, so loops close only to single precision: unset JAX_ENABLE_X64, or set it to 1"
     if engine != "native":
         yield f"machine code is not used here ({reason}): simulations take up to a hundred times as long"
+    folder = cache_folder()
+    if os.environ.get("UDKJAX_CACHE") != "0" and (folder is None or not is_writable(folder)):
+        place = "without a home folder" if folder is None else f"in {folder}"
+        yield f"machine code cannot be stored {place}, and is compiled in each process: set UDKJAX_CACHE to a folder"

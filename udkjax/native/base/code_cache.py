@@ -1,26 +1,43 @@
 """The cache of machine code on disk.
 
-It holds object code under a digest of the text, the processor and the compiler. Incomplete files are compiled again; the oldest
-are deleted when there are too many.
+It holds object code under a digest of the text, the processor and the compiler. Incomplete files are compiled again; the least
+recently used are deleted when they take too much space.
 """
 
 import hashlib
+import itertools
 import os
 import tempfile
+import time
 from pathlib import Path
 
 import platformdirs
 
-MAX_FILES = 5_000  # object files of 10 to 75 KiB, 150 MB in all
+MAX_BYTES = 2**28  # limit of the stored code; a file has 10 to 75 KiB
+WRITES_OF_CHECK = 500  # writes of a process from one check of the limit to the next; listing thousands of files takes 20 ms
+TOUCH_AFTER = 86_400.0  # s: a file's time of last use is this accurate, so that reading rarely writes
 _MAGIC = b"udkjax object 1\n"
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of stored code: the user's cache folder, or `UDKJAX_CACHE`; None if that is 0."""
+    """Return the folder of stored code, `UDKJAX_CACHE` or the user's cache folder; None if that is 0 or the user has no home."""
     choice = os.environ.get("UDKJAX_CACHE", "").strip()
     if choice == "0":
         return None
-    return Path(choice).expanduser() if choice else platformdirs.user_cache_path("udkjax")
+    try:
+        folder = Path(choice).expanduser() if choice else platformdirs.user_cache_path("udkjax")
+    except RuntimeError:  # "~" without a home
+        return None
+    return folder if choice or folder.is_absolute() else None  # without a home platformdirs returns "~/.cache/udkjax"
+
+
+def is_writable(folder: Path) -> bool:
+    """Return whether files can be written into a folder, which is created if necessary."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
 
 
 def cached_files() -> list[tuple[float, int, Path]]:
@@ -31,7 +48,7 @@ def cached_files() -> list[tuple[float, int, Path]]:
             if file.is_dir():  # JAX's own cache
                 continue
             status = file.stat()
-            found.append((max(status.st_atime, status.st_mtime), status.st_size, file))
+            found.append((status.st_mtime, status.st_size, file))
     except OSError:  # the folder does not exist yet, or another process has just removed a file
         pass
     return found
@@ -40,14 +57,25 @@ def cached_files() -> list[tuple[float, int, Path]]:
 def read(name: str) -> bytes | None:
     """Return the stored code of this name; None if the file is missing or incomplete."""
     folder = cache_folder()
+    if folder is None:
+        return None
     try:
-        data = (folder / name).read_bytes() if folder else b""
+        data = (folder / name).read_bytes()
     except OSError:
         return None
+    _touch(folder / name)
     head, code = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :]
     if not head.startswith(_MAGIC) or hashlib.sha256(code).digest() != head[len(_MAGIC) :]:
         return None
     return code
+
+
+def _touch(file: Path) -> None:
+    try:
+        if time.time() - file.stat().st_mtime > TOUCH_AFTER:
+            os.utime(file)
+    except OSError:  # a folder of someone else, or the file has just been removed
+        pass
 
 
 def write(name: str, code: bytes) -> None:
@@ -65,9 +93,21 @@ def write(name: str, code: bytes) -> None:
         except OSError:  # a full disk: remove the partial file
             Path(temporary).unlink(missing_ok=True)
             raise
-        files = [p for p in folder.iterdir() if p.is_file()]
-        if len(files) > MAX_FILES:
-            for old in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) - MAX_FILES]:
-                old.unlink(missing_ok=True)
+        if next(_writes) % WRITES_OF_CHECK == 0:
+            _evict()
     except OSError:  # not writable: run without a cache
         return
+
+
+_writes = itertools.count()  # of this process
+
+
+def _evict() -> None:
+    """Delete the least recently used files above the limit."""
+    files = sorted(cached_files())
+    excess = sum(size for _, size, _ in files) - MAX_BYTES
+    for _, size, file in files:
+        if excess <= 0:
+            return
+        file.unlink(missing_ok=True)
+        excess -= size
