@@ -39,8 +39,8 @@ def make():
     before, after = (abs(np.asarray(v)[blows, 0, 2]) for v in (events.v_before, events.v_after))
     facts = {
         "blows until it rests": len(blows),
-        "rate behind a blow over that before it": float(np.median(after / before)),
-        "rate before the second blow over that behind the first": float(before[1] / after[0]),
+        "rate after a blow over that before it": float(np.median(after / before)),
+        "rate before the second blow over that after the first": float(before[1] / after[0]),
     }
     return facts, {"motion": udk.animate(mech, sol, traces=["H"], live=LIVE, events=[anvil])}
 

@@ -78,7 +78,7 @@ class CompiledMechanism:
 
     @cached_property
     def textbook(self) -> TextbookEquations:
-        """The equations of a mechanism, whatever formulation is around them."""
+        """The equations of a mechanism, without the formulation that may contain them."""
         return textbook_of(self.equations)
 
 
@@ -131,7 +131,7 @@ def _reason_for_diffrax(
     adjoint: "diffrax.AbstractAdjoint | None",
     meter: "diffrax.AbstractProgressMeter | None",
 ) -> str:
-    """Return the reason why machine code cannot integrate equations, whatever the scene is; empty where it can."""
+    """Return the reason why machine code cannot integrate equations of any scene; empty where it can."""
     if adjoint is not None:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
@@ -142,7 +142,7 @@ def _reason_for_diffrax(
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
-    """Return the reason why machine code cannot evaluate equations, whatever the scene is; empty where it can."""
+    """Return the reason why machine code cannot evaluate equations of any scene; empty where it can."""
     formulation = None
     if isinstance(equations, FormulatedSystem):
         equations, formulation = equations.equations, equations.formulation
@@ -152,7 +152,7 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
 
 
 def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = None) -> str:
-    """Return why machine code cannot evaluate equations by a method and a formulation, whatever the scene is; empty if it can."""
+    """Return why machine code cannot evaluate equations of any scene by a method and a formulation; empty if it can."""
     try:
         MethodCode.of(method, formulation)
     except UnsupportedError as unknown:
@@ -165,7 +165,7 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
 
 
 def textbook_of(equations: AbstractSystem) -> TextbookEquations:
-    """Return the equations of a mechanism, whatever formulation is around them."""
+    """Return the equations of a mechanism, without the formulation that may contain them."""
     inner = equations.equations if isinstance(equations, WrappedSystem) else equations
     assert isinstance(inner, TextbookEquations)  # a user's own system has textbook equations
     return inner

@@ -54,7 +54,7 @@ def integrate(problem: Problem) -> IntegratorOutput:
 
 
 class RecordedRun(NamedTuple):
-    """The record of a run, from which reverse mode walks back."""
+    """The record of a run, through which reverse mode goes back."""
 
     record: Array
     states: tuple[Array, ...]  # q and v (T, n), if there are outputs between the first and the last
@@ -62,7 +62,7 @@ class RecordedRun(NamedTuple):
 
 
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, RecordedRun]:
-    """Integrate a problem by the code that `vjp` takes: no other is compiled. Return the record that it walks back from, too."""
+    """Integrate a problem by the code of `vjp`, so that no other is compiled; return the record for `vjp`, too."""
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
     none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     found = native_p.bind(*run_inputs(problem, operation), *none, operation=operation, times=times)
@@ -169,7 +169,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
 
 
 class SceneInputs(NamedTuple):
-    """The inputs of machine code that the equations of a mechanism decide on, whatever its states are."""
+    """The inputs of machine code that the equations of a mechanism determine, independent of its states."""
 
     numbers: list[Any]  # all numbers of the scene, and the gains
     thresholds: list[Any]  # two, of pivots
@@ -180,7 +180,7 @@ class SceneInputs(NamedTuple):
 
 
 def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
-    """Return the inputs that equations decide on, with the numbers of `mechanism`: without samples, or at a time."""
+    """Return the inputs that equations determine, with the numbers of `mechanism`: without samples, or at a time."""
     textbook = textbook_of(equations)
     method: Any = textbook.method
     rank_tol = method.rank_tol

@@ -122,7 +122,7 @@ class ConcreteRates:
 
 
 def equations_for_diffrax(problem: Problem) -> AbstractSystem:
-    """Return the equations of a problem as an integrator of diffrax's takes them: by machine code, where there is some."""
+    """Return the equations of a problem for an integrator of diffrax: by machine code, if there is any."""
     if problem.compiled.plan.evaluation is None:
         return problem.equations
     marks = mark_rows(problem.compiled, problem.ts[0], problem.q, problem.v, problem.length, problem.rate)

@@ -19,7 +19,7 @@ LEAST_ATOL = np.finfo(float).eps
 
 
 class FinishedRun(NamedTuple):
-    """A run as the integrator leaves it."""
+    """A run as the integrator returns it."""
 
     raw: IntegratorOutput
     ts: Float[Array, "T"]
@@ -34,7 +34,7 @@ def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
 
 
 def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: Array | None) -> Bool[Array, ""]:
-    """Tell whether numbers are what `simulate` lets in: of those that are traced when it is called it sees the shapes alone."""
+    """Tell whether numbers are valid for `simulate`, which sees only the shapes of traced ones."""
     finite = jnp.all(jnp.isfinite(jnp.concatenate([q, v])))
     tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol >= LEAST_ATOL) & (rtol + atol < jnp.inf) & (drift_tol > 0)
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))

@@ -66,7 +66,7 @@ class Choices(NamedTuple):
         return self.engine == "diffrax" or others
 
     def arrays(self) -> "Choices":
-        """Return the same with arrays of JAX in place of plain numbers, which compiled programs would take as fixed."""
+        """Return the choices with arrays of JAX in place of plain numbers, which would be constants of compiled programs."""
         dt0 = None if self.dt0 is None else number(self.dt0)
         return self._replace(rtol=number(self.rtol), atol=number(self.atol), drift_tol=number(self.drift_tol), dt0=dt0)
 
@@ -93,7 +93,7 @@ class Beginning(NamedTuple):
 
 
 def begin(mechanism: Mechanism, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
-    """Analyse a mechanism, and assemble its guess at the time t (s), where that is not given."""
+    """Analyse a mechanism, and assemble its guess at the time t (s), unless these are given."""
     analysis = analyse(mechanism) if analysis is None else analysis
     moves = ""
     if state is None and closure is None:
@@ -112,7 +112,7 @@ class PreparedRun(NamedTuple):
     problem: Problem
     ts: Float[Array, "T"]  # as they were given
     state_shape: tuple[int, ...]
-    is_usable: Bool[Array, ""]  # whether all numbers are what `simulate` lets in
+    is_usable: Bool[Array, ""]  # whether all numbers are valid for `simulate`
     is_closed: Bool[Array, ""]  # whether the initial state is; True of one that was given
     has_missed_rows: Bool[Array, ""]  # whether the closed state takes rows that the method leaves out
 

@@ -43,7 +43,7 @@ class Problem:
 
     @property
     def textbook(self) -> TextbookEquations:
-        """The equations of a mechanism, whatever formulation is around them."""
+        """The equations of a mechanism, without the formulation that may contain them."""
         return self.compiled.textbook
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
@@ -55,7 +55,7 @@ class Problem:
 
 
 class IntegratorOutput(NamedTuple):
-    """A run as an integrator leaves it: `status` is one of `native.steps`, from `DONE` on."""
+    """A run as an integrator returns it: `status` is one of `native.steps`, from `DONE` on."""
 
     q: Float[Array, "T n"]  # NaN where it was not reached, or after the first lost output
     v: Float[Array, "T n"]
@@ -70,5 +70,5 @@ class IntegratorOutput(NamedTuple):
 
     @property
     def kept(self) -> Bool[Array, "T"]:
-        """True for outputs that were reached and do not lie behind the first lost one."""
+        """True for outputs that were reached, up to the first lost one."""
         return self.reached & (np.arange(self.reached.shape[-1]) <= self.lost)

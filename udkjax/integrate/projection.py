@@ -33,7 +33,7 @@ def error_after_projection(
 
 
 def violation(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:
-    """Return the largest of any row of Psi over its scale, also of those that the method leaves out."""
+    """Return the largest row of Psi over its scale, among all rows, including those that the method leaves out."""
     if not equations.constrained:
         return jnp.zeros(())
     equations, t, y = stop_gradients((equations, t, y))

@@ -75,8 +75,8 @@ def simulate(
         mechanism: the mechanism, or a `ConstrainedSystem`.
         ts: output times (T,) in s, increasing; the motion starts at ts[0].
         state: the initial `State`, taken as it is, or the `Closure` of an assembly. By default the scene's guess is assembled.
-        rtol: relative tolerance of every coordinate and velocity. Steps are taken as they are: nothing has derivatives by
-            tolerances, nor by `dt0`.
+        rtol: relative tolerance of every coordinate and velocity. The sizes of steps are held constant: nothing has
+            derivatives by tolerances, nor by `dt0`.
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
             their rates by 1/T of that, with L the characteristic length (`analyse`) and T the shortest of the characteristic
             time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. The same tolerances
@@ -240,7 +240,7 @@ _compiled, _deferred = eqx.filter_jit(_simulate), deferred(_simulate)
 def _finish(
     run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
 ) -> tuple[Solution, Any, Any]:
-    """Return the results of `_run`, of a run as the integrator leaves it."""
+    """Return the results of `_run` from those of the integrator."""
     problem, ts = run.problem, run.ts
     ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows)
     code, time = outcome(ending if xp is np else stop_gradients(ending), xp)
@@ -276,7 +276,7 @@ def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
 
 
 def _adjoint(adjoint: Any) -> Any:
-    """Return an adjoint of diffrax's; None where derivatives are those of JAX, which `ForwardMode` leaves them to."""
+    """Return diffrax's adjoint; None where JAX differentiates the steps, as with `ForwardMode`."""
     import diffrax
 
     return None if type(adjoint) is diffrax.ForwardMode else adjoint

@@ -40,7 +40,7 @@ def weights(last: int) -> np.ndarray:
 
 
 def _slope_weights() -> np.ndarray:
-    """Return the weights with which values at the nodes, a unit apart, make the derivative at zero."""
+    """Return the weights of values at the nodes, a unit apart, in the derivative at zero."""
     steps = nodes(FARTHEST_NODE)
     return weights(FARTHEST_NODE) * np.array([sum(-1 / m for m in steps if m != k) for k in steps])
 

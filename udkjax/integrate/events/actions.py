@@ -117,7 +117,7 @@ class Impact(Action):
 
 
 class Release(Action):
-    """Take a joint or driver away, from then on: one of the scene's, or what `Attach` or `Lock` has added, by its name.
+    """Remove a joint or driver from then on, by its name: one of the scene's, or one that `Attach` or `Lock` has added.
 
     Args:
         name: name of the joint or driver.

@@ -232,7 +232,7 @@ def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Ev
 
 
 def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
-    """Tell whether the numbers of events are what they must be: restitutions from 0 to 1, limits in order, contacts finite.
+    """Tell whether the numbers of events are valid: restitutions from 0 to 1, limits in order, contacts finite.
 
     Concrete numbers were checked before; this checks those that were traced.
     """

@@ -1,4 +1,4 @@
-"""The common part of runs with events, whatever their numbers are: tables of the phases, and kinds of the events."""
+"""The part of runs with events that does not depend on numbers: tables of the phases, and kinds of the events."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class EventPlan:
 
     @cached_property
     def changes(self) -> Bool[np.ndarray, "E"]:
-        """Mask of the events that do more than to take note or to stop."""
+        """Mask of the events that do more than record or stop."""
         return np.array([x.changes for x in self.actions])
 
     @cached_property

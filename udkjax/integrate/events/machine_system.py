@@ -204,7 +204,7 @@ class MachineSystem:
         return watch
 
     def _watch_before(self, plan: PhasePlan, watched: Int[np.ndarray, "C"]) -> Float[np.ndarray, "B K"]:
-        """Return the same before a run, with all that does not change."""
+        """Return the array of `_watch` before a run, with the entries that stay constant."""
         units, B = self._units, len(self.end)
         assert plan.run.conditions is not None  # it watches some
         room, ones = plan.run.conditions.number_count + 2 * len(watched), np.ones((B, 1))

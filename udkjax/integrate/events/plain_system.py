@@ -109,7 +109,7 @@ class PlainSystem:
         )
 
     def when(self, those: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the run with a change, or as it is."""
+        """Return the run with a change if the mask is true, else unchanged."""
         return jax.lax.cond(those[0], lambda runs: change(runs, None), lambda runs: runs, runs)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:

@@ -31,7 +31,7 @@ class RunState(NamedTuple):
 
 
 class EventRun(NamedTuple):
-    """The outputs and events of a run, infinite where it did not get. In tangents, fields without derivatives are None."""
+    """The outputs and events of a run, infinite for those it did not reach. In tangents, fields without derivatives are None."""
 
     q: Float[Any, "*m T n"]
     v: Float[Any, "*m T n"]

@@ -48,7 +48,7 @@ class System(Protocol):
         ...
 
     def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
-        """Evaluate some members at states, of phases in which no contact is at rest where `is_free`."""
+        """Evaluate some members at states; if `is_free`, in phases without contacts at rest."""
         ...
 
     def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:

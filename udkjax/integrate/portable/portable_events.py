@@ -1,4 +1,4 @@
-"""Events of a portable engine: what a page knows of them, and the operations by which it runs to the next and looks at states."""
+"""Events of a portable engine: their data for a page, and the operations that run to the next event and evaluate states."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -37,7 +37,7 @@ def solver_named(name: str) -> "diffrax.AbstractSolver":
 
 
 def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
-    """Return True if a solver is an explicit Runge-Kutta method with one tableau, as is the default, None."""
+    """Return True if a solver is an explicit Runge-Kutta method with one tableau, such as the default, None."""
     if solver is None:
         return True
     import diffrax

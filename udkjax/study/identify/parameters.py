@@ -74,7 +74,7 @@ class _Part(NamedTuple):
 
 
 def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
-    """Read parameters: texts, lengths, functions and `Parameter`s.
+    """Read parameters: strings, lengths, functions and `Parameter`s.
 
     Raises:
         IdentificationError: with every mistake.

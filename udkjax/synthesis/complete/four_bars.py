@@ -49,7 +49,7 @@ class FourBars(NamedTuple):
         return FourBars(self.C, self.O, self.B, self.A, self.P)
 
     def cognates(self) -> "tuple[FourBars, FourBars, FourBars]":
-        """Return Roberts's three four-bars of each: the point traces the same curve in all of them."""
+        """Return Roberts's three cognates of each four-bar: the point traces the same curve in all three."""
         return self, self._other(), self.swapped()._other()
 
     def _other(self) -> "FourBars":
