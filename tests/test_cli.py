@@ -57,6 +57,16 @@ def test_simulate_writes_a_file_that_can_be_trusted_and_a_picture(tmp_path, caps
         np.testing.assert_allclose(data.q.sel(body="link2", coordinate="x"), 1 + np.cos(angle) / 2, atol=1e-8)
 
 
+def test_a_scene_is_a_file_or_a_mechanism_of_the_library(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert udkjax("convert", "parallelogram", "found.toml") == 0
+    assert Path("found.toml").read_text() == udk.dumps(udk.library.parallelogram())
+    assert udkjax("check", "paralelogram") == udkjax("animate", "paralelogram", "--out", "page.html") == 2
+    assert capsys.readouterr().err.count("no such file; scenes of udkjax.library are andrews_squeezer, ") == 2
+    Path("parallelogram").write_text(udk.dumps(udk.library.simple_pendulum()))
+    assert udkjax("check", "parallelogram") == 0 and "pendulum" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_what_a_run_prints_is_measured(tmp_path, capsys):
     """Loose tolerances without stabilization: the error and the drift that are printed must be large, not the default's."""

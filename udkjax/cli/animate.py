@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from udkjax.cli.common import Json, fail, load, output_times, refuse, show
+from udkjax.cli.common import Json, fail, is_of_library, load, output_times, refuse, show
 from udkjax.cli.datasets import check_target
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # with further measures by name
 
 ANIMATION_SUFFIXES = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
-Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml")]
+Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml|NAME")]
 
 
 def animate(
@@ -46,7 +46,8 @@ def animate(
     A failed run is shown up to its end, with the cause, and the exit code is 1.
 
     Args:
-        files: runs written by `udkjax simulate` (NetCDF), or scenes (TOML or MJCF) to simulate.
+        files: runs written by `udkjax simulate` (NetCDF), or scenes (TOML, MJCF or names of `udkjax.library`) to
+            simulate.
         out: file to write: .html, a self-contained page; .gif or .mp4, a film; .svg, .png or .dxf, one pose.
         t1: end of the run of a scene (s).
         dt: time between outputs of the run of a scene (s).
@@ -108,7 +109,7 @@ def animate(
 
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":
     """Return the mechanism of a file, its run, and the file's further measures."""
-    if file.suffix.lower() in (".toml", ".xml"):
+    if file.suffix.lower() in (".toml", ".xml") or is_of_library(file) or not (file.suffix or file.exists()):
         mechanism, _ = load(file)
 
         import udkjax as udk

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene"]
 __all__ += ["channels_of", "choose_driver", "fail", "load", "measure_channels", "output_times", "refuse", "say", "show"]
 
-Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml")]
+Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.toml|MODEL.xml|NAME")]
 Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="write the results as JSON.")]
 MOST_TIMES = 10**7  # output times of a command: some gigabytes for a few bodies
 Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not show progress.")]
@@ -59,18 +59,30 @@ def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[s
 
 
 def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> tuple["Mechanism", str]:
-    """Read a scene and its text; for the options see `read_mjcf`."""
+    """Read a scene and its text, or make one of `udkjax.library` if no file has this name; for the options see `read_mjcf`."""
     import udkjax as udk
 
     try:
+        if is_of_library(scene) and not leave_out and key is None:
+            mechanism = getattr(udk.library, str(scene))()
+            return mechanism, udk.dumps(mechanism)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)  # including `MjcfWarning`
             mechanism = udk.read_mjcf(scene, leave_out, key) if leave_out or key is not None else udk.load(scene)
         for warning in caught:
             say(f"{scene}: {warning.message}")
         return mechanism, scene.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        refuse(f"cannot read {scene}: there is no such file; scenes of udkjax.library are {', '.join(udk.library.__all__)}")
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {scene}: {problem}")
+
+
+def is_of_library(scene: Path) -> bool:
+    """Return whether no file has this name, and a mechanism of `udkjax.library` has it."""
+    from udkjax.scene import library
+
+    return str(scene) in library.__all__ and not scene.exists()
 
 
 def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":
