@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import get_args
 
@@ -102,7 +103,7 @@ def test_choices_reach_the_simulation(tmp_path, choice):
 def test_the_choices_of_the_command_line_are_those_of_files():
     from udkjax.study.choices import CHOICES, choice
 
-    simulate = sys.modules["udkjax.cli.simulate"]
+    simulate = import_module("udkjax.cli.simulate")
     for setting, table in CHOICES.items():
         assert list(table) == list(get_args(getattr(simulate, setting.capitalize())))
         for name in table:

@@ -1,7 +1,7 @@
 """Trajectories by machine code are those that the equations of textbooks give, found in another way."""
 
 import inspect
-import sys
+from importlib import import_module
 from itertools import pairwise
 
 import diffrax
@@ -60,7 +60,7 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
 @pytest.fixture(autouse=True)
 def served(monkeypatch, request):
     """All of these runs are by machine code, but for those of tests that look themselves."""
-    seen, module = [], sys.modules["udkjax.integrate.simulate"]
+    seen, module = [], import_module("udkjax.integrate.simulate")
     finish = module._finish
 
     def finish_and_note(run, *given):
