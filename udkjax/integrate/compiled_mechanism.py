@@ -1,4 +1,4 @@
-"""Decisions on a mechanism before it runs: its equations, and the operation of machine code, or why there is none."""
+"""Preparation of a mechanism for runs: its equations, and its machine code or the reason why it has none."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The part of a run that follows from the structure of a mechanism and the choices, not from numbers."""
+    """The part of a run that depends on the structure of the mechanism and the choices, but not on numbers."""
 
     solver: "diffrax.AbstractSolver | None"
     projected: bool
     operation: RunStates | None  # the machine code that integrates the mechanism
     evaluation: Accelerate | None  # the machine code that evaluates its equations for diffrax; None: `TextbookEquations` in JAX
-    why_not_native: str  # why there is no machine code, or why it is not used; empty where it is used
+    why_not_native: str  # the reason why machine code does not integrate; empty if it does
     independent_rows: int = 0  # the number of rows that the method uses
 
     @cached_property
@@ -54,7 +54,7 @@ class RunPlan:
 
     @cached_property
     def marks_rows(self) -> bool:
-        """True if machine code takes marks of the rows of Psi that are independent."""
+        """True if machine code needs marks of the independent rows of Psi as input."""
         operation = self.operation or self.evaluation
         return operation is not None and operation.code.marks_rows
 
@@ -62,13 +62,13 @@ class RunPlan:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class CompiledMechanism:
-    """A mechanism prepared for runs with any times, states and tolerances: made once, and passed on.
+    """A mechanism prepared once for runs with any times, states and tolerances.
 
     The arrays of the equations and the breakpoints may be traced or batched.
     """
 
     equations: AbstractSystem
-    breakpoints: Float[Array, "k"] | None  # the times where the motion is not smooth, in any order; None: it is
+    breakpoints: Float[Array, "k"] | None  # the times where the motion is not smooth, in any order; None: always smooth
     plan: RunPlan = field(metadata={"static": True})
 
     @property
@@ -93,10 +93,10 @@ def compile_mechanism(
     meter: "diffrax.AbstractProgressMeter | None" = None,
     engine: str = "auto",
 ) -> CompiledMechanism:
-    """Return a mechanism, or a system of the user's own, as runs take it; the arguments are those of `simulate`.
+    """Prepare a mechanism, or a user-defined system, for runs; the arguments are those of `simulate`.
 
     Raises:
-        ValueError: machine code was asked for and cannot run it.
+        ValueError: machine code was requested but cannot integrate the system.
     """
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
     equations = equations_of(system, method, baumgarte, formulation, analysis)
@@ -120,7 +120,7 @@ def compile_mechanism(
 
 @cached_by_identity
 def compile_concrete(system: Mechanism, *choices: Any) -> CompiledMechanism:
-    """Return the same for a mechanism of concrete numbers, as NumPy arrays, since JAX would compile each operation."""
+    """Return `compile_mechanism` of concrete numbers, with NumPy arrays: JAX would compile a program for each operation."""
     compiled = compile_mechanism(system.without_origin, *choices)
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, compiled)
 
@@ -131,7 +131,7 @@ def _reason_for_diffrax(
     adjoint: "diffrax.AbstractAdjoint | None",
     meter: "diffrax.AbstractProgressMeter | None",
 ) -> str:
-    """Return the reason why machine code cannot integrate equations of any scene; empty where it can."""
+    """Return why machine code cannot integrate such equations, whatever the scene; empty if it can."""
     if adjoint is not None:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
@@ -142,7 +142,7 @@ def _reason_for_diffrax(
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
-    """Return the reason why machine code cannot evaluate equations of any scene; empty where it can."""
+    """Return why machine code cannot evaluate such equations, whatever the scene; empty if it can."""
     formulation = None
     if isinstance(equations, FormulatedSystem):
         equations, formulation = equations.equations, equations.formulation
@@ -152,7 +152,7 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
 
 
 def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = None) -> str:
-    """Return why machine code cannot evaluate equations of any scene by a method and a formulation; empty if it can."""
+    """Return why machine code cannot evaluate equations by a method and a formulation, whatever the scene; empty if it can."""
     try:
         MethodCode.of(method, formulation)
     except UnsupportedError as unknown:
@@ -166,13 +166,13 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
 
 def textbook_of(equations: AbstractSystem) -> TextbookEquations:
     """Return the equations of a mechanism, without the formulation that may contain them."""
-    inner = equations.equations if isinstance(equations, WrappedSystem) else equations
-    assert isinstance(inner, TextbookEquations)  # a user's own system has textbook equations
-    return inner
+    textbook = equations.equations if isinstance(equations, WrappedSystem) else equations
+    assert isinstance(textbook, TextbookEquations)  # also for a user-defined system
+    return textbook
 
 
 def eliminates(method: Pseudoinverse) -> bool:
-    """Return whether a method eliminates rows, and leaves out those that are redundant."""
+    """Return whether a method eliminates rows and leaves out the redundant ones."""
     return isinstance(method, Auto | Elimination)
 
 
@@ -197,7 +197,7 @@ def _method_code(equations: AbstractSystem) -> MethodCode:
 
 
 def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
-    """Return the operation that evaluates equations at single states; None where machine code cannot."""
+    """Return the operation that evaluates equations at single states; None if there is no machine code for them."""
     if not equations.constrained or _reason_for_equations(equations):
         return None
     inner = textbook_of(equations)
@@ -206,9 +206,9 @@ def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
 
 
 def _programs(equations: TextbookEquations) -> ScenePrograms:
-    """Return the programs of a scene: with pivots that are refused, where the method falls back on a rank-revealing one.
+    """Return the programs of a scene: small pivots are refused if the method has a rank-revealing fallback, else dropped.
 
-    `Elimination` drops the rows that depend on others, whether they are known or not; all others need them as input.
+    `Elimination` drops dependent rows even if they are unknown; all other methods need them as input.
     """
     policy = RankPolicy.REFUSE if isinstance(equations.method, Auto) else RankPolicy.DROP
     redundant = () if equations.redundant is None and isinstance(equations.method, Elimination) else equations.redundant

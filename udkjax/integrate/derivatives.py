@@ -1,8 +1,8 @@
 """Derivatives of a run, forward and reverse, of any order.
 
-A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and in reverse w -> J^T w, are machine
-code if it supports them, else diffrax's. The two form one linear map with its transpose, which is a primitive for JAX
-(linear_map.py): no derivative is ever transposed operation by operation.
+A run is a function x -> f(x) of its numbers. Its first derivatives, forward x' -> J x' and reverse w -> J^T w, are computed by
+machine code if possible, else by diffrax. Together they are one primitive of JAX, a linear map with its transpose
+(linear_map.py), so JAX never transposes a derivative operation by operation.
 """
 
 import operator
@@ -25,24 +25,24 @@ from udkjax.transforms.split_jvp import split_jvp
 from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
 
 CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the step controller
-SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # of `IntegratorOutput`: what has derivatives
+SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # indices of fields with derivatives
 
 
 def differentiable(problem: Problem, has_concrete_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
-    Numbers that do not depend on the variables are not differentiated, nor are those of the step controller (the sizes of steps
-    are held constant), nor times that were known before the problem was traced.
+    There are no derivatives by the numbers of the step controller (the sizes of steps are held constant), nor by times that were
+    concrete before the problem was traced.
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)
-    moves = isinstance(problem.ts, Tracer) and not has_concrete_times
-    return run_of_times(_integrate, problem) if moves else _integrate(problem)
+    has_varying_times = isinstance(problem.ts, Tracer) and not has_concrete_times
+    return run_of_times(_integrate, problem) if has_varying_times else _integrate(problem)
 
 
 def _integrate(problem: Problem) -> IntegratorOutput:
-    problem_of, inputs = split_numbers(problem)
-    return _run(DifferentiableRun(problem_of, problem.compiled.plan.is_native), inputs)
+    restore, inputs = split_numbers(problem)
+    return _run(DifferentiableRun(restore, problem.compiled.plan.is_native), inputs)
 
 
 @eqx.filter_custom_jvp
@@ -64,7 +64,7 @@ def _(primals, tangents):
         return list(_as_run(*at, raw)), linear.applied(direction)
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
-        """Return both by forward mode."""
+        """Return the run, and its change along the direction, by forward mode."""
         function, inputs = at
         raw, change = function.run_and_jvp(inputs, active, direction)
         return list(raw), change
@@ -78,7 +78,7 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _as_run(function: "DifferentiableRun", inputs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
-    """Return the results of a run, with the derivatives of the run."""
+    """Return `raw`, the results of a run, with the derivatives of that run attached."""
     del function, inputs
     return raw
 
@@ -94,7 +94,7 @@ def _(primals, tangents):
 class DifferentiableRun(DifferentiableFunction):
     """Positions and velocities at the output times, and at the end, as a function of the numbers of a problem.
 
-    Derivatives beyond the second are those of diffrax alone.
+    Third and higher derivatives are computed by diffrax.
     """
 
     problem: TreeOfNumbers
@@ -115,18 +115,18 @@ class DifferentiableRun(DifferentiableFunction):
         return self.run_and_jvp(inputs, active, tangents)[1]
 
     def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
-        problem, which = self.problem(inputs), self.problem.marks(active)
+        problem, mask = self.problem(inputs), self.problem.marks(active)
         if self._is_native(inputs, active):
             run = self.recorded(inputs, active)[1] if run is None else run
             q, v, y = cotangents
-            found = native_engine.vjp(problem, which, run, jnp.concatenate([q, v], axis=1), y)
-            pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (which, found)), strict=True)
+            gradient = native_engine.vjp(problem, mask, run, jnp.concatenate([q, v], axis=1), y)
+            pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (mask, gradient)), strict=True)
             return [bar for m, bar in pairs if m is True]
         if run is None:
             return self.pull(inputs, active, cotangents)
 
-        def function(some: list[Array]) -> list[Array]:
-            raw = _integrate_by_diffrax(self.problem(replaced(inputs, active, some)), "RecursiveCheckpointAdjoint")
+        def function(active_inputs: list[Array]) -> list[Array]:
+            raw = _integrate_by_diffrax(self.problem(replaced(inputs, active, active_inputs)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
         return jax.vjp(function, select(inputs, active))[1](cotangents)[0]
@@ -146,11 +146,11 @@ class DifferentiableRun(DifferentiableFunction):
         return list(native_engine.second_derivative(problem, which, *changes))
 
     def run_and_jvp(self, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
-        """Return the run, and the change of its states along tangents of the active inputs, by machine code if it can."""
+        """Return the run and the change of its states along tangents of the active inputs, by machine code if possible."""
         if self._is_native(inputs, active):
             change = self.problem.changes(active, tangents)
-            raw, found = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
-            return raw, list(found)
+            raw, changes = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
+            return raw, list(changes)
         raw, change = change_along(lambda inputs: _integrate_by_diffrax(self.problem(inputs)), inputs, active, tangents)
         return raw, [change[k] for k in SMOOTH]
 

@@ -27,12 +27,11 @@ from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
-# Rank threshold of fallback steps, relative to that of other steps. They begin on the constraint manifold, unless states are not
-# projected, and only those beside singular configurations take it. Rows that count as redundant there and are not leave what they
-# hold back in velocities, as large as the threshold, and rounding errors are as large as a unit over its square: both are least
-# at some third root of a unit. With three times more, linkages that turn back in singular configurations take up to a quarter
-# less steps, but Peaucellier's may cross with errors of 1e-5 in its energy, at any tolerance; with three times less they take up
-# to two fifths more.
+# Rank threshold of fallback steps, relative to that of other steps. Only steps near singular configurations use it; if states are
+# projected, they start on the constraint manifold. An independent row that is treated as redundant causes errors in velocities as
+# large as the threshold; rounding errors are eps over its square. The best threshold is thus about eps^(1/3). With a threshold
+# three times larger, linkages that turn back in singular configurations need up to a quarter fewer steps, but Peaucellier's may
+# cross with energy errors of 1e-5 at any tolerance; with one three times smaller they need up to two fifths more steps.
 FALLBACK_RANK_SHARE = 0.2
 
 
@@ -48,7 +47,7 @@ def integrate_concrete(problem: Problem) -> IntegratorOutput:
 
 
 def integrate(problem: Problem) -> IntegratorOutput:
-    """Integrate one problem; under vmap, as many as there are, in lanes."""
+    """Integrate one problem; under vmap all problems together, in SIMD lanes."""
     operation = _operation(problem)
     return _output(native_p.bind(*run_inputs(problem, operation), operation=operation, times=len(problem.ts)))
 
@@ -57,45 +56,45 @@ class RecordedRun(NamedTuple):
     """The record of a run, through which reverse mode goes back."""
 
     record: Array
-    states: tuple[Array, ...]  # q and v (T, n), if there are outputs between the first and the last
+    states: tuple[Array, ...]  # q and v (T, n) if T > 2, else empty
     kept: Array  # `IntegratorOutput.kept`
 
 
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, RecordedRun]:
-    """Integrate a problem by the code of `vjp`, so that no other is compiled; return the record for `vjp`, too."""
+    """Integrate a problem, and return its output with the record that `vjp` needs; both run the same compiled code."""
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
-    none = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
-    found = native_p.bind(*run_inputs(problem, operation), *none, operation=operation, times=times)
-    raw = _output(found[: RunStates.results])
-    return raw, RecordedRun(found[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
+    empty = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
+    results = native_p.bind(*run_inputs(problem, operation), *empty, operation=operation, times=times)
+    raw = _output(results[: RunStates.results])
+    return raw, RecordedRun(results[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
 
 
 def serves_derivatives(active: Problem) -> bool:
-    """Return whether there is machine code for derivatives along `active` numbers of the scene and initial states."""
-    served = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
-    others = eqx.tree_at(served, active, (None,) * 4, is_leaf=lambda x: x is None)
+    """Return whether machine code has all `active` derivatives: it has those by the scene, the gains and the initial state."""
+    supported = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
+    others = eqx.tree_at(supported, active, (None,) * 4, is_leaf=lambda x: x is None)
     return not any(x is True for x in jax.tree.leaves(others))
 
 
 def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
-    """Return the numbers of a run, or a change of them, with zeros in place of one row of sampled quantities."""
-    of = problem if change is None else change
-    return problem.compiled.samples.stand_in(of.textbook.mechanism), of.textbook.baumgarte, of.marks
+    """Return the numbers of a run, or a change of these, with zeros instead of sampled quantities."""
+    source = problem if change is None else change
+    return problem.compiled.samples.stand_in(source.textbook.mechanism), source.textbook.baumgarte, source.marks
 
 
 def _active_numbers(problem: Any, active: Any) -> ActiveNumbers:
-    """Return the numbers of a run, of which some are active."""
+    """Return the numbers of a run, with the mask of the active ones."""
     mask = problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
     return ActiveNumbers(_numbers_of(problem), mask)
 
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
-    """Integrate a problem, with the changes of positions, velocities and the end along a `change` of the active numbers."""
+    """Integrate a problem; also return the changes of positions, velocities and end along a `change` of the active numbers."""
     return _integrate_along(problem, [(active, change)], _operation(problem, active))
 
 
 def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
-    """Return the second derivatives of positions, velocities and the end along two changes, each of its active numbers."""
+    """Return the second derivatives of positions, velocities and end along two `changes`: pairs (active numbers, change)."""
     operation = _operation(problem).with_second_tangents(_active_numbers(problem, active).mask)
     return _integrate_along(problem, changes, operation)[1]
 
@@ -108,13 +107,13 @@ def _integrate_along(
         tangents = _active_numbers(problem, active).tangents(_numbers_of(problem, change))
         directions += [tangents, *(np.zeros(n) if dx is None else dx for dx in (change.q, change.v))]
         samples += [problem.compiled.samples.changes(change.textbook.mechanism)] if operation.sampled else []
-    *found, dys, dend = native_p.bind(
+    *results, dys, dend = native_p.bind(
         *run_inputs(problem, operation),
         *(x[None, None] for x in (*samples, *directions)),
         operation=operation,
         times=len(problem.ts),
     )
-    raw = _output(found)
+    raw = _output(results)
     dys = jnp.where(raw.kept[:, None], dys[0, 0], 0.0)
     return raw, (dys[:, :n], dys[:, n:], dend[0, 0])
 
@@ -123,35 +122,35 @@ def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) 
     """Return the cotangents of the `active` numbers from those of the states at the outputs (T, 2n) and of the end (2n,)."""
     operation, kept = _operation(problem, active, reverse=True), run.kept[:, None]
     states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
-    given = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]
-    found = native_p.bind(*run_inputs(problem, operation), *given, operation=operation, times=len(problem.ts))
-    numbersbar, qbar, vbar = found[RunStates.results : RunStates.results + 3]
-    none = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
+    inputs = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]
+    results = native_p.bind(*run_inputs(problem, operation), *inputs, operation=operation, times=len(problem.ts))
+    numbersbar, qbar, vbar = results[RunStates.results : RunStates.results + 3]
+    no_cotangents = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)
     mechanism, baumgarte, _ = _active_numbers(problem, active).cotangents(numbersbar[0])
     if operation.sampled:
         mechanism = problem.compiled.samples.with_cotangents(
-            mechanism, active.textbook.mechanism, found[RunStates.results + 3][0]
+            mechanism, active.textbook.mechanism, results[RunStates.results + 3][0]
         )
     q, v = qbar[0] if active.q is True else None, vbar[0] if active.v is True else None
-    places = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
-    return eqx.tree_at(places, none, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
+    differentiated = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
+    return eqx.tree_at(differentiated, no_cotangents, (mechanism, baumgarte, q, v), is_leaf=lambda x: x is None)
 
 
 def _operation(problem: Problem, active: Problem | None = None, reverse: bool = False) -> RunStates:
-    """Return the operation of a problem: a run, or one with tangents or cotangents of active numbers."""
+    """Return the operation of a problem: a run, with tangents or cotangents if there are active numbers."""
     run = problem.compiled.plan.operation
     assert run is not None  # checked by the caller
     if active is None:
         return run
-    which = _active_numbers(problem, active).mask
+    mask = _active_numbers(problem, active).mask
     if not reverse:
-        return run.with_tangents(which)
+        return run.with_tangents(mask)
     breaks = problem.compiled.breakpoints
-    return run.with_cotangents(which, 0 if breaks is None else len(breaks), problem.points)
+    return run.with_cotangents(mask, 0 if breaks is None else len(breaks), problem.points)
 
 
 def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
-    """Return the arrays that machine code takes, for one member."""
+    """Return the inputs of machine code for one member."""
     compiled = problem.compiled
     scene = _concrete_inputs_of_run(compiled) if xp is np else _inputs_of_run(compiled, operation.code.policy)
     settings = scene.settings | {
@@ -169,28 +168,28 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
 
 
 class SceneInputs(NamedTuple):
-    """The inputs of machine code that the equations of a mechanism determine, independent of its states."""
+    """The inputs of machine code that follow from the equations of a mechanism; they do not depend on states."""
 
     numbers: list[Any]  # all numbers of the scene, and the gains
-    thresholds: list[Any]  # two, of pivots
+    thresholds: list[Any]  # two thresholds of pivots
     rows: Any  # the scales of the rows of Psi
-    settings: dict[str, Any]  # the unit of lengths, and the arguments of method and formulation
-    breaks: Any = ()  # times (s) where the motion is not smooth, in their order
+    settings: dict[str, Any]  # the unit of length, and the arguments of the method and the formulation
+    breaks: Any = ()  # times (s) where the motion is not smooth, in increasing order
     samples: tuple[Any, ...] = ()  # the rows of sampled quantities, if any
 
 
 def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
-    """Return the inputs that equations determine, with the numbers of `mechanism`: without samples, or at a time."""
+    """Return the inputs that follow from equations; `mechanism` has the numbers, without samples or at a given time."""
     textbook = textbook_of(equations)
     method: Any = textbook.method
     rank_tol = method.rank_tol
-    # Elimination, by which derivatives of all methods are taken, has relative thresholds.
+    # Derivatives of all methods are computed by elimination, whose thresholds are relative.
     relative_tol = rank_tol if method.relative else textbook.scales.rank_tol
     safe_tol = method.branch_tol if isinstance(method, Auto) else relative_tol**2
     fallback_tol = FALLBACK_RANK_SHARE * rank_tol if eliminates(method) else rank_tol
     drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
-    number = xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
-    settings = {"length": textbook.scales.length, "fallback_tol": fallback_tol, "method": number}
+    method_index = xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
+    settings = {"length": textbook.scales.length, "fallback_tol": fallback_tol, "method": method_index}
     if isinstance(equations, FormulatedSystem):
         settings |= MethodCode.formulation_settings(equations.formulation, textbook.scales.mass)
     numbers = jax.tree.leaves((mechanism, textbook.baumgarte))
@@ -199,35 +198,35 @@ def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPo
 
 def _inputs_of_run(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
     samples = compiled.samples
-    found = scene_inputs(compiled.equations, samples.stand_in(compiled.textbook.mechanism), policy, xp)
-    return found._replace(breaks=samples.breakpoints(xp), samples=(samples.rows(xp),) if samples.samples else ())
+    inputs = scene_inputs(compiled.equations, samples.stand_in(compiled.textbook.mechanism), policy, xp)
+    return inputs._replace(breaks=samples.breakpoints(xp), samples=(samples.rows(xp),) if samples.samples else ())
 
 
 @cached_by_identity
 def _concrete_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
     """Return the inputs of a run with concrete numbers, as one vector."""
-    assert compiled.plan.operation is not None  # a run by machine code has one
-    found = _inputs_of_run(compiled, compiled.plan.operation.code.policy, np)
-    return found._replace(numbers=[numbers_as_vector(found.numbers)])
+    assert compiled.plan.operation is not None  # checked by the caller
+    inputs = _inputs_of_run(compiled, compiled.plan.operation.code.policy, np)
+    return inputs._replace(numbers=[numbers_as_vector(inputs.numbers)])
 
 
 def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp) -> Any:
-    """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code has them."""
+    """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code contains the marks."""
     if not compiled.plan.marks_rows:
         return None
     equations = compiled.textbook
     mechanism = equations.mechanism.at(t)
-    finding = MarkRows(scene_programs(mechanism).with_all_rows)
+    operation = MarkRows(scene_programs(mechanism).with_all_rows)
     tol = equations.scales.rank_tol
     settings = {"length": length, "omega": rate}
     numbers = [*mechanism.numbers, tol**2, 0.0]
-    given = finding.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
-    found = call_concrete(finding, given, 2) if xp is np else native_p.bind(*given, operation=finding, times=2)
-    return found[0][0]
+    inputs = operation.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
+    results = call_concrete(operation, inputs, 2) if xp is np else native_p.bind(*inputs, operation=operation, times=2)
+    return results[0][0]
 
 
-def _output(found: Sequence[Any]) -> IntegratorOutput:
-    q, v, _, info = [x[0] for x in found]
+def _output(results: Sequence[Any]) -> IntegratorOutput:
+    q, v, _, info = [x[0] for x in results]
     code, t, tried, accepted, evaluations, written, lost = [info[k] for k in range(len(RunStates.info_names))]
     number = np.arange(len(q))
     reached = (number <= written) & (number < len(q) - 1) | (code == Status.DONE)

@@ -1,6 +1,6 @@
-"""The equations of motion by machine code, for integrators that are not: accelerations and projections as functions of a state.
+"""The equations of motion by machine code, for integrators in Python: accelerations and projections as functions of a state.
 
-They are primitives of JAX with a batching rule. Their derivatives are those of the textbook equations, to any order.
+Both are primitives of JAX with a batching rule. Their derivatives, of any order, are those of the textbook equations.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class NativeEquations(WrappedSystem):
 
     equations: TextbookEquations
     marks: Float[Array, "m"] | None  # of independent rows; None if the machine code contains them
-    scene: SceneInputs  # at the first time: put together once, not in every step
+    scene: SceneInputs  # at time zero: computed once, not in every step
     operation: Accelerate = eqx.field(static=True)
 
     @property
@@ -51,22 +51,22 @@ class NativeEquations(WrappedSystem):
         return _project(self, t, q, v)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        return TangentPart(*jnp.split(self._find(self.operation.tangent_part, t, q, v, [dq, dv]), 2))
+        return TangentPart(*jnp.split(self._evaluate(self.operation.tangent_part, t, q, v, [dq, dv]), 2))
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         return self.equations.is_finite(t, q, v)
 
-    def _find(self, operation: StateOperation, t: Time, q: Vector, v: Vector, further: Sequence[Any] = ()) -> Array:
+    def _evaluate(self, operation: StateOperation, t: Time, q: Vector, v: Vector, further: Sequence[Any] = ()) -> Array:
         scene = self.scene
         if self.equations.mechanism.samples:
             numbers = [self.equations.mechanism.at(t), self.equations.baumgarte]
             scene = scene._replace(numbers=jax.tree.leaves(numbers))
-        given = _pack(operation, scene, self.marks, t, q, v, jnp, further)
-        return native_p.bind(*given, operation=operation, times=2)[0][0]
+        inputs = _pack(operation, scene, self.marks, t, q, v, jnp, further)
+        return native_p.bind(*inputs, operation=operation, times=2)[0][0]
 
     @property
     def differentiated(self) -> TextbookEquations:
-        """The equations whose derivatives are taken: of several methods those of singular values, the same at constant rank."""
+        """The equations to differentiate: SVD replaces several methods, since at constant rank all have the same derivatives."""
         method = self.equations.method
         return (
             replace(self.equations, method=SVD(method.rank_tol, method.relative)) if isinstance(method, OneOf) else self.equations
@@ -74,7 +74,7 @@ class NativeEquations(WrappedSystem):
 
 
 def native_equations(compiled: CompiledMechanism, marks: Float[Array, "m"] | None) -> NativeEquations:
-    """Return equations by machine code, with marks of independent rows, or None if the machine code contains them."""
+    """Return equations by machine code; `marks` are those of independent rows, None if the machine code contains them."""
     operation, textbook = compiled.plan.evaluation, compiled.textbook
     assert operation is not None  # checked by the caller
     scene = scene_inputs(compiled.equations, textbook.mechanism.at(0.0), operation.code.policy)
@@ -92,7 +92,7 @@ def _pack(
     xp: ModuleType,
     further: Sequence[Any] = (),
 ) -> list[Any]:
-    """Return the arrays that machine code takes to evaluate equations at a state."""
+    """Return the inputs with which machine code evaluates equations at a state."""
     numbers = [*scene.numbers, *([] if marks is None else [marks]), *scene.thresholds]
     return operation.pack(numbers, xp.stack([t, t]), q, v, scene.settings, scene.rows, xp=xp, further=further)
 
@@ -101,7 +101,7 @@ class ConcreteRates:
     """The derivative (v, a) of a state (q, v) of a mechanism of concrete numbers, for integrators outside of JAX.
 
     Raises:
-        ValueError: There is no machine code for the equations.
+        ValueError: there is no machine code for the equations.
     """
 
     def __init__(self, mechanism: Mechanism, method: Pseudoinverse, baumgarte: Baumgarte | None = None):
@@ -110,8 +110,8 @@ class ConcreteRates:
         if operation is None or operation.code.marks_rows or mechanism.samples:
             raise ValueError(f"there is no machine code for {type(method).__name__} of this mechanism")
         scene = scene_inputs(compiled.equations, compiled.textbook.mechanism, operation.code.policy, np)
-        given = _pack(operation, scene, None, 0.0, np.zeros(n), np.zeros(n), np)
-        self._call = machine_code(operation, 1, 1).prepare(given, operation.shapes(given, 2))
+        inputs = _pack(operation, scene, None, 0.0, np.zeros(n), np.zeros(n), np)
+        self._call = machine_code(operation, 1, 1).prepare(inputs, operation.shapes(inputs, 2))
         self._t, self._q, self._v = (self._call.inputs[operation.input_names.index(name)][0] for name in ("ts", "q", "v"))
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
@@ -122,7 +122,7 @@ class ConcreteRates:
 
 
 def equations_for_diffrax(problem: Problem) -> AbstractSystem:
-    """Return the equations of a problem for an integrator of diffrax: by machine code, if there is any."""
+    """Return the equations of a problem for an integrator of diffrax, by machine code if possible."""
     if problem.compiled.plan.evaluation is None:
         return problem.equations
     marks = mark_rows(problem.compiled, problem.ts[0], problem.q, problem.v, problem.length, problem.rate)
@@ -131,7 +131,7 @@ def equations_for_diffrax(problem: Problem) -> AbstractSystem:
 
 @eqx.filter_custom_jvp
 def _accelerations(native: NativeEquations, t: Time, q: Vector, v: Vector) -> Vector:
-    return native._find(native.operation, t, q, v)
+    return native._evaluate(native.operation, t, q, v)
 
 
 @_accelerations.def_jvp
@@ -142,8 +142,8 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _project(native: NativeEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    found = jnp.split(native._find(native.operation.projection, t, q, v), 2)
-    return found[0], found[1]
+    projected = jnp.split(native._evaluate(native.operation.projection, t, q, v), 2)
+    return projected[0], projected[1]
 
 
 @_project.def_jvp

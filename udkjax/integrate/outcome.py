@@ -13,7 +13,7 @@ from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import LOOK_AHEAD, Status
 
-# The least `atol`, in the scene's units. Nothing is known to less than rounding, and a coordinate that is zero has no other
+# The least `atol`, relative to the scene's scales: errors cannot be below rounding, and a coordinate near zero has no other
 # tolerance.
 LEAST_ATOL = np.finfo(float).eps
 
@@ -23,9 +23,9 @@ class FinishedRun(NamedTuple):
 
     raw: IntegratorOutput
     ts: Float[Array, "T"]
-    usable: Bool[Array, ""]  # `usable` of its arguments
+    usable: Bool[Array, ""]  # whether its arguments are `usable`
     closed: Bool[Array, ""]
-    missed: Bool[Array, ""]  # the closed state takes rows that the method leaves out
+    missed: Bool[Array, ""]  # `PreparedRun.has_missed_rows`
 
 
 def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
@@ -34,14 +34,14 @@ def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
 
 
 def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: Array | None) -> Bool[Array, ""]:
-    """Tell whether numbers are valid for `simulate`, which sees only the shapes of traced ones."""
+    """Return whether numbers are valid for `simulate`, which itself can check only the shapes of traced numbers."""
     finite = jnp.all(jnp.isfinite(jnp.concatenate([q, v])))
     tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol >= LEAST_ATOL) & (rtol + atol < jnp.inf) & (drift_tol > 0)
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 
 def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
-    """Return the `Result` and the time (s) that belongs to it; the first lost output ends the motion."""
+    """Return the `Result` and its time (s): that of the first output with drift, or the last time of the integrator."""
     raw = run.raw
     code = xp.where(raw.status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
     code = xp.where(raw.status == Status.NOT_FINITE, Result.not_finite, code)
@@ -58,7 +58,7 @@ def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
 def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:
     """Return the status of a run that ended in (t, y): `NOT_FINITE` if its step became too small near a non-finite number.
 
-    That number may occur in (t, y) itself or up to `LOOK_AHEAD` of the span later.
+    The non-finite number may occur at t itself, or up to `LOOK_AHEAD` of the span later.
     """
     q, v = jnp.split(y, 2)
     times = t + jnp.array([0.0, LOOK_AHEAD]) * span

@@ -1,4 +1,4 @@
-"""Preparation of a run before its first step, common to all kinds of runs, with concrete or traced numbers."""
+"""Preparation of all kinds of runs before their first step, with concrete or traced numbers."""
 
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,13 +29,13 @@ from udkjax.transforms.gradients import stop_gradients
 if TYPE_CHECKING:
     import diffrax
 
-AUTO = Auto()  # one for all runs that do not say otherwise
-# Relative to the rows' scales. Projection leaves rounding errors, unless rows that it leaves out drift. Without it drift is
-# expected, up to a bound beyond which a run is lost: the paper's linkage, not stabilized, is 1.6 rad off the exact solution when
-# its loops are 2e-3 open.
+AUTO = Auto()  # a single object: caches compare it by identity
+# Defaults of `drift_tol`, relative to the scales of the rows. With projection, only rows left out as redundant can be violated by
+# more than rounding errors. Without it drift is expected, up to a bound beyond which the run is useless: the paper's linkage, not
+# stabilized, is 1.6 rad off the exact solution when its loops are 2e-3 open.
 DRIFT_PROJECTED, DRIFT_FREE = 1e-6, 1e-3
-LOOSE_TOL = 1e3  # tolerance of runs that have failed before they begin
-NO_DRIFT = -1.0  # their largest violation of Psi: only their first output is kept
+LOOSE_TOL = 1e3  # tolerance of runs that fail before their first step
+NO_DRIFT = -1.0  # `drift_tol` of such runs: only their first output is kept
 
 
 class Choices(NamedTuple):
@@ -66,12 +66,12 @@ class Choices(NamedTuple):
         return self.engine == "diffrax" or others
 
     def arrays(self) -> "Choices":
-        """Return the choices with arrays of JAX in place of plain numbers, which would be constants of compiled programs."""
+        """Return the choices with arrays of JAX instead of plain numbers, which would be constants of compiled programs."""
         dt0 = None if self.dt0 is None else number(self.dt0)
         return self._replace(rtol=number(self.rtol), atol=number(self.atol), drift_tol=number(self.drift_tol), dt0=dt0)
 
     def settings(self, why_not_native: str) -> tuple[tuple[str, str], ...]:
-        """Return the choices of a run as texts by name."""
+        """Return pairs of names and values, as strings, of the choices of a run."""
         return (
             ("method", type(self.method).__name__),
             ("formulation", "UdwadiaKalaba" if self.formulation is None else type(self.formulation).__name__),
@@ -84,12 +84,12 @@ class Choices(NamedTuple):
 
 
 class Beginning(NamedTuple):
-    """The analysis of a mechanism that runs, and its assembled guess."""
+    """The analysis of a mechanism, and its assembled guess, before a run."""
 
     analysis: Analysis
-    closure: Closure | None  # of the initial guess; None: the state is given
+    closure: Closure | None  # closure of the initial guess; None if the state is given
     is_open: bool  # whether the closure is known to be open
-    moves: str  # of assembly, far from the guess, in words
+    moves: str  # a warning if assembly moves bodies far from the guess; else empty
 
 
 def begin(mechanism: Mechanism, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
@@ -110,11 +110,11 @@ class PreparedRun(NamedTuple):
     """A run before its first step."""
 
     problem: Problem
-    ts: Float[Array, "T"]  # as they were given
+    ts: Float[Array, "T"]  # output times, as given
     state_shape: tuple[int, ...]
     is_usable: Bool[Array, ""]  # whether all numbers are valid for `simulate`
-    is_closed: Bool[Array, ""]  # whether the initial state is; True of one that was given
-    has_missed_rows: Bool[Array, ""]  # whether the closed state takes rows that the method leaves out
+    is_closed: Bool[Array, ""]  # whether the initial state is closed; True for a given state
+    has_missed_rows: Bool[Array, ""]  # whether rows left out as redundant are independent in the closed state
 
 
 def prepare_run(
@@ -132,13 +132,13 @@ def prepare_run(
         compiled: The mechanism.
         analysis: The mechanism's `Analysis`; None for a user-defined system.
         ts: Output times (s).
-        state: The initial state, or None: that of `closure`.
+        state: The initial state; None: the state of `closure`.
         closure: The assembled initial guess.
         choices: All other arguments of `simulate`.
-        xp: jax.numpy, or NumPy if all numbers are concrete, and thus checked.
+        xp: jax.numpy, or NumPy if all numbers are concrete (they are then checked already).
 
     Returns:
-        The run. One that cannot be used, or is open, gets loose tolerances: as a member of a batch it would hold up others.
+        The run. If it is unusable or open, it gets loose tolerances, so as not to delay other members of a batch.
     """
     start = (_concrete_start if xp is np else _start)(compiled, analysis, state, closure)
     rtol, atol, good, given_ts = choices.rtol, choices.atol, xp.asarray(True), ts
@@ -179,11 +179,11 @@ class RunStart(NamedTuple):
 
     q: Float[Array, "n"]
     v: Float[Array, "n"]
-    shape: tuple[int, ...]  # of the coordinates as they were given
+    shape: tuple[int, ...]  # shape of the given coordinates
     is_closed: Bool[Array, ""]
     has_missed_rows: Bool[Array, ""]
     length: Any  # unit of `atol` (m); None: coordinates are of order one
-    rate: Any  # of the system and the initial velocities (1/s)
+    rate: Any  # characteristic rate of the system and the initial velocities (1/s)
 
 
 def _start(
@@ -194,7 +194,7 @@ def _start(
         state, closed = closure.state, xp.asarray(closure.is_closed)
         if compiled.plan.is_native:
             missed = closed & (xp.asarray(closure.rank) > compiled.plan.independent_rows)
-    assert state is not None  # one of them is given
+    assert state is not None  # a state or a closure is given
     q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
     if analysis is not None:
         scales = compiled.textbook.scales

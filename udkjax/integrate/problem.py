@@ -25,14 +25,14 @@ class Problem:
     v: Float[Array, "n"]
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
-    smallest: Float[Array, ""]  # step (s)
-    h: Float[Array, ""] | None  # the first step; None: chosen
+    smallest: Float[Array, ""]  # smallest step (s)
+    h: Float[Array, ""] | None  # the first step (s); None: chosen automatically
     # Characteristic length (m), to which `atol` is relative; None: coordinates are of order one.
     length: Float[Array, ""] | None
-    rate: Float[Array, ""]  # of the system and the run (1/s)
+    rate: Float[Array, ""]  # characteristic rate of the system and the run (1/s)
     max_steps: Int[ArrayLike, ""]
-    drift_tol: Float[Array, ""]  # violation of Psi, of the rows' scales, beyond which a run has failed
-    marks: Float[Array, "m"] | None = None  # of rows of Psi: one for those that are independent; None: machine code knows them
+    drift_tol: Float[Array, ""]  # violation of Psi, relative to the scales of the rows, beyond which a run has failed
+    marks: Float[Array, "m"] | None = None  # 1 for each independent row of Psi, else 0; None: machine code contains the marks
     # Capacity of a record for reverse mode; None: by breakpoints.
     points: int | None = field(default=None, metadata={"static": True})
 

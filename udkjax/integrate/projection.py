@@ -25,15 +25,15 @@ def error_after_projection(
 ) -> TangentPart:
     """Return the errors dq and dv of a step that ends in q and v.
 
-    The part that projection removes counts by `NORMAL_ERROR_WEIGHT`.
+    The part that projection removes is multiplied by `NORMAL_ERROR_WEIGHT`.
     """
     equations, t, q, v, dq, dv = stop_gradients((equations, t, q, v, dq, dv))
-    left = equations.tangent_part(t, q, v, dq, dv)
-    return TangentPart(left.dq + NORMAL_ERROR_WEIGHT * (dq - left.dq), left.dv + NORMAL_ERROR_WEIGHT * (dv - left.dv))
+    tangent = equations.tangent_part(t, q, v, dq, dv)
+    return TangentPart(tangent.dq + NORMAL_ERROR_WEIGHT * (dq - tangent.dq), tangent.dv + NORMAL_ERROR_WEIGHT * (dv - tangent.dv))
 
 
 def violation(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:
-    """Return the largest row of Psi over its scale, among all rows, including those that the method leaves out."""
+    """Return the largest |Psi_i| over its scale, among all rows, including those left out as redundant."""
     if not equations.constrained:
         return jnp.zeros(())
     equations, t, y = stop_gradients((equations, t, y))
@@ -43,6 +43,6 @@ def violation(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array
 def project_all(equations: AbstractSystem, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
     """Return states at many times, each projected to the manifold.
 
-    An interpolated state lies off it by the error of the interpolation: it takes one projection more than a step.
+    Interpolated states are farther from the manifold than the ends of steps, so they are projected twice.
     """
     return jax.lax.map(lambda at: project(equations, at[0], project(equations, *at)), (ts, ys))

@@ -38,8 +38,8 @@ from udkjax.transforms.gradients import stop_gradients
 if TYPE_CHECKING:
     import diffrax
 
-MAX_STEPS = 100_000  # default: at some microseconds each, a small scene that hangs ends within about a second
-MAX_EVENTS = 64  # by default; the arrays of events are as long
+MAX_STEPS = 100_000  # default; at a few microseconds per step, a small scene that gets stuck ends within a second
+MAX_EVENTS = 64  # default; also the length of the arrays of events
 
 
 @checked
@@ -67,60 +67,60 @@ def simulate(
     """Integrate the equations of motion q'' = a(t, q, q') of a mechanism; return its states at output times.
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
-    vmap as well. The result has derivatives of any order, forward and reverse; those beyond the first take the time of a hundred
-    runs and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there; one above 0.01 L
-    or 0.01 rad after a projected step ends a run by machine code.
+    vmap as well. The result has derivatives of any order, forward and reverse; second and higher ones take as long as a hundred
+    runs, and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there; machine
+    code also ends a run at a violation above 0.01 L or 0.01 rad after a projected step.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
         ts: output times (T,) in s, increasing; the motion starts at ts[0].
-        state: the initial `State`, taken as it is, or the `Closure` of an assembly. By default the scene's guess is assembled.
-        rtol: relative tolerance of every coordinate and velocity. The sizes of steps are held constant: nothing has
-            derivatives by tolerances, nor by `dt0`.
+        state: the initial `State`, used as given, or the `Closure` of an assembly. By default the scene's guess is assembled.
+        rtol: relative tolerance of every coordinate and velocity. The sizes of steps are not differentiated, so there
+            are no derivatives by tolerances or by `dt0`.
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
-            their rates by 1/T of that, with L the characteristic length (`analyse`) and T the shortest of the characteristic
-            time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. The same tolerances
-            thus mean the same accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
+            and a rate by the same over T, with L the characteristic length (`analyse`) and T the shortest of the characteristic
+            time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. Equal tolerances thus
+            mean equal accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
         method: the pseudoinverse; by default `Auto()`.
         stabilization: `Projection()`, a `Baumgarte`, or None.
         solver: any diffrax solver for ordinary differential equations; by default Dopri8, the fastest at equal error in
             benchmarks/, except for the tightest tolerances through singular configurations.
-        adjoint: an adjoint of diffrax; by default derivatives are those of JAX.
+        adjoint: an adjoint of diffrax; by default JAX differentiates the run.
         max_steps: the largest number of steps tried.
         drift_tol: the largest violation of Psi, relative to L or in rad.
-        dt0: the first step tried (s); by default it is chosen.
-        formulation: finds the accelerations in another way than by the Udwadia-Kalaba equation: `Augmented`, `NullSpaceQR`,
-            `NullSpaceSVD` or `CoordinatePartitioning`; `method` then serves projection and derivatives.
+        dt0: the first step tried (s); by default chosen automatically.
+        formulation: computes accelerations by other equations than that of Udwadia and Kalaba: `Augmented`, `NullSpaceQR`,
+            `NullSpaceSVD` or `CoordinatePartitioning`; `method` is then used for projection and derivatives only.
         throw: whether a run that does not reach its end raises; a traced run never does.
         progress: True prints the progress of the run; a progress meter of diffrax is used as it is.
         analysis: the mechanism's `Analysis`; by default computed here.
-        engine: "native" is machine code made of the scene's expressions, on the CPU: explicit Runge-Kutta methods with
+        engine: "native" is machine code generated from the scene's expressions, on the CPU: explicit Runge-Kutta methods with
             elimination, under vmap in lanes that step independently. "diffrax" is `diffrax.diffeqsolve`: every solver,
-            adjoint, progress meter, device and method. "auto" takes the first where it can; `Solution.settings` names the
-            engine and the reason.
-        events: consequences where conditions cross zero: `Event`, `JointLimit`, `Contact`, one or a list of them, with
-            actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. They are located to rounding, whatever `ts` is, and
-            the run restarts after each; contacts that act on one another are hit together. Both engines serve them, and
-            batches: each member has its own events. Such runs have first derivatives, forward and reverse, through the times of
-            the events (saltation), but none by `ts`.
+            adjoint, progress meter, device and method. "auto" uses machine code where possible; `Solution.settings`
+            names the engine and the reason.
+        events: actions where conditions cross zero: an `Event`, `JointLimit` or `Contact`, or a list of them, with the
+            actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to rounding, independently of
+            `ts`, and the run restarts after each; contacts that act on one another are hit together. Both engines support
+            events, also in batches, where each member has its own. Such runs have first derivatives, forward and reverse,
+            which include the changes of event times (saltation), but no derivatives by `ts`.
         max_events: the largest number of events.
 
     Returns:
         A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` tells how the
-        run ended, `Solution.events` the times of events with the states before and after; an output at the time of an event
-        is the state after it.
+        run ended, `Solution.events` has the times of events with the states before and after; an output at the time of an
+        event is the state after the event.
 
     Raises:
-        SimulationError: the run does not reach its end; it carries the solution.
+        SimulationError: the run does not reach its end; the error carries the solution.
         AssemblyError: the initial guess cannot be closed.
         ArgumentError: the tolerances are below rounding.
-        ValueError: an argument cannot be used, or the requested engine cannot run this.
+        ValueError: an argument is invalid, or the requested engine cannot integrate the mechanism.
 
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
     require_output_times("ts", ts)
-    ts = jnp.asarray(ts) if is_traced(ts) else ts  # of a list, too
+    ts = jnp.asarray(ts) if is_traced(ts) else ts  # also a list with tracers
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
         raise ArgumentError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
     if state is None and isinstance(mechanism, ConstrainedSystem):
@@ -158,7 +158,7 @@ def simulate(
             others = "an adjoint of diffrax's" if choices.adjoint else "progress"
             what = others if isinstance(mechanism, Mechanism) else "a ConstrainedSystem"
             raise ValueError(f"a run with events takes a Mechanism, JAX's own derivatives and no progress meter: not {what}")
-        from udkjax.integrate.events.simulate_events import simulate_events  # a dozen modules that other runs do without
+        from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
         assert analysis is not None  # a mechanism has one
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
@@ -170,7 +170,7 @@ def simulate(
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:
-        analysis = analyse(mechanism)  # the given analysis was of other numbers, of which a row was redundant
+        analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
         solution, _, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
     if _has_failed(solution):
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
@@ -198,22 +198,23 @@ def _run(
     choices: Choices,
     all_concrete: bool,
 ) -> tuple[Solution, Any, Any]:
-    """Return the solution, whether it takes rows that the method leaves out, and the last state (t, (q, v)) of the integrator.
+    """Return the solution, whether rows left out as redundant are independent, and the last state (t, (q, v)) of the integrator.
 
-    With concrete numbers machine code is called directly, by NumPy; everything else is traced.
+    With concrete numbers NumPy calls machine code directly; everything else is traced.
     """
     if all_concrete and isinstance(system, Mechanism):
-        with jax.ensure_compile_time_eval():  # while something else is traced
+        with jax.ensure_compile_time_eval():  # concrete even while something else is traced
             compiled = compile_concrete(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
                 run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
                 return _finish(run, integrate_concrete(run.problem), system.body_names, choices, np)
-    bare = system.without_origin if isinstance(system, Mechanism) else system
-    given = bare, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
+    scene = system.without_origin if isinstance(system, Mechanism) else system
+    arguments = scene, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
     if is_within_jit():  # concrete numbers become tracers, too
-        return _simulate(*given)
-    takes_diffrax = choices.take_diffrax or not isinstance(system, Mechanism)
-    return _compiled(*given) if takes_diffrax else _deferred(*given)  # diffrax takes hundreds of operations for each step
+        return _simulate(*arguments)
+    # Runs by diffrax are compiled at once: each step has hundreds of operations.
+    uses_diffrax = choices.take_diffrax or not isinstance(system, Mechanism)
+    return _compiled(*arguments) if uses_diffrax else _deferred(*arguments)
 
 
 def _simulate(
@@ -269,14 +270,14 @@ def _finish(
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
-    """Integrate as in diffrax_engine.py: diffrax is imported where it is asked for, since that takes as long as all of JAX."""
+    """Integrate by diffrax (diffrax_engine.py), imported only here, since its import takes as long as that of JAX."""
     from udkjax.integrate.diffrax_engine import integrate_by_diffrax
 
     return integrate_by_diffrax(problem, adjoint, meter)
 
 
 def _adjoint(adjoint: Any) -> Any:
-    """Return diffrax's adjoint; None where JAX differentiates the steps, as with `ForwardMode`."""
+    """Return an adjoint of diffrax; None for `ForwardMode`, since JAX then differentiates the steps by default."""
     import diffrax
 
     return None if type(adjoint) is diffrax.ForwardMode else adjoint

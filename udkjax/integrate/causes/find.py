@@ -1,4 +1,4 @@
-"""Find the cause of a failed run, and describe it with the place, the time and the cure."""
+"""Find the cause of a failed run, and describe it with its place, its time and a remedy."""
 
 from collections.abc import Hashable
 from dataclasses import replace
@@ -15,22 +15,23 @@ from udkjax.integrate.solvers import is_explicit
 from udkjax.positions.open_rows import MOST_NAMED, explain_open, name_not_finite
 from udkjax.scene.mechanism import Mechanism
 
-NEARBY = 1e-9  # fraction of the span: between two instants this close only a jump changes a load much
-# Fractions of the span that are searched for non-finite numbers: the integrator tries steps up to ten times as long as the last.
+NEARBY = 1e-9  # fraction of the span: a load changes much within this time only if it jumps
+# Times after the end of the run at which non-finite numbers are looked for, as fractions of the span: the integrator may have
+# evaluated them in a rejected step up to ten times as long as the last.
 AHEAD = (0.0, *np.geomspace(1e-6, 0.1, 80))
-JUMP = 1e-3  # least relative change of a load over `NEARBY` at a jump; a smooth one changes by a millionth of that
-GROWN = 1e6  # ratio to its earlier value of a load that grows without bound
+JUMP = 1e-3  # least relative change of a load over `NEARBY` at a jump; smooth loads change a million times less
+GROWN = 1e6  # ratio of a load to its earlier value above which it grows without bound
 NEAR_REACH = 1e-2  # fraction of the span by which a run may end before a dead point
-STIFF = 0.1  # rate times step: explicit methods of any order lose stability between 1 and 10
-SINGULAR = 1e-4  # relative to the largest singular value of D with rows of length one
+STIFF = 0.1  # least rate times step; explicit methods of any order lose stability between 1 and 10
+SINGULAR = 1e-4  # bound on singular values of D, with rows of length one, relative to the largest
 RATES = ("vx", "vy", "omega")
 
 
 class FoundCause:
     """The cause of a failed run, found on demand.
 
-    All instances compare equal, so that all solutions have the same tree structure. The cause is therefore returned only for the
-    code and time of its own run.
+    All instances compare equal, so all solutions have the same tree structure. A solution may thus hold the cause of another
+    run; the cause is returned only for the code and time of the run it was found for.
     """
 
     def __init__(self, run: FailedRun | None, text: str | None = None):
@@ -60,17 +61,17 @@ class FoundCause:
 
 def find_cause(run: FailedRun) -> str | None:
     """Return the cause of a failed run; None if nothing beyond its result is found."""
-    wrong = " and ".join(
+    not_finite = " and ".join(
         text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATES)) if text
     )
-    if wrong:
-        return f"the initial state is not finite: {wrong}"
+    if not_finite:
+        return f"the initial state is not finite: {not_finite}"
     match run.result:
         case Result.could_not_assemble:
             return _explain_open_guess(run)
         case Result.initial_state_open:
             text = run.open_rows(run.ts[0], run.q[0])
-            return f"the initial state is open (m, rad): {text}; `assemble` closes it, and so does a run that is given none"
+            return f"the initial state is open (m, rad): {text}; `assemble` closes it, and so does a run without an initial state"
         case Result.drift:
             return _explain_drift(run)
         case Result.not_finite:
@@ -93,9 +94,9 @@ def _explain_drift(run: FailedRun) -> str | None:
     k = int(np.argmin(np.abs(run.ts - run.time)))
     q, left_out = run.q[k], sorted({run.rows.names[i][0] for i in run.analysis.redundant_rows or ()})
     text = run.open_rows(run.time, q)
-    anew = "analyse the mechanism with its present numbers, or take method=SVD()"
+    anew = "analyse the mechanism with its present numbers, or use method=SVD()"
     if not text:
-        return f"the constraints take rows that the method leaves out as redundant, of {', '.join(left_out)}: {anew}"
+        return f"rows of {', '.join(left_out)} are left out as redundant, but are independent: {anew}"
     reach = explain_reach(run, run.time)
     if reach:
         return reach
@@ -104,10 +105,10 @@ def _explain_drift(run: FailedRun) -> str | None:
     if not run.is_projected:
         return f"{open_by}; nothing returns the states to the constraints: stabilize them, by Projection()"
     if run.drops_rows and any(f'"{name}"' in text for name in left_out):
-        return f"{open_by}; rows of {', '.join(left_out)} are left out as redundant, and they are not: {anew}"
+        return f"{open_by}; rows of {', '.join(left_out)} are left out as redundant, but are independent: {anew}"
     if run.rows.close(run.time, q) is None:
-        return f"{open_by}; no position near it closes"
-    return f"{open_by}; it can be closed nearby: {_near_singular(run) or 'loosen drift_tol, or tighten rtol and atol'}"
+        return f"{open_by}; no position nearby satisfies the constraints"
+    return f"{open_by}; a position nearby satisfies them: {_near_singular(run) or 'loosen drift_tol, or tighten rtol and atol'}"
 
 
 def _explain_not_finite(run: FailedRun) -> str | None:
@@ -117,7 +118,7 @@ def _explain_not_finite(run: FailedRun) -> str | None:
     if run.formulation == "Augmented" and (run.analysis.redundant_rows or _rank(run) < run.rows.count):
         return (
             f"`Augmented()` solves its equations by plain LU, and they are singular: {run.rows.count} rows of rank {_rank(run)}; "
-            "take another formulation"
+            "use another formulation"
         )
     return _near_singular(run)
 
@@ -145,14 +146,14 @@ def _not_finite_ahead(run: FailedRun) -> str:
     span = float(run.ts[-1] - run.ts[0])
     states = [(t + share * span, q + share * span * v, v) for share in AHEAD]
     loads = _loads(run, states)
-    for k, (at, position, _) in enumerate(states):
-        psi, length, _ = run.rows.at(at, position) if run.rows.count else (np.zeros(0), np.zeros(0), None)
+    for k, (time, position, _) in enumerate(states):
+        psi, length, _ = run.rows.at(time, position) if run.rows.count else (np.zeros(0), np.zeros(0), None)
         bad = ~(np.isfinite(psi) & np.isfinite(length))
         owners = {run.rows.names[i][0] for i in np.flatnonzero(bad)}
         named = [f'{"driver" if name in run.mechanism.drivers else "joint"} "{name}"' for name in sorted(owners)]
         named += [f'force "{name}"' for name, size in zip(loads.names, loads.size[k], strict=True) if not np.isfinite(size)]
         if named:
-            return f"{', '.join(named)} is not finite from about {at:.6g} s on: check its law at that time"
+            return f"{', '.join(named)} is not finite from about {time:.6g} s on: check its law at that time"
     return ""
 
 
@@ -163,8 +164,8 @@ def _violent_load(run: FailedRun) -> str:
     scales = run.analysis.scales
     unit = np.tile([float(scales.length), float(scales.length), 1.0], len(q) // 3)
     turn = 1e-6 * max(speed, float(scales.rate)) * unit
-    back, ahead = ((t + way * NEARBY * span, q + way * NEARBY * span * v, v) for way in (-1, 1))
-    loads = _loads(run, [back, (t, q, v), ahead, (t, q, v - turn), (t, q, v + turn), *run.states[1:][::-1][:2]])
+    earlier, later = ((t + sign * NEARBY * span, q + sign * NEARBY * span * v, v) for sign in (-1, 1))
+    loads = _loads(run, [earlier, (t, q, v), later, (t, q, v - turn), (t, q, v + turn), *run.states[1:][::-1][:2]])
     size, names = np.nan_to_num(loads.size, nan=0.0, posinf=1e300), loads.names
     before, now = size[5:].max(0, initial=0.0), size[1]
     slow = max(float(scales.rate), 1 / span) ** 2
@@ -172,7 +173,7 @@ def _violent_load(run: FailedRun) -> str:
         if now[k] > GROWN * max(before[k], slow):
             return f'force "{name}" grows without bound: here it is {now[k] / max(before[k], slow):.1g} times what it was'
     largest = size.max(0)
-    # Once over time, once over velocity.
+    # A load may jump with time, or with velocity.
     time_jump = np.abs(loads.jump[2])
     speed_jump = np.abs(_loads(run, [(t, q, v - turn), (t, q, v + turn)]).jump[1])
     for k, name in enumerate(names):
@@ -194,17 +195,17 @@ def _stiff(run: FailedRun) -> str:
         return ""
     damping, stiffness = loads.damping[0], loads.stiffness[0]
     k = int(np.argmax(np.maximum(damping, stiffness)))
-    rate, what = (damping[k], "damps") if damping[k] >= stiffness[k] else (stiffness[k], "swings")
+    rate, verb = (damping[k], "damps") if damping[k] >= stiffness[k] else (stiffness[k], "swings")
     if not STIFF < rate * step < 1 / STIFF**2:
         return ""
     return (
-        f'force "{loads.names[k]}" {what} at a rate of {rate:.2g} 1/s, which holds an explicit solver to steps of {step:.2g} s: '
-        "take an implicit one, such as solver=diffrax.Kvaerno5(), or make it softer"
+        f'force "{loads.names[k]}" {verb} at a rate of {rate:.2g} 1/s, which limits an explicit solver to steps of {step:.2g} s: '
+        "use an implicit one, such as solver=diffrax.Kvaerno5(), or make it softer"
     )
 
 
 def _reach_at_end(run: FailedRun) -> str:
-    """Describe the demands of drivers if the run ended where the mechanism cannot follow."""
+    """Describe the demands of drivers if the run ended where the mechanism cannot follow them."""
     t, span = run.states[0][0], float(run.ts[-1] - run.ts[0])
     return explain_reach(run, min(float(run.ts[-1]), t + NEAR_REACH * span)) if t < run.ts[-1] else ""
 
@@ -219,10 +220,10 @@ def _near_singular(run: FailedRun) -> str:
     if not sigma[rank - 1] < SINGULAR * sigma[0]:
         return ""
     involved = np.abs(u[:, rank - 1]) > 0.1 * np.abs(u[:, rank - 1]).max()
-    names = list(dict.fromkeys(name for (name, _), part in zip(run.rows.names, involved, strict=True) if part))
+    names = list(dict.fromkeys(name for (name, _), is_involved in zip(run.rows.names, involved, strict=True) if is_involved))
     share = sigma[rank - 1] / sigma[0]
     listed = ", ".join(names[:MOST_NAMED])
-    return f"it is beside a singular configuration of {listed} (smallest singular value {share:.1g} of the largest)"
+    return f"the state is near a singular configuration of {listed} (smallest singular value {share:.1g} of the largest)"
 
 
 def _rank(run: FailedRun) -> int:
@@ -238,7 +239,7 @@ def _loads(run: FailedRun, states: list) -> ElementLoads:
 def explained(
     solution: Solution, mechanism: Mechanism, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
 ) -> Solution:
-    """Return a failed solution of a single run, with its cause found on demand.
+    """Return the solution of a failed single run, with its cause found on demand.
 
     Args:
         solution: the solution, of concrete numbers.
@@ -250,7 +251,7 @@ def explained(
     """
     assert analysis is not None  # a mechanism has one
     q, v = (np.asarray(x).reshape(len(solution.ts), -1) for x in (solution.q, solution.v))
-    chosen = solution.settings
+    settings = solution.settings
     last = None
     if end is not None:
         t, y = (np.asarray(x) for x in end)
@@ -268,9 +269,9 @@ def explained(
         rtol=float(solution.rtol),
         atol=float(solution.atol),
         drift_tol=float(drift_tol),
-        is_projected=chosen["stabilization"] == "Projection",
-        is_explicit=is_explicit(solver) or chosen["solver"] == "Adams",  # the corrector of Adams is applied once, not solved
-        drops_rows=chosen["method"] in ("Auto", "Elimination"),
-        formulation=chosen["formulation"],
+        is_projected=settings["stabilization"] == "Projection",
+        is_explicit=is_explicit(solver) or settings["solver"] == "Adams",  # the corrector of Adams is applied once, not solved
+        drops_rows=settings["method"] in ("Auto", "Elimination"),
+        formulation=settings["formulation"],
     )
     return replace(solution, found_cause=FoundCause(run))
