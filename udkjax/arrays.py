@@ -61,10 +61,10 @@ def put_arrays(arrays: Any) -> Any:
 
 def make_module(cls: type[Module], **fields: Any) -> Module:
     """Make an instance from all of its fields, without the checks and conversions of its constructor."""
-    made = object.__new__(cls)
+    module = object.__new__(cls)
     for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made
+        object.__setattr__(module, name, value)
+    return module
 
 
 def number(value: Numbers) -> Float[Array, "..."]:
@@ -72,9 +72,9 @@ def number(value: Numbers) -> Float[Array, "..."]:
     dtype = jnp.result_type(float)
     if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
         value = np.asarray(value, dtype)
-        found = jax.device_put(value)  # jnp.asarray would compile a program for each shape
-        if not isinstance(found, Tracer):
-            return found
+        array = jax.device_put(value)  # jnp.asarray would compile a program for each shape
+        if not isinstance(array, Tracer):
+            return array
         with jax.ensure_compile_time_eval():  # concrete numbers stay concrete while something else is traced
             return jax.device_put(value)
     return jnp.asarray(value, dtype=dtype)

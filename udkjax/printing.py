@@ -114,19 +114,19 @@ def format_numbers(value: Any, unit: str = "") -> str:
         return "none"
     if not has_numbers(value):
         return f"{'traced' if isinstance(value, Tracer) else 'array'} {_shape(np.shape(value))}".rstrip()
-    found = np.asarray(value)
-    if found.dtype == bool:
-        return ("no", "yes")[int(found)] if found.ndim == 0 else f"{int(found.sum())} of {found.size}"
-    behind = f" {unit}" if unit else ""
-    if found.ndim == 0:
-        return format_number(found) + behind
-    if found.size <= MOST_NUMBERS:
-        return _format_few(found, float(np.max(np.abs(found), initial=0.0, where=np.isfinite(found)))) + behind
-    if "," in unit or not np.isfinite(found).any() or np.iscomplexobj(found):
-        return _shape(found.shape) + behind
-    scale = float(np.max(np.abs(found), where=np.isfinite(found), initial=0.0))
-    low, high = (format_number(end(found), scale=scale) for end in (np.nanmin, np.nanmax))
-    return f"{_shape(found.shape)} {f'from {low} to {high}' if low != high else f'all {low}'}{behind}"
+    array = np.asarray(value)
+    if array.dtype == bool:
+        return ("no", "yes")[int(array)] if array.ndim == 0 else f"{int(array.sum())} of {array.size}"
+    suffix = f" {unit}" if unit else ""
+    if array.ndim == 0:
+        return format_number(array) + suffix
+    if array.size <= MOST_NUMBERS:
+        return _format_few(array, float(np.max(np.abs(array), initial=0.0, where=np.isfinite(array)))) + suffix
+    if "," in unit or not np.isfinite(array).any() or np.iscomplexobj(array):
+        return _shape(array.shape) + suffix
+    scale = float(np.max(np.abs(array), where=np.isfinite(array), initial=0.0))
+    low, high = (format_number(end(array), scale=scale) for end in (np.nanmin, np.nanmax))
+    return f"{_shape(array.shape)} {f'from {low} to {high}' if low != high else f'all {low}'}{suffix}"
 
 
 def _format_few(values: np.ndarray, scale: float) -> str:
@@ -240,9 +240,9 @@ def prints_table(cls: Class) -> Class:
 
 
 def _table_of(record: Any) -> PrintedTable:
-    make = getattr(record, "_table" if has_numbers(record) else "_shapes", None)
+    make_table = getattr(record, "_table" if has_numbers(record) else "_shapes", None)
     try:
         with jax.ensure_compile_time_eval():  # concrete numbers stay concrete while something else is traced
-            return fields_table(record, getattr(record, "_units", {})) if make is None else make()
+            return fields_table(record, getattr(record, "_units", {})) if make_table is None else make_table()
     except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError):  # JAX replaces numbers by other objects
         return fields_table(record, getattr(record, "_units", {}))

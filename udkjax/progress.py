@@ -40,9 +40,9 @@ class Progress:
         return self.seconds * (self.total / self.done - 1.0) if self.total and self.done > 0 else None
 
     def __str__(self) -> str:
-        part = "" if not self.total else f" {100 * self.done / self.total:.0f} %"
+        percent = "" if not self.total else f" {100 * self.done / self.total:.0f} %"
         left = "" if self.left is None or self.done == self.total else f", about {self.left:.0f} s left"
-        return f"{self.what}:{part} ({self.seconds:.0f} s{left}){f' {self.message}' if self.message else ''}"
+        return f"{self.what}:{percent} ({self.seconds:.0f} s{left}){f' {self.message}' if self.message else ''}"
 
 
 ProgressOption = TypeAliasType("ProgressOption", Callable[[Progress], object] | bool | Literal["auto"] | None)
@@ -56,9 +56,9 @@ class Report:
         self.state = Progress(what, 0, total, 0.0)
 
     def __call__(self, done: float | None = None, message: str = "") -> None:
-        before = self.state
-        done = before.done if done is None else done
-        self.state = Progress(before.what, done, before.total, time.monotonic() - self.begun, message)
+        previous = self.state
+        done = previous.done if done is None else done
+        self.state = Progress(previous.what, done, previous.total, time.monotonic() - self.begun, message)
         self.show(self.state)
 
 

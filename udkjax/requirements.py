@@ -43,33 +43,33 @@ def describe(value: Any) -> str:
 def array(name: str, value: Any) -> "np.ndarray | Tracer":
     """Return real numbers as an array, a traced one unchanged; raise a `TypeError` that names the argument for anything else."""
     if isinstance(value, Tracer):
-        found: Any = value
+        numbers: Any = value
     elif not isinstance(value, np.ndarray | float) and is_traced(value):
-        found = jnp.asarray(value)  # a list of traced numbers
+        numbers = jnp.asarray(value)  # a list of traced numbers
     else:
         try:
-            found = np.asarray(value)
+            numbers = np.asarray(value)
         except ValueError:
             raise ArgumentTypeError(f"{name} must be an array of numbers; its rows have different lengths") from None
         except TypeError:
             raise ArgumentTypeError(f"{name} must be an array of numbers, {describe(value)}") from None
-    if found.dtype.kind in "fiu":
-        return found
-    if not (jnp.issubdtype(found.dtype, jnp.floating) or jnp.issubdtype(found.dtype, jnp.integer)):  # bfloat16 and the like
-        kind = "complex numbers" if jnp.issubdtype(found.dtype, jnp.complexfloating) else None
+    if numbers.dtype.kind in "fiu":
+        return numbers
+    if not (jnp.issubdtype(numbers.dtype, jnp.floating) or jnp.issubdtype(numbers.dtype, jnp.integer)):  # bfloat16 and the like
+        kind = "complex numbers" if jnp.issubdtype(numbers.dtype, jnp.complexfloating) else None
         raise ArgumentTypeError(f"{name} must be real numbers, {f'not {kind}' if kind else describe(value)}")
-    return found
+    return numbers
 
 
 def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: GivenArguments = NOTHING) -> None:
     """Require one real number of a sign, finite unless `infinite`; of a traced one, only shape and dtype are checked."""
-    found = array(name, value)
-    if found.shape != ():
+    number = array(name, value)
+    if number.shape != ():
         cure = "a batch is for jax.vmap, or for udk.sweep"
-        raise ArgumentError(f"{name} must be one number, not an array of the shape {found.shape}; {cure}")
-    if isinstance(found, Tracer):
+        raise ArgumentError(f"{name} must be one number, not an array of the shape {number.shape}; {cure}")
+    if isinstance(number, Tracer):
         return
-    x = float(found)
+    x = float(number)
     bad = np.isnan(x) or (np.isinf(x) and not infinite)
     if bad or (sign == "positive" and not x > 0) or (sign == "not negative" and not x >= 0):
         meant = {"any": "a finite number", "positive": "positive", "not negative": "zero or positive"}[sign]
@@ -78,39 +78,39 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
 
 def require_count(name: str, value: Any, least: int = 1, given: GivenArguments = NOTHING) -> None:
     """Require an integer, at least `least`; of a traced one, only shape and dtype are checked."""
-    found = None if isinstance(value, bool | np.bool_) else array(name, value)
-    if found is None or found.shape != () or not jnp.issubdtype(found.dtype, jnp.integer):
+    number = None if isinstance(value, bool | np.bool_) else array(name, value)
+    if number is None or number.shape != () or not jnp.issubdtype(number.dtype, jnp.integer):
         raise ArgumentTypeError(f"{name} must be a whole number, {describe(value)}")
-    if not isinstance(found, Tracer) and int(found) < least:
-        raise ArgumentError(f"{name} must be at least {least}, not {int(found)}")
+    if not isinstance(number, Tracer) and int(number) < least:
+        raise ArgumentError(f"{name} must be at least {least}, not {int(number)}")
 
 
 def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: GivenArguments = NOTHING) -> None:
     """Require finite numbers if they are concrete; `place` describes an entry in words."""
-    found = array(name, value)
-    if isinstance(found, Tracer) or (finite := np.isfinite(found)).all():
+    numbers = array(name, value)
+    if isinstance(numbers, Tracer) or (finite := np.isfinite(numbers)).all():
         return
     index = tuple(int(k) for k in np.argwhere(~finite)[0])
     where = f"[{', '.join(map(str, index))}]" if index else ""
-    raise ArgumentError(f"{name}{where} is {found[index]:g}{place(*index)}: it must be finite")
+    raise ArgumentError(f"{name}{where} is {numbers[index]:g}{place(*index)}: it must be finite")
 
 
 def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
     """Require a vector of finite times; of a traced one, only the shape is checked."""
-    found = array(name, value)
-    if found.ndim != 1 or not len(found):
-        raise ArgumentError(f"{name} must be a vector of times in s; its shape is {found.shape}")
-    require_finite(name, found)
+    times = array(name, value)
+    if times.ndim != 1 or not len(times):
+        raise ArgumentError(f"{name} must be a vector of times in s; its shape is {times.shape}")
+    require_finite(name, times)
 
 
 def require_output_times(name: str, value: Any) -> None:
     """Require at least two finite, increasing times; of traced ones, only the shape is checked."""
-    found = array(name, value)
-    if found.ndim != 1 or len(found) < 2:
+    times = array(name, value)
+    if times.ndim != 1 or len(times) < 2:
         what = "a vector of at least two output times, from the start on"
-        raise ArgumentError(f"{name} must be {what}; its shape is {found.shape}")
-    require_finite(name, found)
-    if not isinstance(found, Tracer) and not np.all(steps := np.diff(found) > 0):
+        raise ArgumentError(f"{name} must be {what}; its shape is {times.shape}")
+    require_finite(name, times)
+    if not isinstance(times, Tracer) and not np.all(steps := np.diff(times) > 0):
         k = int(np.argmin(steps))
-        after = f"{name}[{k + 1}] = {found[k + 1]:g} s follows {found[k]:g} s"
-        raise ArgumentError(f"{name} must increase from each output time to the next: {after}")
+        pair = f"{name}[{k + 1}] = {times[k + 1]:g} s follows {times[k]:g} s"
+        raise ArgumentError(f"{name} must increase from each output time to the next: {pair}")

@@ -88,7 +88,7 @@ def animate(
     options = {name: value for name, value in (film | page | look).items() if value is not None}
     try:
         with warnings.catch_warnings(action="ignore", category=FailedRunWarning):  # reported below
-            found = udk.animate(
+            animation = udk.animate(
                 {name: mechanism for name, (mechanism, _, _) in runs.items()},
                 {name: run for name, (_, run, _) in runs.items()},
                 measures=_measures(measures, runs) if kind == ".html" else (),
@@ -96,15 +96,15 @@ def animate(
                 traces=traces or None,
                 live=list(live or ()) or live is not None,
             )
-        found.save(out, t, **options)
+        animation.save(out, t, **options)
     except (ValueError, OSError) as problem:
         refuse(problem)
     size = out.stat().st_size
-    data = found.data
+    data = animation.data
     results = {"files": [out], "bytes": size, "start": data["start"], "end": data["end"], "speed": data["speed"]}
-    show(results | {"failures": found.failures}, f"wrote {out} ({size / 1e3:.0f} kB)", json)
-    if found.failures:
-        fail("; ".join(f"{name}: {cause}" if name else f"the run failed: {cause}" for name, cause in found.failures.items()))
+    show(results | {"failures": animation.failures}, f"wrote {out} ({size / 1e3:.0f} kB)", json)
+    if animation.failures:
+        fail("; ".join(f"{name}: {cause}" if name else f"the run failed: {cause}" for name, cause in animation.failures.items()))
 
 
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":
@@ -128,13 +128,13 @@ def _run(file: Path, t1: float, dt: float) -> "ShownRun":
 
 def _measures(wanted: tuple[str, ...], runs: dict[str, "ShownRun"]) -> "dict[str, dict[str, np.ndarray] | None]":
     """Return the measures by name: None for those to be computed, and the values in each run's file for others."""
-    found: dict[str, dict[str, np.ndarray] | None] = {}
+    measures: dict[str, dict[str, np.ndarray] | None] = {}
     for name in wanted:
-        own = {
-            label: {key: value for key, value in others.items() if key.split(" (")[0] == name}
-            for label, (_, _, others) in runs.items()
+        by_run = {
+            label: {key: value for key, value in further.items() if key.split(" (")[0] == name}
+            for label, (_, _, further) in runs.items()
         }
-        keys = {key for variables in own.values() for key in variables}
+        keys = {key for variables in by_run.values() for key in variables}
         for key in keys or {name}:
-            found[key] = {label: variables[key] for label, variables in own.items() if key in variables} if keys else None
-    return found
+            measures[key] = {label: variables[key] for label, variables in by_run.items() if key in variables} if keys else None
+    return measures

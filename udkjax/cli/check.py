@@ -15,11 +15,11 @@ def check(scene: Scene, /, json: Json = False) -> None:
     from udkjax.positions.assembly import check as checked
     from udkjax.show.summary import check_summary
 
-    found = checked(mech)
+    report = checked(mech)
     results = {
-        **found._asdict(),
-        "redundant": [{"constraint": name, "row": row} for name, row in found.redundant],
+        **report._asdict(),
+        "redundant": [{"constraint": name, "row": row} for name, row in report.redundant],
     }
-    show(results, check_summary(mech, found), json)
-    if not found.closed:
+    show(results, check_summary(mech, report), json)
+    if not report.closed:
         sys.exit(BAD_RUN)

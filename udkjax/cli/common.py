@@ -120,13 +120,13 @@ def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
     """Return the channels with the given names; exit with a message if one is invalid."""
     from udkjax.positions.channels import channel_of
 
-    found = []
+    channels = []
     for name in names:
         try:
-            found.append(channel_of(mech, name))
+            channels.append(channel_of(mech, name))
         except ValueError as problem:
             refuse(f"--channels {name}: {problem}")
-    return found
+    return channels
 
 
 def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Sequence[Channel]") -> "Columns":

@@ -105,23 +105,26 @@ def _columns(data: "xarray.Dataset") -> "Iterator[tuple[str, np.ndarray]]":
     """Iterate over the columns of a table: headings, and values along the first dimension."""
     import numpy as np
 
-    along = str(next(iter(data.data_vars.values())).dims[0])
-    count = data.sizes[along]
-    yield _heading(along, data[along].attrs.get("units", "")), np.asarray(data[along] if along in data.coords else range(count))
+    first_dim = str(next(iter(data.data_vars.values())).dims[0])
+    count = data.sizes[first_dim]
+    yield (
+        _heading(first_dim, data[first_dim].attrs.get("units", "")),
+        np.asarray(data[first_dim] if first_dim in data.coords else range(count)),
+    )
     for name, variable in data.data_vars.items():
-        others = [str(dim) for dim in variable.dims if dim != along]
-        if along not in variable.dims:
-            variable = variable.expand_dims({along: count})
-        table = np.asarray(variable.transpose(along, *others)).reshape(count, -1)
-        labels = [[str(x) for x in np.asarray(variable[dim])] if dim in data.coords else None for dim in others]
+        other_dims = [str(dim) for dim in variable.dims if dim != first_dim]
+        if first_dim not in variable.dims:
+            variable = variable.expand_dims({first_dim: count})
+        table = np.asarray(variable.transpose(first_dim, *other_dims)).reshape(count, -1)
+        labels = [[str(x) for x in np.asarray(variable[dim])] if dim in data.coords else None for dim in other_dims]
         units = str(variable.attrs.get("units", "")).split(", ", 2)
-        for k, place in enumerate(np.ndindex(*(variable.sizes[dim] for dim in others))):
-            words = [str(i) if names is None else names[i] for names, i in zip(labels, place, strict=True)]
-            if name in COLUMN_NAMES and others == ["body", "coordinate"]:
-                words = ["body", words[0], COLUMN_NAMES[str(name)][place[1]]]
+        for k, index in enumerate(np.ndindex(*(variable.sizes[dim] for dim in other_dims))):
+            words = [str(i) if names is None else names[i] for names, i in zip(labels, index, strict=True)]
+            if name in COLUMN_NAMES and other_dims == ["body", "coordinate"]:
+                words = ["body", words[0], COLUMN_NAMES[str(name)][index[1]]]
             else:
                 words = [str(name), *words]
-            unit = units[place[-1]] if others and others[-1] == "coordinate" and len(units) == 3 else ", ".join(units)
+            unit = units[index[-1]] if other_dims and other_dims[-1] == "coordinate" and len(units) == 3 else ", ".join(units)
             yield _heading(".".join(words), unit), table[:, k]
 
 

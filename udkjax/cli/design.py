@@ -34,9 +34,9 @@ def design(
         results: maximum number of designs to return.
         out: folder for each design as a drawing (design1.toml) and as an animated page (design1.html).
     """
-    for name, value, least in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
-        if value < least:
-            refuse(f"--{name} {value}: must be at least {least}")
+    for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
+        if value < minimum:
+            refuse(f"--{name} {value}: must be at least {minimum}")
     import numpy as np
 
     from udkjax.show.summary import table
@@ -50,31 +50,31 @@ def design(
     if isinstance(search, CompleteSearch):
         _show_all(goal, search, results, out, json)
         return
-    found = search(starts, seed, results)
+    designs = search(starts, seed, results)
     mech = search.problem.mechanism
-    lines = {"starts": f"{starts}; {len(found.losses)} ended within the limits"}
-    for k, one in enumerate(found):
-        lines[f"design {k + 1}"] = f"loss {one.loss:.8g}, largest residual {np.max(np.abs(one.residuals)):.3g}"
+    lines = {"starts": f"{starts}; {len(designs.losses)} ended within the limits"}
+    for k, candidate in enumerate(designs):
+        lines[f"design {k + 1}"] = f"loss {candidate.loss:.8g}, largest residual {np.max(np.abs(candidate.residuals)):.3g}"
     if out is not None:
-        lines["files in"] = _write(found, search.problem.goal, out)
+        lines["files in"] = _write(designs, search.problem.goal, out)
     listed = [
         {
-            "loss": one.loss,
-            "transmission": one.transmission,
-            "turns": one.turns,
-            "values": one.values,
-            "residuals": one.residuals,
-            "parameters": one.parameters,
+            "loss": candidate.loss,
+            "transmission": candidate.transmission,
+            "turns": candidate.turns,
+            "values": candidate.values,
+            "residuals": candidate.residuals,
+            "parameters": candidate.parameters,
         }
-        for one in found
+        for candidate in designs
     ]
     show(
-        {"starts": starts, "losses": found.losses, "reason": found.reason, "designs": listed},
+        {"starts": starts, "losses": designs.losses, "reason": designs.reason, "designs": listed},
         table(f"designs of {mech.name or 'a mechanism'}", lines),
         json,
     )
-    if not len(found):
-        fail(f"no mechanism was found: {found.reason}")
+    if not len(designs):
+        fail(f"no mechanism was found: {designs.reason}")
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
@@ -83,18 +83,20 @@ def _show_all(file: Path, search: Any, results: int, out: Path | None, json: boo
     from udkjax.show.summary import table
 
     try:
-        found = search()
+        solutions = search()
     except ValueError as problem:
         if isinstance(problem, udk.SceneError):
             raise
         refuse(f"{file}: {problem}")
-    chosen = [found[k] for k in range(min(results, len(found)))]
-    lines = {"solutions": ", ".join(f"{count} {name}" for name, count in found.paths.items())}
-    lines["real solutions"] = f"{found.classes} proven, {found.unproven} unproven; {len(found)} four-bars"
-    for name in dict.fromkeys(found.defects):
-        lines[f"defect {name}"] = str(found.defects.count(name))
-    for k, one in enumerate(chosen):
-        lines[f"design {k + 1}"] = f"{one.kind}, defect {one.defect}, transmission {one.transmission:.3g}, class {one.number}"
+    chosen = [solutions[k] for k in range(min(results, len(solutions)))]
+    lines = {"solutions": ", ".join(f"{count} {name}" for name, count in solutions.paths.items())}
+    lines["real solutions"] = f"{solutions.classes} proven, {solutions.unproven} unproven; {len(solutions)} four-bars"
+    for name in dict.fromkeys(solutions.defects):
+        lines[f"defect {name}"] = str(solutions.defects.count(name))
+    for k, solution in enumerate(chosen):
+        lines[f"design {k + 1}"] = (
+            f"{solution.kind}, defect {solution.defect}, transmission {solution.transmission:.3g}, class {solution.number}"
+        )
     if out is not None:
         lines["files in"] = _write(chosen, search.goal, out)
     names = (
@@ -110,22 +112,27 @@ def _show_all(file: Path, search: Any, results: int, out: Path | None, json: boo
         "number",
         "cognate",
     )
-    listed = [{name: getattr(one, name) for name in (*names, "values", "pins")} for one in chosen]
-    counts = {"solutions": found.paths, "classes": found.classes, "unproven": found.unproven, "four_bars": len(found)}
-    counts |= {"beyond_limits": found.left_out, "others": [{"kind": kind, "pins": pins} for kind, pins in found.others]}
-    show({**counts, "designs": listed}, table(f"four-bars of {found.mechanism.name or 'a drawing'}", lines), json)
-    if not len(found):
-        beyond = f" within the limits; {found.left_out} are beyond them" if found.left_out else ""
+    listed = [{name: getattr(solution, name) for name in (*names, "values", "pins")} for solution in chosen]
+    counts = {
+        "solutions": solutions.paths,
+        "classes": solutions.classes,
+        "unproven": solutions.unproven,
+        "four_bars": len(solutions),
+    }
+    counts |= {"beyond_limits": solutions.left_out, "others": [{"kind": kind, "pins": pins} for kind, pins in solutions.others]}
+    show({**counts, "designs": listed}, table(f"four-bars of {solutions.mechanism.name or 'a drawing'}", lines), json)
+    if not len(solutions):
+        beyond = f" within the limits; {solutions.left_out} are beyond them" if solutions.left_out else ""
         fail(f"no real four-bar meets the goal exactly{beyond}: remove complete = true to find the nearest")
 
 
-def _write(found: Iterable[Any], goal: Any, out: Path) -> str:
+def _write(designs: Iterable[Any], goal: Any, out: Path) -> str:
     """Write each design as a drawing and as an animated page; return the folder."""
     import udkjax as udk
 
     out.mkdir(parents=True, exist_ok=True)
     traces = [goal.point] if isinstance(goal, udk.PathGoal) else None
-    for k, one in enumerate(found):
-        udk.save(one.mechanism, out / f"design{k + 1}.toml")
-        udk.animate(one.mechanism, one.motion(), measures=(), traces=traces).save(out / f"design{k + 1}.html")
+    for k, candidate in enumerate(designs):
+        udk.save(candidate.mechanism, out / f"design{k + 1}.toml")
+        udk.animate(candidate.mechanism, candidate.motion(), measures=(), traces=traces).save(out / f"design{k + 1}.html")
     return str(out)

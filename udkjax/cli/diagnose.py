@@ -23,7 +23,7 @@ def diagnose(
     import udkjax as udk
 
     run = None if ts is None else udk.simulate(mech, ts, rtol=1e-10, atol=1e-10, throw=False)
-    found = udk.diagnose(mech, solution=run, t=t, fixes=fixes)
-    show(found.to_dict(), str(found), json)
+    diagnosis = udk.diagnose(mech, solution=run, t=t, fixes=fixes)
+    show(diagnosis.to_dict(), str(diagnosis), json)
     if run is not None and run.result:
         fail(run.cause)

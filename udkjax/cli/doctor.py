@@ -7,5 +7,5 @@ def doctor(json: Json = False) -> None:
     """Print versions, devices, precision, and the engine in use with the reason, to paste into a bug report."""
     from udkjax.show.doctor import facts, summary
 
-    found = facts()
-    show(found, summary(found), json)
+    report = facts()
+    show(report, summary(report), json)

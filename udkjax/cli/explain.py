@@ -25,5 +25,5 @@ def explain(scene: Scene, /, t: float = 0.0, json: Json = False) -> None:
         except udk.SimulationError as problem:
             refuse(f"--t {t:g}: {problem}")
         state = udk.State(run.q[-1], run.v[-1])
-    found = udk.explain(mech, t, state)
-    show(found.to_dict(), str(found), json)
+    explanation = udk.explain(mech, t, state)
+    show(explanation.to_dict(), str(explanation), json)

@@ -97,13 +97,13 @@ def identify(
     given = {name: [item for group in groups for item in group] for name, groups in several.items()}
     results = estimate.to_dict() | {
         "settings": {**given, "estimate_initial_state": estimate_initial_state, **settings},
-        "intervals": {found.name: found.interval for found in profiles},
+        "intervals": {likelihood.name: likelihood.interval for likelihood in profiles},
         "data": [{"file": str(file), "sha256": hashlib.sha256(file.read_bytes()).hexdigest()} for file in data],
         "scene_file": str(scene),
         "scene": text,
     }
     files = _write(estimate, profiles, results, out)
-    lines = [str(estimate), *(found.text for found in profiles), f"wrote {', '.join(files)} to {out}"]
+    lines = [str(estimate), *(likelihood.text for likelihood in profiles), f"wrote {', '.join(files)} to {out}"]
     show(results | {"files": [out / name for name in files]}, "\n".join(lines), json)
     if not estimate.success:
         fail("the fit has not converged" if not estimate.converged else "the measurements do not determine every parameter")

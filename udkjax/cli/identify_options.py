@@ -52,13 +52,13 @@ class IdentifyOptions:
             return []
         everywhere, by_channel = self._noise(noise)
         left_out = [name for group in ignore for name in group]
-        found = self._try(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
-        found = self._try(lambda: records_of(self.mechanism, found, everywhere), ()) if found else ()
-        return [record.changed(initial_state=Start(estimate=start)) for record in found]
+        loaded = self._try(lambda: records_of(self.mechanism, list(data), by_channel, left_out), ())
+        loaded = self._try(lambda: records_of(self.mechanism, loaded, everywhere), ()) if loaded else ()
+        return [record.changed(initial_state=Start(estimate=start)) for record in loaded]
 
     def profiled(self, groups: Groups) -> list[str]:
         """Return the names in the estimate of parameters given by their full name, or by one of several tied names."""
-        full_names = {_plain(part): name for name in self.names for part in (name, *name.split("="))}
+        full_names = {_plain(alias): name for name in self.names for alias in (name, *name.split("="))}
         given = [text for group in groups for text in group]
         if self.names:
             self.problems += [
@@ -86,22 +86,26 @@ class IdentifyOptions:
 
     def _add(self, given: dict[str, dict[str, Any]], option: str, text: str) -> None:
         """Add an option of a parameter, given by its full name or by any of several tied names."""
-        place = f"--{option} {quote(text)}"
+        option_text = f"--{option} {quote(text)}"
         name, _, numbers = text.rpartition("=")
-        of = {_plain(part): whole for whole in given for part in (whole, *whole.split("="))}.get(_plain(name))
+        parameter = {_plain(alias): full_name for full_name in given for alias in (full_name, *full_name.split("="))}.get(
+            _plain(name)
+        )
         values = _numbers(numbers, 1 if option == "guess" else 2)
         if not name or values is None:
             form = {"guess": "NAME=VALUE", "bounds": "NAME=LOW,HIGH", "prior": "NAME=MEAN,DEVIATION"}[option]
-            self.problems.append(f"{place}: must be {form}, in SI units")
-        elif of is None:
-            near = suggestion(name.strip(), [part.strip() for whole in given for part in (whole, *whole.split("="))])
-            self.problems.append(f"{place}: {quote(name.strip())} is not among --parameters{near}")
-        elif option in given[of]:
-            self.problems.append(f"{place}: is given twice for {quote(of)}")
+            self.problems.append(f"{option_text}: must be {form}, in SI units")
+        elif parameter is None:
+            advice = suggestion(
+                name.strip(), [alias.strip() for full_name in given for alias in (full_name, *full_name.split("="))]
+            )
+            self.problems.append(f"{option_text}: {quote(name.strip())} is not among --parameters{advice}")
+        elif option in given[parameter]:
+            self.problems.append(f"{option_text}: is given twice for {quote(parameter)}")
         elif option == "bounds" and not values[0] < values[1]:
-            self.problems.append(f"{place}: the lower bound must be below the upper one")
+            self.problems.append(f"{option_text}: the lower bound must be below the upper one")
         else:
-            given[of][option] = values[0] if option == "guess" else tuple(values)
+            given[parameter][option] = values[0] if option == "guess" else tuple(values)
 
     def _try(self, read: Callable[[], Found], otherwise: Found) -> Found:
         try:
@@ -114,10 +118,10 @@ class IdentifyOptions:
 def _numbers(text: str, count: int) -> list[float] | None:
     """Parse `count` comma-separated finite numbers; None if the text is anything else."""
     try:
-        found = [float(part) for part in text.split(",")]
+        numbers = [float(word) for word in text.split(",")]
     except ValueError:
         return None
-    return found if len(found) == count and all(map(math.isfinite, found)) else None
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
 
 
 def _plain(text: str) -> str:

@@ -38,32 +38,38 @@ def inverse(
 
     import udkjax as udk
 
-    found = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
-    efforts = {name: np.asarray(x) for name, x in found.efforts.items()}
-    results: dict[str, Any] = {"time": ts, "efforts": efforts, "powers": found.powers, "residual": found.residual, "peaks": {}}
+    solution = udk.inverse_dynamics(mech, ts, drivers=list(drivers) or None)
+    efforts = {name: np.asarray(x) for name, x in solution.efforts.items()}
+    results: dict[str, Any] = {
+        "time": ts,
+        "efforts": efforts,
+        "powers": solution.powers,
+        "residual": solution.residual,
+        "peaks": {},
+    }
     for name, x in efforts.items():
         good = np.isfinite(x)
         k = int(np.nanargmax(np.abs(x))) if good.any() else 0
         rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
-        energies = {"work": found.works[name], "swing": found.swings[name]}
+        energies = {"work": solution.works[name], "swing": solution.swings[name]}
         results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms, **energies}
-    units = sorted({unit for _, unit in found.effort_units}, reverse=True)
+    units = sorted({unit for _, unit in solution.effort_units}, reverse=True)
     variables = {
         "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), " or ".join(units)),
-        "power": (("time", "driver"), np.stack([np.asarray(x) for x in found.powers.values()], 1), "W"),
+        "power": (("time", "driver"), np.stack([np.asarray(x) for x in solution.powers.values()], 1), "W"),
     }
     if plot is not None:
         from udkjax.show.figures import channels_figure
 
-        shown = {name: (x, unit) for (name, x), (_, unit) in zip(efforts.items(), found.effort_units, strict=True)}
-        shown |= {f"power of {name}": (np.asarray(x), "W") for name, x in found.powers.items()}
+        shown = {name: (x, unit) for (name, x), (_, unit) in zip(efforts.items(), solution.effort_units, strict=True)}
+        shown |= {f"power of {name}": (np.asarray(x), "W") for name, x in solution.powers.items()}
         channels_figure(ts, shown, title=mech.name).savefig(plot, dpi=150)
     write(out, text, variables, {"time": ts, "driver": list(efforts)}, {})
-    show(results, f"{mech.name or 'mechanism'}, {found}", json)
-    determined = np.asarray(found.determined)
+    show(results, f"{mech.name or 'mechanism'}, {solution}", json)
+    determined = np.asarray(solution.determined)
     if not determined.all():
         k = int(np.argmin(determined))
-        became = udk.Reached(int(found.motion.status[k])) if found.motion is not None else udk.Reached.closed
+        became = udk.Reached(int(solution.motion.status[k])) if solution.motion is not None else udk.Reached.closed
         if became in (udk.Reached.closed, udk.Reached.singular, udk.Reached.not_determined):
             fail(f"at {ts[k]:g} s the efforts are not determined: the position is singular")
         fail(f"the prescribed motion ends at {ts[k]:g} s: {became.label}")

@@ -65,10 +65,10 @@ def kinematics(
     rate = (constant_speed(mech, driver) or 1.0) if rate is None else rate
     first = _default(first, float(travel.lower), float(value_of(mech, driver)(udk.assemble(mech).q)))
     last = _default(last, float(travel.upper), first + (2 * math.pi if travel.unit == "rad" else float(udk.analyse(mech).length)))
-    found = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
-    others = udk.branches(mech, driver, first) if branches else None
-    names = [udk.Reached(int(code)).name for code in np.asarray(found.status)]
-    reached = int(np.sum(np.asarray(found.reached)))
+    motion = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
+    assembly_modes = udk.branches(mech, driver, first) if branches else None
+    names = [udk.Reached(int(code)).name for code in np.asarray(motion.status)]
+    reached = int(np.sum(np.asarray(motion.reached)))
     free = (
         math.isinf(float(travel.lower)) and math.isinf(float(travel.upper)) and udk.Reached.lost not in np.asarray(travel.status)
     )
@@ -78,48 +78,48 @@ def kinematics(
     }
     if out is not None or plot is not None:
         lines["velocities"] = f"at {format_number(rate)} {travel.unit}/s of {driver}"
-    if math.isfinite(float(found.limit)):
-        lines["toggle at"] = f"{float(found.limit):.15g} {travel.unit}"
+    if math.isfinite(float(motion.limit)):
+        lines["toggle at"] = f"{float(motion.limit):.15g} {travel.unit}"
     for name, words in (("singular", "singular at"), ("not_determined", "rates undetermined at")):
         if name in names:
-            lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(found.values), names, strict=True) if n == name)
-    if others is not None:
-        lines["branches"] = f"{len(others)} at {first:g}"
-    ranges = udk.motion_ranges(mech, found, driver)
+            lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(motion.values), names, strict=True) if n == name)
+    if assembly_modes is not None:
+        lines["branches"] = f"{len(assembly_modes)} at {first:g}"
+    ranges = udk.motion_ranges(mech, motion, driver)
     lines |= range_lines(ranges)
-    columns = measure_channels(mech, found, measured)
+    columns = measure_channels(mech, motion, measured)
     results: dict[str, object] = {
         "driver": driver,
         "travel": [travel.lower, travel.upper],
-        "values": found.values,
+        "values": motion.values,
         "status": names,
-        "limit": found.limit,
+        "limit": motion.limit,
         "ranges": {name: getattr(ranges, name) for name in ("swings", "strokes", "transmission_angles")},
-        "bodies": list(found.bodies),
-        **{name: getattr(found, name) for name in ("q", "v", "a")},
+        "bodies": list(motion.bodies),
+        **{name: getattr(motion, name) for name in ("q", "v", "a")},
         "channels": {name: values for name, (values, _) in columns.items()},
     }
-    if others is not None:
-        results["branches"] = others
+    if assembly_modes is not None:
+        results["branches"] = assembly_modes
     dims = ("value", "body", "coordinate")
     variables: "dict[str, tuple[tuple[str, ...], ArrayLike, str]]" = {
-        "q": (dims, found.q, "m, m, rad"),
-        "v": (dims, found.v, "m/s, m/s, rad/s"),
-        "a": (dims, found.a, "m/s2, m/s2, rad/s2"),
-        "status": (("value",), found.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open, 5 not determined"),
+        "q": (dims, motion.q, "m, m, rad"),
+        "v": (dims, motion.v, "m/s, m/s, rad/s"),
+        "a": (dims, motion.a, "m/s2, m/s2, rad/s2"),
+        "status": (("value",), motion.status, "0 closed, 1 singular, 2 beyond limit, 3 lost, 4 open, 5 not determined"),
     }
-    coordinates = {"value": np.asarray(found.values), "body": list(found.bodies)}
+    coordinates = {"value": np.asarray(motion.values), "body": list(motion.bodies)}
     variables |= {name: (("value",), values, unit) for name, (values, unit) in columns.items()}
     if plot is not None:
         from udkjax.show.figures import channels_figure, driven_figure
 
-        label = f"{driver} ({found.unit})"
-        picture = channels_figure(found.values, columns, label, mech.name) if columns else driven_figure(mech, found, driver)
+        label = f"{driver} ({motion.unit})"
+        picture = channels_figure(motion.values, columns, label, mech.name) if columns else driven_figure(mech, motion, driver)
         picture.savefig(plot, dpi=150)
     write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
     show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
     if reached < count:
-        fail(f"{count - reached} values cannot be reached: {names[int(np.argmin(np.asarray(found.reached)))].replace('_', ' ')}")
+        fail(f"{count - reached} values cannot be reached: {names[int(np.argmin(np.asarray(motion.reached)))].replace('_', ' ')}")
 
 
 def _end(travel: "Travel", side: int) -> str:

@@ -20,24 +20,24 @@ def modes(scene: Scene, /, stable: bool = True, t: float = 0.0, out: Path | None
 
     import udkjax as udk
 
-    rest = udk.equilibrium(mech, t=t, stable=stable)
-    found = udk.modes(mech, rest.state, t)
+    balance = udk.equilibrium(mech, t=t, stable=stable)
+    oscillations = udk.modes(mech, balance.state, t)
     results = {
         "bodies": mech.body_names,
-        "omega2": found.omega2,
-        "frequencies": found.frequencies,
-        "s": [[s.real, s.imag] for s in np.asarray(found.s)],
-        "damping": found.damping,
-        "shapes": found.shapes,
-        "q": found.q,
-        "balanced": bool(rest.balanced),
+        "omega2": oscillations.omega2,
+        "frequencies": oscillations.frequencies,
+        "s": [[s.real, s.imag] for s in np.asarray(oscillations.s)],
+        "damping": oscillations.damping,
+        "shapes": oscillations.shapes,
+        "q": oscillations.q,
+        "balanced": bool(balance.balanced),
     }
     variables = {
-        "omega2": (("mode",), found.omega2, "1/s2"),
-        "shape": (("mode", "body", "coordinate"), found.shapes, "m, m, rad, of modal mass 1 kg"),
-        "q": (("body", "coordinate"), found.q, "m, m, rad"),
+        "omega2": (("mode",), oscillations.omega2, "1/s2"),
+        "shape": (("mode", "body", "coordinate"), oscillations.shapes, "m, m, rad, of modal mass 1 kg"),
+        "q": (("body", "coordinate"), oscillations.q, "m, m, rad"),
     }
     write(out, text, variables, {"body": list(mech.body_names)}, {"t": t})
-    show(results, f"{mech.name or 'mechanism'}, {found}", json)
-    if not rest.balanced:
+    show(results, f"{mech.name or 'mechanism'}, {oscillations}", json)
+    if not balance.balanced:
         fail("no equilibrium was found near the initial guess")

@@ -37,35 +37,37 @@ def reactions(
     from udkjax.statics.reaction_peaks import cam_forces, unique_pin_forces
 
     sol = udk.simulate(mech, ts, throw=False)
-    found = {pin: {body: np.asarray(x) for body, x in at.items()} for pin, at in udk.pin_reactions(mech, sol).items()}
-    if not found:
+    forces = {pin: {body: np.asarray(x) for body, x in by_body.items()} for pin, by_body in udk.pin_reactions(mech, sol).items()}
+    if not forces:
         refuse("the scene has no pins")
     unique = unique_pin_forces(mech, sol)
     variables: dict[str, Any] = {}
     rows: list[tuple[str, ...]] = []
     results: dict[str, dict[str, Any]] = {}
-    for pin, at in found.items():
-        for body, x in at.items():
+    for pin, by_body in forces.items():
+        for body, x in by_body.items():
             for k, (name, unit) in enumerate(LOADS.items()):
                 variables[f"pin.{pin}.{body}.{name}"] = (("time",), x[:, k], unit)
             force = np.hypot(x[:, 0], x[:, 1])
-            top, size = int(np.nanargmax(force)) if np.isfinite(force).any() else 0, float(np.nanmax(force, initial=0.0))
+            highest, size = int(np.nanargmax(force)) if np.isfinite(force).any() else 0, float(np.nanmax(force, initial=0.0))
             is_unique = unique[pin][body]
-            cells = [format_number(value, scale=size) for value in (force[top], x[top, 0], x[top, 1])]
-            rows.append((pin, body, *cells, f"{ts[top]:g}", "" if is_unique else "not unique: minimum-norm value"))
-            peak = {"force": force[top], "fx": x[top, 0], "fy": x[top, 1], "time": ts[top], "unique": is_unique}
+            cells = [format_number(value, scale=size) for value in (force[highest], x[highest, 0], x[highest, 1])]
+            rows.append((pin, body, *cells, f"{ts[highest]:g}", "" if is_unique else "not unique: minimum-norm value"))
+            peak = {"force": force[highest], "fx": x[highest, 0], "fy": x[highest, 1], "time": ts[highest], "unique": is_unique}
             results.setdefault(pin, {})[body] = peak
     write(out, text, variables, {"time": ts}, {})
     if plot is not None:
         from udkjax.show.figures import reactions_figure
 
-        reactions_figure(ts, found, mech.name).savefig(plot, dpi=150)
+        reactions_figure(ts, forces, mech.name).savefig(plot, dpi=150)
     remarks, cams = [], {}
     for cam, pressed in cam_forces(mech, sol).items():
-        least = int(np.nanargmin(pressed)) if np.isfinite(pressed).any() else 0
-        cams[cam] = {"least": pressed[least], "time": ts[least]}
-        lifts = "; where it is negative, the follower lifts off" if pressed[least] < 0 else ""
-        remarks.append(f"  smallest contact force of cam {cam}: {format_number(pressed[least], 'N')}, at {ts[least]:g} s{lifts}")
+        lowest = int(np.nanargmin(pressed)) if np.isfinite(pressed).any() else 0
+        cams[cam] = {"least": pressed[lowest], "time": ts[lowest]}
+        lifts = "; where it is negative, the follower lifts off" if pressed[lowest] < 0 else ""
+        remarks.append(
+            f"  smallest contact force of cam {cam}: {format_number(pressed[lowest], 'N')}, at {ts[lowest]:g} s{lifts}"
+        )
     heads = "pin", "on body", "largest force (N)", "fx (N)", "fy (N)", "at (s)", ""
     show(
         {"result": sol.result, "peaks": results, "cams": cams},

@@ -116,19 +116,19 @@ def simulate(
     if columns:
         files.append(plot.with_stem(f"{plot.stem}-channels"))
         channels_figure(sol.ts, columns, title=mech.name).savefig(files[-1], dpi=150)
-    found = accuracy(mech, sol)
+    achieved = accuracy(mech, sol)
     moved = () if t0 and mech.drivers else moves_of_assembly(mech, udk.assemble(mech, t0, throw=False).q)
     results = {
         "result": sol.result,
         "end_time": sol.time,
         "moved": moved,
         **sol.stats,
-        **found._asdict(),
+        **achieved._asdict(),
         "seconds": seconds["all"],
         "seconds_compiling": seconds["compiling"],
         "files": files,
     }
-    text = run_summary(mech, sol, found, seconds["all"], seconds["compiling"], moved)
+    text = run_summary(mech, sol, achieved, seconds["all"], seconds["compiling"], moved)
     show(results, f"{text}\nwrote {' and '.join(map(str, files))}", json)
     if sol.result:
         fail(sol.cause)

@@ -36,36 +36,39 @@ def statics(
     from udkjax.positions.channels import LOADS
     from udkjax.statics.resting_forces import force_lines, resting_forces
 
-    one = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
-    found = ([one] if one.balanced else []) if one is not None else udk.equilibria(mech, starts, seed, t)
-    forces = [resting_forces(mech, e.q, t) for e in found]
+    single = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
+    equilibria = ([single] if single.balanced else []) if single is not None else udk.equilibria(mech, starts, seed, t)
+    forces = [resting_forces(mech, e.q, t) for e in equilibria]
     results = {
         "bodies": mech.body_names,
         "equilibria": [
             {"q": e.q, "omega2": e.omega2, "stable": bool(e.stable), "multipliers": e.multipliers, "residual": e.residual}
-            | own._asdict()
-            for e, own in zip(found, forces, strict=True)
+            | reactions._asdict()
+            for e, reactions in zip(equilibria, forces, strict=True)
         ],
     }
-    if found:
+    if equilibria:
         variables = {
-            "q": (("equilibrium", "body", "coordinate"), np.stack([np.asarray(e.q) for e in found]), "m, m, rad"),
-            "omega2": (("equilibrium", "mode"), np.stack([np.asarray(e.omega2) for e in found]), "1/s2"),
-            "multiplier": (("equilibrium", "row"), np.stack([np.asarray(e.multipliers) for e in found]), "N, N m"),
+            "q": (("equilibrium", "body", "coordinate"), np.stack([np.asarray(e.q) for e in equilibria]), "m, m, rad"),
+            "omega2": (("equilibrium", "mode"), np.stack([np.asarray(e.omega2) for e in equilibria]), "1/s2"),
+            "multiplier": (("equilibrium", "row"), np.stack([np.asarray(e.multipliers) for e in equilibria]), "N, N m"),
         }
         for name in mech.driver_names:
             variables[f"effort.{name}"] = (
                 ("equilibrium",),
-                [one.efforts[name] for one in forces],
+                [x.efforts[name] for x in forces],
                 mech.drivers[name].effort_unit,
             )
-        for pin, on in forces[0].forces.items():
-            for body in on:
-                for k, (part, unit) in enumerate(LOADS.items()):
-                    values = [one.forces[pin][body][k] for one in forces]
-                    variables[f"pin.{pin}.{body}.{part}"] = (("equilibrium",), values, unit)
+        for pin, by_body in forces[0].forces.items():
+            for body in by_body:
+                for k, (component, unit) in enumerate(LOADS.items()):
+                    values = [x.forces[pin][body][k] for x in forces]
+                    variables[f"pin.{pin}.{body}.{component}"] = (("equilibrium",), values, unit)
         write(out, text, variables, {"body": list(mech.body_names)}, {"t": t, "starts": starts})
-    words = (f"{mech.name or 'mechanism'}, {e}\n{force_lines(mech, own)}" for e, own in zip(found, forces, strict=True))
+    words = (
+        f"{mech.name or 'mechanism'}, {e}\n{force_lines(mech, reactions)}"
+        for e, reactions in zip(equilibria, forces, strict=True)
+    )
     show(results, "\n".join(words), json)
-    if not found:
+    if not equilibria:
         fail("no equilibrium was found near the initial guess; try --stable, or --starts 64")

@@ -85,8 +85,8 @@ def _estimate(mech: "Mechanism", arguments: dict[str, Any], memory: int, json: b
     from udkjax.study.sweep.plan import make_plan
 
     plan = make_plan(mech, **arguments)
-    found = estimate_cost(plan, memory)
-    show(asdict(found), estimate_summary(plan, found), json)
+    cost = estimate_cost(plan, memory)
+    show(asdict(cost), estimate_summary(plan, cost), json)
 
 
 def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, json: bool, choices: dict[str, Any]) -> None:

@@ -64,7 +64,7 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
     defaults = {name: p.default for name, p in parameters.parameters.items() if p.default is not p.empty}
     kinds = {p.kind for p in parameters.parameters.values()}
     names = [name for name, p in parameters.parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
-    required, plain = (
+    required, is_fixed = (
         parameters.parameters.keys() - defaults.keys(),
         kinds <= {Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY},
     )
@@ -72,8 +72,8 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
     def bind(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[GivenArguments, GivenArguments]:
         given = dict(zip(names, args, strict=False)) | kwargs
         bound = defaults | given
-        is_right = len(given) == len(args) + len(kwargs) and required <= given.keys() and len(bound) == len(parameters.parameters)
-        if not (plain and is_right):  # `bind` raises the error
+        is_valid = len(given) == len(args) + len(kwargs) and required <= given.keys() and len(bound) == len(parameters.parameters)
+        if not (is_fixed and is_valid):  # `bind` raises the error
             given = bind_arguments(function.__name__, parameters, args, kwargs).arguments
             bound = defaults | given
         return given, bound
@@ -111,27 +111,27 @@ class ParameterCheck(NamedTuple):
 
 
 def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
-    found: list[ParameterCheck] = []
+    parameter_checks: list[ParameterCheck] = []
     checks = CHECKS | {"mechanism": require_single}
     for name, parameter in signature(function).parameters.items():
         annotation = parameter.annotation
         if get_origin(annotation) is Literal:
-            found.append(ParameterCheck(name, _choice(get_args(annotation))))
+            parameter_checks.append(ParameterCheck(name, _choice(get_args(annotation))))
         elif classes := _classes(annotation):
-            found.append(ParameterCheck(name, _instance(classes)))
+            parameter_checks.append(ParameterCheck(name, _instance(classes)))
         if name in ("solution", "motion") and parameter.default is parameter.empty:
-            found.append(ParameterCheck(name, require_history))
+            parameter_checks.append(ParameterCheck(name, require_history))
         elif name in checks:
             may_be_none = parameter.default is None or type(None) in get_args(annotation)
-            found.append(ParameterCheck(name, checks[name], "passes" if may_be_none else "refuses"))
-    return found
+            parameter_checks.append(ParameterCheck(name, checks[name], "passes" if may_be_none else "refuses"))
+    return parameter_checks
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
     """Return the classes that an annotation allows; empty unless it consists of classes only."""
-    parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    plain = [x for x in parts if isclass(x) and (x in (bool, type(None), str) or _is_ours(x))]
-    return tuple(plain) if len(plain) == len(parts) and any(x is not type(None) for x in plain) else ()
+    alternatives = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    classes = [x for x in alternatives if isclass(x) and (x in (bool, type(None), str) or _is_ours(x))]
+    return tuple(classes) if len(classes) == len(alternatives) and any(x is not type(None) for x in classes) else ()
 
 
 def _is_ours(x: type) -> bool:
@@ -160,9 +160,13 @@ def _meant(cls: type) -> str:
 
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
     """Return the advice to give an instance, if the value is a class or its name; else an empty string."""
-    called = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
-    found = {x.__name__.lower(): x.__name__ for x in _family(classes)}.get(called.strip("() ").lower())
-    return f"; give an instance: {name}=udk.{found}()" if found and found not in ("Mechanism", "State", "Analysis") else ""
+    wanted = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
+    class_name = {x.__name__.lower(): x.__name__ for x in _family(classes)}.get(wanted.strip("() ").lower())
+    return (
+        f"; give an instance: {name}=udk.{class_name}()"
+        if class_name and class_name not in ("Mechanism", "State", "Analysis")
+        else ""
+    )
 
 
 def _family(classes: Sequence[type]) -> Iterator[type]:

@@ -64,16 +64,16 @@ class SceneEntry(NamedTuple):
     @property
     def where(self) -> str:
         """The path of the entry, as in error messages."""
-        place = f"{self.section}[{self.index}]"
-        return f"{self.section} {abbreviate(self.name)} ({place})" if isinstance(self.name, str) and self.name else place
+        entry = f"{self.section}[{self.index}]"
+        return f"{self.section} {abbreviate(self.name)} ({entry})" if isinstance(self.name, str) and self.name else entry
 
 
 def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     """Return every mistake of a scene, in the order of its entries."""
-    found = gravity_mistakes(gravity)
+    problems = gravity_mistakes(gravity)
     bodies = [entry for entry in entries if entry.section == "body"]
     if not bodies:
-        found.append("body: a mechanism needs at least one body")
+        problems.append("body: a mechanism needs at least one body")
     known: dict[str, dict[str, type | None]] = {
         "body": {GROUND: None, **{e.name: e.cls for e in bodies if isinstance(e.name, str)}},
         "revolute": {e.name: e.cls for e in entries if e.section == "joint" and isinstance(e.name, str)},
@@ -82,31 +82,33 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     for entry in entries:
         space = "joint" if entry.section == "driver" else entry.section
         if not isinstance(entry.name, str) or not entry.name:
-            given = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
-            found.append(f"{entry.where}.name: {given}")
+            mistake = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
+            problems.append(f"{entry.where}.name: {mistake}")
         elif entry.section == "body" and entry.name == GROUND:
-            found.append(f'{entry.where}.name: "{GROUND}" is the fixed frame; choose another name')
+            problems.append(f'{entry.where}.name: "{GROUND}" is the fixed frame; choose another name')
         elif (first := owner.setdefault((space, entry.name), entry)) is not entry:
-            found.append(f"{entry.where}.name: taken by {first.section}[{first.index}]; names must be unique")
+            problems.append(f"{entry.where}.name: taken by {first.section}[{first.index}]; names must be unique")
         if entry.cls is None:
-            found.append(entry.problem)
-            found.extend(_check_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
+            problems.append(entry.problem)
+            problems.extend(_check_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
         else:
-            found.extend(check_table(entry.where, entry.cls, entry.table, known))
-    return found
+            problems.extend(check_table(entry.where, entry.cls, entry.table, known))
+    return problems
 
 
 def traced_numbers_are_valid(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
     """Return True if traced numbers meet the strict requirements of their fields; concrete numbers are checked on input."""
-    found = [jnp.array(True)]
+    conditions = [jnp.array(True)]
     for element in elements:
         for field in dataclasses.fields(element):
             value = getattr(element, field.name)
             if isinstance(value, eqx.Module):
-                found.append(traced_numbers_are_valid([value]))
+                conditions.append(traced_numbers_are_valid([value]))
             elif isinstance(value, Tracer):
-                found += [jnp.all(need.holds(value)) for need in field.metadata.get("require", ()) if need.strict]
-    return jnp.all(jnp.stack(found))
+                conditions += [
+                    jnp.all(requirement.holds(value)) for requirement in field.metadata.get("require", ()) if requirement.strict
+                ]
+    return jnp.all(jnp.stack(conditions))
 
 
 def gravity_mistakes(gravity: object) -> list[str]:
@@ -138,8 +140,8 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
     """Iterate over the mistakes in one value. `sizes` collects the lengths of the table's named dimensions."""
     if get_origin(annotation) is UnionType:  # a number, or samples of it
-        annotation, held = get_args(annotation)
-        if isinstance(value, held | dict):
+        annotation, sampled_class = get_args(annotation)
+        if isinstance(value, sampled_class | dict):
             yield from _check_held(path, annotation.dim_str.split(), value)
             return
     if hasattr(annotation, "dim_str"):
@@ -179,16 +181,16 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
 def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
     """Iterate over the mistakes in a `Held` whose samples have the shape `dims`."""
     table = table_of(value) if isinstance(value, Held) else value
-    found, expected = list(check_table(path, Held, table, {})), keys(Held)
+    problems, expected = list(check_table(path, Held, table, {})), keys(Held)
     for name in ("dt", "t0"):
         if isinstance(time := table.get(name, 0.0 if name == "t0" else 1.0), Tracer):
-            found.append(f"{path}.{name}: must be known when a function is traced")
+            problems.append(f"{path}.{name}: must be known when a function is traced")
         else:
-            found.extend(_check_number(f"{path}.{name}", [], time, expected[name].metadata, {}))
-    yield from found
-    if not found and (shape := np.shape(table["values"])[1:]) != tuple(map(int, dims)):  # pyright: ignore[reportArgumentType]
-        each = f"{' x '.join(dims)} numbers" if dims else "a number"
-        yield f"{path}.values: each sample must be {each}, has the shape {shape}"
+            problems.extend(_check_number(f"{path}.{name}", [], time, expected[name].metadata, {}))
+    yield from problems
+    if not problems and (shape := np.shape(table["values"])[1:]) != tuple(map(int, dims)):  # pyright: ignore[reportArgumentType]
+        sample = f"{' x '.join(dims)} numbers" if dims else "a number"
+        yield f"{path}.values: each sample must be {sample}, has the shape {shape}"
 
 
 def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tuple[type | None, str]:
@@ -253,16 +255,16 @@ def _check_references(path: str, kind: str | None, value: object, known: KnownNa
     named = known[kind]
     single = isinstance(value, str)
     for i, name in enumerate([value] if single else value if isinstance(value, list | tuple) else []):
-        place = path if single else f"{path}[{i}]"
+        entry_path = path if single else f"{path}[{i}]"
         if not isinstance(name, str):
             continue
         if name not in named:
-            what = {"revolute": "revolute joint"}.get(kind, kind)
-            yield f"{place}: no {what} named {quote(name)}{suggestion(name, named)}"
+            noun = {"revolute": "revolute joint"}.get(kind, kind)
+            yield f"{entry_path}: no {noun} named {quote(name)}{suggestion(name, named)}"
         elif kind == "revolute" and not issubclass(named[name] or Revolute, Revolute):
-            yield f"{place}: {quote(name)} must be a revolute joint"
+            yield f"{entry_path}: {quote(name)} must be a revolute joint"
         elif single and name == GROUND and path.endswith(".body"):
-            yield f'{place}: "{GROUND}" does not move; name a body'
+            yield f'{entry_path}: "{GROUND}" does not move; name a body'
 
 
 def _check_bodies(where: str, cls: type, table: TomlTable) -> Iterator[str]:

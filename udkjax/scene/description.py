@@ -65,8 +65,8 @@ def _format_element(element: eqx.Module) -> str:
         owner = element
         for field in path[:-1]:
             owner = getattr(owner, field)
-        held = isinstance(owner, Held)
-        unit = field_unit(type(element if held else owner).__name__, path[-2] if held else path[-1], driven)
+        is_held = isinstance(owner, Held)
+        unit = field_unit(type(element if is_held else owner).__name__, path[-2] if is_held else path[-1], driven)
         shown.append(f"{' '.join(path)} {format_numbers(value, unit)}".replace("_", " "))
     return ", ".join(shown)
 

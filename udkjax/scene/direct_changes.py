@@ -49,28 +49,28 @@ def marks_by_name(mechanism: Marked) -> dict[str, Any]:
 
 def mark_changes(mechanism: Marked, groups: ElementGroups, names: Collection[str]) -> Float[Array, "K"]:
     """Return the marks of elements with new values of the named numbers, or entries of numbers; older marks are kept."""
-    before, found = marks_by_name(mechanism), {}
+    old_marks, marks = marks_by_name(mechanism), {}
     for name, field in _present(groups).items():
-        mark, shape = before.get(name), np.shape(field.value)
-        found[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # new samples count as set
-    for given in names:
-        name, index = split_index(given, found)
-        if name in found:
-            which = np.zeros(found[name].shape)
-            which[index] = 1.0
-            found[name] = (jnp if is_traced(found[name]) else np).maximum(found[name], which)
-    return number(_joined(list(found.values())))
+        mark, shape = old_marks.get(name), np.shape(field.value)
+        marks[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # new samples count as set
+    for full_name in names:
+        name, index = split_index(full_name, marks)
+        if name in marks:
+            changed = np.zeros(marks[name].shape)
+            changed[index] = 1.0
+            marks[name] = (jnp if is_traced(marks[name]) else np).maximum(marks[name], changed)
+    return number(_joined(list(marks.values())))
 
 
 def directly_changed(mechanism: Marked, redrawn: Sections) -> dict[str, Any]:
     """Return the directly changed numbers by name, with their unchanged entries taken from the redrawn mechanism."""
     known, drawn = parameters_of(mechanism), parameters_of(redrawn)
-    held = [name for name in held_names(known) if f"{name}.values" not in drawn]
-    found = {name: value_of(known, name, groups_of(mechanism)) for name in held}
+    sampled = [name for name in held_names(known) if f"{name}.values" not in drawn]
+    changed = {name: value_of(known, name, groups_of(mechanism)) for name in sampled}
     for name, mark in marks_by_name(mechanism).items():
-        if not any(name.startswith(f"{x}.") for x in held):
-            found |= _kept(name, mark, known[name].value, drawn[name].value if name in drawn else None)
-    return found
+        if not any(name.startswith(f"{x}.") for x in sampled):
+            changed |= _kept(name, mark, known[name].value, drawn[name].value if name in drawn else None)
+    return changed
 
 
 def _kept(name: str, mark: Any, value: Any, drawn: Any) -> dict[str, Any]:
@@ -87,6 +87,6 @@ def _present(groups: ElementGroups) -> Mapping[str, NumberField]:
     return {name: field for name, field in parameters_in(groups).items() if field.value is not None}
 
 
-def _joined(parts: Sequence[Any]) -> Any:
-    xp = jnp if is_traced(parts) else np
-    return xp.concatenate([xp.ravel(x) for x in parts]) if parts else np.zeros(0)
+def _joined(arrays: Sequence[Any]) -> Any:
+    xp = jnp if is_traced(arrays) else np
+    return xp.concatenate([xp.ravel(x) for x in arrays]) if arrays else np.zeros(0)

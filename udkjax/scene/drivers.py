@@ -111,13 +111,13 @@ class Driver(Constraint):
     axis: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # None: the x axis of body 1
 
     def residual(self, t, *frames):
-        one, two = frames
+        frame1, frame2 = frames
         if self.coordinate == "angle":
-            return [two.angle - one.angle - self.motion(t)]
-        d = between(self.points, one, two)
+            return [frame2.angle - frame1.angle - self.motion(t)]
+        d = between(self.points, frame1, frame2)
         if self.coordinate == "distance":
             return [d.norm() - self.motion(t)]
-        d = one.local(d)
+        d = frame1.local(d)
         if self.axis is not None:
             c, s = jnp.cos(self.axis), jnp.sin(self.axis)
             d = Point(c * d.x + s * d.y, c * d.y - s * d.x)

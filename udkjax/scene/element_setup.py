@@ -23,12 +23,12 @@ from udkjax.wording import abbreviate
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
     """Return names for elements (or the names of their types): unnamed ones are numbered by type, TYPE1, TYPE2, ..."""
-    found, counts = [], {}
+    numbered, counts = [], {}
     for i, element in enumerate(elements):
         kind = element if isinstance(element, str) else type_name(type(element))
         counts[kind] = counts.get(kind, 0) + 1
-        found.append((names[i] if names else None) or f"{kind}{counts[kind]}")
-    return found
+        numbered.append((names[i] if names else None) or f"{kind}{counts[kind]}")
+    return numbered
 
 
 def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
@@ -41,7 +41,7 @@ def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joi
 def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> dict[str, list[tuple[str, Any]]]:
     """Return all elements with plain numbers converted to arrays; raise a `SceneError` that lists all mistakes."""
     kinds = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}
-    problems, entries, found = [], [], {section: [] for section in given}
+    problems, entries, checked = [], [], {section: [] for section in given}
     for section, items in given.items():
         for index, (key, element) in enumerate(items):
             if not isinstance(element, kinds[section]):
@@ -55,11 +55,11 @@ def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> di
             problems.extend(f"{entry.where}{problem}" for problem in _check_hashable(element))
             if section == "force" and not _has_load(type(element)):
                 problems.append(f"{entry.where}: {type(element).__name__} must have a method `potential` or `loads`")
-            found[section].append((key, element))
+            checked[section].append((key, element))
     problems.extend(problems_of(entries, gravity))
     if problems:
         raise SceneError(problems, name)
-    return found
+    return checked
 
 
 def _check_hashable(element: eqx.Module) -> Iterator[str]:
@@ -103,12 +103,12 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
 
 def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:
     """Return the mistakes in concrete numbers that constraints took from the initial guess."""
-    found = []
+    mistakes = []
     for section, elements in after.items():
         for k, ((name, completed), (_, given)) in enumerate(zip(elements, before[section], strict=True)):
             if completed is not given and not is_traced(completed):
-                found.extend(_mistakes_of_guess(f"{section} {abbreviate(name)} ({section}[{k}])", given, completed))
-    return found
+                mistakes.extend(_mistakes_of_guess(f"{section} {abbreviate(name)} ({section}[{k}])", given, completed))
+    return mistakes
 
 
 def _mistakes_of_guess(where: str, before: eqx.Module, after: eqx.Module) -> Iterator[str]:
@@ -121,7 +121,9 @@ def _mistakes_of_guess(where: str, before: eqx.Module, after: eqx.Module) -> Ite
         conditions = [Requirement("must be finite", np.isfinite), *field.metadata.get("require", ())]
         unmet = next((c.text for c in conditions if not np.all(c.holds(value))), None)
         if unmet:
-            given = (f.name for f in dataclasses.fields(before) if isinstance(getattr(before, f.name), np.ndarray | jax.Array))
-            cure = " or ".join(["other positions of the bodies", *(f"other {name}" for name in given)])
-            found = f"{where}.{field.name}: {unmet}, and is {abbreviate(value)} in the initial guess, from which it is taken"
-            yield f"{found}: give it, or {cure}"
+            other_numbers = (
+                f.name for f in dataclasses.fields(before) if isinstance(getattr(before, f.name), np.ndarray | jax.Array)
+            )
+            cure = " or ".join(["other positions of the bodies", *(f"other {name}" for name in other_numbers)])
+            mistake = f"{where}.{field.name}: {unmet}, and is {abbreviate(value)} in the initial guess, from which it is taken"
+            yield f"{mistake}: give it, or {cure}"

@@ -28,11 +28,11 @@ def direction(value: Numbers | None) -> Float[Array, ""]:
     """Convert a direction in the plane, an angle (rad) or a vector (x, y), to an angle; None stays None."""
     if value is None:
         return None  # pyright: ignore[reportReturnType]
-    found = number(value)
-    if found.shape != (2,):
-        return found
-    xp = np if not isinstance(found, Tracer) else jnp
-    x, y = xp.asarray(found)
+    array = number(value)
+    if array.shape != (2,):
+        return array
+    xp = np if not isinstance(array, Tracer) else jnp
+    x, y = xp.asarray(array)
     return number(xp.arctan2(y, x))
 
 
@@ -54,23 +54,23 @@ def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 def vector_as_angle(value: Any) -> Any:
     """Return the angle (rad) of a vector of two numbers in a table; return anything else unchanged, to be refused later."""
-    parts = list(value) if isinstance(value, np.ndarray | jax.Array) and value.shape == (2,) else value
+    components = list(value) if isinstance(value, np.ndarray | jax.Array) and value.shape == (2,) else value
     numbers = int | float | np.number | jax.Array
-    if not isinstance(parts, list | tuple) or len(parts) != 2 or not all(isinstance(x, numbers) for x in parts):
+    if not isinstance(components, list | tuple) or len(components) != 2 or not all(isinstance(x, numbers) for x in components):
         return value
-    if any(isinstance(x, bool) or np.ndim(x) for x in parts):
+    if any(isinstance(x, bool) or np.ndim(x) for x in components):
         return value
-    if is_traced(parts):
-        return direction(parts)
-    return math.atan2(parts[1], parts[0]) if any(parts) else value
+    if is_traced(components):
+        return direction(components)
+    return math.atan2(components[1], components[0]) if any(components) else value
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
     """Convert a name or a list of names to a tuple; raise a `TypeError` if an entry is not a string."""
-    found = (value,) if isinstance(value, str) else tuple(value)
-    if not all(isinstance(name, str) for name in found):
+    entries = (value,) if isinstance(value, str) else tuple(value)
+    if not all(isinstance(name, str) for name in entries):
         raise TypeError("must be a name, or a list of names")
-    return found
+    return entries
 
 
 given_number, given_or_none, given_or_guess = map(or_as_given, (number, optional_number, number_or_guess))

@@ -92,12 +92,12 @@ class Spring(ForceElement):
     def loads(self, t, *frames):
         if self.damping is None:
             return None
-        one, two = frames
-        d, v1, v2 = between(self.points, one, two), one.velocity(self.points[0]), two.velocity(self.points[1])
+        frame1, frame2 = frames
+        d, v1, v2 = between(self.points, frame1, frame2), frame1.velocity(self.points[0]), frame2.velocity(self.points[1])
         square, rate = d.dot(d), d.dot(Point(v2.x - v1.x, v2.y - v1.y))
         pull = self.damping * rate / jnp.where(square > 0, square, 1.0)
         force = Point(pull * d.x, pull * d.y)  # on point 1
-        return [_load(one, self.points[0], force), _load(two, self.points[1], Point(-force.x, -force.y))]
+        return [_load(frame1, self.points[0], force), _load(frame2, self.points[1], Point(-force.x, -force.y))]
 
 
 class TorsionSpring(ForceElement):
@@ -118,14 +118,14 @@ class TorsionSpring(ForceElement):
     angle: Float[Array, ""] | Held = eqx.field(converter=given_sampled, default=0.0)
 
     def potential(self, t, *frames):
-        one, two = frames
-        return 0.5 * self.stiffness * (two.angle - one.angle - value_at(self.angle, t)) ** 2
+        frame1, frame2 = frames
+        return 0.5 * self.stiffness * (frame2.angle - frame1.angle - value_at(self.angle, t)) ** 2
 
     def loads(self, t, *frames):
         if self.damping is None:
             return None
-        one, two = frames
-        return _couple(-self.damping * (two.omega - one.omega))
+        frame1, frame2 = frames
+        return _couple(-self.damping * (frame2.omega - frame1.omega))
 
 
 class Force(ForceElement):
@@ -185,8 +185,8 @@ class Friction(ForceElement):
     velocity: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)
 
     def loads(self, t, *frames):
-        one, two = frames
-        return _couple(-self.torque * jnp.tanh((two.omega - one.omega) / self.velocity))
+        frame1, frame2 = frames
+        return _couple(-self.torque * jnp.tanh((frame2.omega - frame1.omega) / self.velocity))
 
 
 def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Wrench:

@@ -125,8 +125,8 @@ class Prismatic(Joint):
     angle: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None)
 
     def residual(self, t, *frames):
-        one, two = frames
-        return [_lateral_distance(self.axis, self.points, one, two), two.angle - one.angle - self.angle]
+        frame1, frame2 = frames
+        return [_lateral_distance(self.axis, self.points, frame1, frame2), frame2.angle - frame1.angle - self.angle]
 
     @fills("angle")
     def complete(self, *frames):
@@ -165,9 +165,9 @@ class Weld(Joint):
     angle: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None)
 
     def residual(self, t, *frames):
-        one, two = frames
-        gap = between(self.points, one, two)
-        return [gap.x, gap.y, two.angle - one.angle - self.angle]
+        frame1, frame2 = frames
+        gap = between(self.points, frame1, frame2)
+        return [gap.x, gap.y, frame2.angle - frame1.angle - self.angle]
 
     @fills("angle")
     def complete(self, *frames):
@@ -212,8 +212,8 @@ class Angle(Joint):
     angle: Float[Array, ""] = eqx.field(converter=given_or_guess, default=None)
 
     def residual(self, t, *frames):
-        one, two = frames
-        return [two.angle - one.angle - self.angle]
+        frame1, frame2 = frames
+        return [frame2.angle - frame1.angle - self.angle]
 
     @fills("angle")
     def complete(self, *frames):
@@ -249,8 +249,10 @@ class Gear(Joint):
     def complete(self, *frames):
         return _replace(self, "constant", self._rolling_distance(*frames))
 
-    def _rolling_distance(self, one: Frame, two: Frame, carrier: Frame | None = None) -> Number:
-        first, second = (one.angle, two.angle) if carrier is None else (one.angle - carrier.angle, two.angle - carrier.angle)
+    def _rolling_distance(self, frame1: Frame, frame2: Frame, carrier: Frame | None = None) -> Number:
+        first, second = (
+            (frame1.angle, frame2.angle) if carrier is None else (frame1.angle - carrier.angle, frame2.angle - carrier.angle)
+        )
         rolled = self.radii[1] * second
         return self.radii[0] * first - rolled if self.internal else self.radii[0] * first + rolled
 
@@ -278,9 +280,9 @@ class Rack(Joint):
     def complete(self, *frames):
         return _replace(self, "constant", self._rolling_distance(*frames))
 
-    def _rolling_distance(self, one: Frame, two: Frame) -> Number:
-        along = one.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
-        return along.dot(Point(two.x - one.x, two.y - one.y)) + self.radius * (two.angle - one.angle)
+    def _rolling_distance(self, frame1: Frame, frame2: Frame) -> Number:
+        along = frame1.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
+        return along.dot(Point(frame2.x - frame1.x, frame2.y - frame1.y)) + self.radius * (frame2.angle - frame1.angle)
 
 
 class Profile(PrintsLine):
@@ -331,15 +333,15 @@ class Cam(Joint):
         d = self._arm(*frames)
         return self.profile.piece(jnp.arctan2(d.y, d.x))
 
-    def _arm(self, one: Frame, two: Frame) -> Point:
+    def _arm(self, frame1: Frame, frame2: Frame) -> Point:
         """Return the vector from point 1 to point 2 in body 1's frame."""
-        return one.local(between(self.points, one, two))
+        return frame1.local(between(self.points, frame1, frame2))
 
 
-def _lateral_distance(axis: Number, points: Float[Array, "2 2"], one: Frame, two: Frame) -> Number:
+def _lateral_distance(axis: Number, points: Float[Array, "2 2"], frame1: Frame, frame2: Frame) -> Number:
     """Return the distance (m) of point 2 from the line through point 1 along `axis` of body 1, positive to the left."""
-    normal = one.vector((-jnp.sin(axis), jnp.cos(axis)))
-    return normal.dot(between(points, one, two))
+    normal = frame1.vector((-jnp.sin(axis), jnp.cos(axis)))
+    return normal.dot(between(points, frame1, frame2))
 
 
 def _replace(constraint: AnyConstraint, name: str, value: Numbers) -> AnyConstraint:

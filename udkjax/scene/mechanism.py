@@ -146,16 +146,16 @@ class Mechanism(PrintsTable):
             "driver": list((drivers or {}).items()),
             "force": list(forces.items() if isinstance(forces, Mapping) else zip(name_elements(forces), forces, strict=True)),
         }
-        found = check_elements(given, gravity, name)
+        checked = check_elements(given, gravity, name)
         self.name, self.gravity = name, number(gravity)
-        self.body_names, self._bodies = _unzip(found["body"])
-        known = dict(found["body"])
-        completed = {section: [(key, complete(c, known)) for key, c in found[section]] for section in ("joint", "driver")}
-        if mistakes := completion_mistakes(found, completed):
+        self.body_names, self._bodies = _unzip(checked["body"])
+        known = dict(checked["body"])
+        completed = {section: [(key, complete(c, known)) for key, c in checked[section]] for section in ("joint", "driver")}
+        if mistakes := completion_mistakes(checked, completed):
             raise SceneError(mistakes, name)
         self.joint_names, self._joints = _unzip(completed["joint"])
         self.driver_names, self._drivers = _unzip(completed["driver"])
-        self.force_names, self._forces = _unzip(found["force"])
+        self.force_names, self._forces = _unzip(checked["force"])
         self.origin = None if self.is_concrete else origin
         self.drawing, self.changed = drawing, changed
         if drawing is not None and changed is None:
@@ -204,9 +204,9 @@ class Mechanism(PrintsTable):
     def breakpoints(self) -> Float[Array, "k"] | None:
         """The times (s) where the motion is not smooth, collected from the elements, unsorted; None if there are none."""
         named = [number(e.breakpoints).reshape(-1) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
-        held = [x.breakpoints for x in self.samples.values() if isinstance(x, Held)]
-        if any(map(len, held)):
-            named.append(number(np.unique(np.concatenate(held))))
+        sample_times = [x.breakpoints for x in self.samples.values() if isinstance(x, Held)]
+        if any(map(len, sample_times)):
+            named.append(number(np.unique(np.concatenate(sample_times))))
         if not named:
             return None
         concrete = not is_traced(named)  # and must stay concrete while something else is traced
@@ -216,8 +216,8 @@ class Mechanism(PrintsTable):
     def samples(self) -> dict[tuple[str, int, str], Any]:
         """The sampled numbers, each a `Held` or a `Spline`, by section, index and field."""
         sections = {"_drivers": self._drivers, "_forces": self._forces}
-        places = [(section, *place) for section, elements in sections.items() for place in sampled_fields(elements)]
-        return {place: getattr(sections[place[0]][place[1]], place[2]) for place in places}
+        locations = [(section, *location) for section, elements in sections.items() for location in sampled_fields(elements)]
+        return {location: getattr(sections[location[0]][location[1]], location[2]) for location in locations}
 
     def with_samples(self, samples: Mapping[tuple[str, int, str], Any]) -> "Mechanism":
         """Return the mechanism with other values in place of `samples`, without checks."""
@@ -231,7 +231,7 @@ class Mechanism(PrintsTable):
     @property
     def without_samples(self) -> "Mechanism":
         """The mechanism from which programs are made: with a single interval of zeros in place of all samples."""
-        return self.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in self.samples.items()})
+        return self.with_samples({location: with_row(x, np.zeros(row_size(x))) for location, x in self.samples.items()})
 
     def at(self, t: NumberLike) -> "Mechanism":
         """Return the mechanism with only the interval at time t (s) in place of all samples."""
@@ -239,7 +239,7 @@ class Mechanism(PrintsTable):
         traced = is_traced((t, samples))
         xp, eager = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
         with eager, np.errstate(all="ignore"):
-            return self.with_samples({place: with_row(x, row_at(x, t, xp)) for place, x in samples.items()})
+            return self.with_samples({location: with_row(x, row_at(x, t, xp)) for location, x in samples.items()})
 
     @property
     def without_origin(self) -> "Mechanism":
@@ -286,10 +286,10 @@ class Mechanism(PrintsTable):
         require_values(values, self.name)
         traced = is_traced(dict(values))
         origin = Origin(self) if traced and self.is_concrete else self.origin
-        base, own, changed = self, values, None
+        base, new_values, changed = self, values, None
         if self.drawing is not None:
-            base, own, direct = self._redraw(self.drawing, values)
-        new, gravity = replace_numbers(groups_of(base), base.gravity, own, parameters_of(base), self.name)
+            base, new_values, direct = self._redraw(self.drawing, values)
+        new, gravity = replace_numbers(groups_of(base), base.gravity, new_values, parameters_of(base), self.name)
         if self.drawing is not None:
             changed = mark_changes(self, new, direct)
         elements = new["body"], new["joint"], new["driver"], new["force"]
@@ -309,14 +309,14 @@ class Mechanism(PrintsTable):
         """Return the mechanism redrawn with the drawing's values, all direct changes, and the names of the new ones."""
         drawn, known = parameters_in(drawing.groups), parameters_of(self)
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
-        own = {name: value for name, value in values.items() if name not in of_drawing}
+        new_values = {name: value for name, value in values.items() if name not in of_drawing}
         if not of_drawing:
-            return self, own, list(own)
-        replace_numbers(groups_of(self), self.gravity, own, known, self.name)  # raises all mistakes in names first
+            return self, new_values, list(new_values)
+        replace_numbers(groups_of(self), self.gravity, new_values, known, self.name)  # raises all mistakes in names first
         drawn["gravity"] = known["gravity"]
         groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
         redrawn = drawing.with_groups(groups, gravity).mechanism()
-        return redrawn, directly_changed(self, redrawn) | own, list(own)
+        return redrawn, directly_changed(self, redrawn) | new_values, list(new_values)
 
 
 def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:

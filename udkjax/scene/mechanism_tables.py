@@ -56,10 +56,10 @@ def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
     problems.extend(problems_of(entries, gravity))
     if problems:
         raise SceneError(problems, source)
-    made: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
+    elements: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
     for entry in entries:
-        made[entry.section][entry.name] = build(entry.cls, entry.table)
-    return Mechanism(made["body"], made["joint"], made["driver"], made["force"], gravity, scene.get("name", ""))
+        elements[entry.section][entry.name] = build(entry.cls, entry.table)
+    return Mechanism(elements["body"], elements["joint"], elements["driver"], elements["force"], gravity, scene.get("name", ""))
 
 
 def head_mistakes(scene: TomlTable, expected: Collection[str]) -> Iterator[str]:
@@ -89,9 +89,9 @@ def read_section(
         name = f"{section}{index + 1}" if name is None and counted else name
         entry = SceneEntry(section, index, name, cls, {key: value for key, value in table.items() if key != "name"})
         if section in CLASSES_BY_TYPE:
-            found, problem = find_class(entry.where, CLASSES_BY_TYPE[section], table)
+            table_class, problem = find_class(entry.where, CLASSES_BY_TYPE[section], table)
             table = {key: value for key, value in entry.table.items() if key != "type"}
-            entry = entry._replace(cls=found, problem=problem, table=table)
+            entry = entry._replace(cls=table_class, problem=problem, table=table)
         yield entry
 
 

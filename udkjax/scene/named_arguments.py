@@ -33,19 +33,19 @@ from udkjax.wording import quote
 
 def require_coordinates(name: str, value: Any, given: GivenArguments, flat: bool = True) -> None:
     """Require x, y and angle of each body of the mechanism, or their rates: (bodies, 3), or (n,) if `flat`."""
-    mechanism, found = given["mechanism"], array(name, value)
+    mechanism, coordinates = given["mechanism"], array(name, value)
     if not isinstance(mechanism, Mechanism):  # the number of coordinates of a user-written system is not known
-        if found.ndim != 1:
-            raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {found.shape}")
+        if coordinates.ndim != 1:
+            raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {coordinates.shape}")
         require_finite(name, value)
         return
     names = mechanism.body_names
-    right = (len(names), 3)
-    if found.shape != right and not (flat and found.shape == (3 * len(names),)):
-        rest = f": x, y and angle of {', '.join(map(quote, names[:4]))}{', ...' if len(names) > 4 else ''}"
-        cure = "; a batch of states is for jax.vmap" if found.ndim > 2 and found.shape[-2:] == right else ""
-        raise ArgumentError(f"{name} must have the shape {right}{rest}; it has the shape {found.shape}{cure}")
-    require_finite(name, found, lambda *k: _place(names, k))
+    shape = (len(names), 3)
+    if coordinates.shape != shape and not (flat and coordinates.shape == (3 * len(names),)):
+        order = f": x, y and angle of {', '.join(map(quote, names[:4]))}{', ...' if len(names) > 4 else ''}"
+        cure = "; a batch of states is for jax.vmap" if coordinates.ndim > 2 and coordinates.shape[-2:] == shape else ""
+        raise ArgumentError(f"{name} must have the shape {shape}{order}; it has the shape {coordinates.shape}{cure}")
+    require_finite(name, coordinates, lambda *k: _place(names, k))
 
 
 def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
@@ -66,8 +66,10 @@ def require_history(name: str, value: Any, given: GivenArguments) -> None:
     ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
     right = (*ts.shape, len(mechanism.body_names), 3) if isinstance(mechanism, Mechanism) else q.shape
     if q.ndim == 4:
-        one, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
-        raise ArgumentError(f"{name} is a batch of {len(q)} solutions: take one of them, {one}, or map over them, {all_of_them}")
+        first_member, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
+        raise ArgumentError(
+            f"{name} is a batch of {len(q)} solutions: take one of them, {first_member}, or map over them, {all_of_them}"
+        )
     if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != right or v.shape != q.shape:
         meant = "ts (T,), q and v (T, bodies, 3)" if isinstance(mechanism, Mechanism) else "ts (T,), q and v (T, n)"
         is_of = f" of {len(mechanism.body_names)} bodies" if isinstance(mechanism, Mechanism) else ""

@@ -55,20 +55,20 @@ class NumberField(NamedTuple):
 
 def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
     """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
-    found = {} if mechanism.drawing is None else parameters_in(mechanism.drawing.groups)
+    drawn = {} if mechanism.drawing is None else parameters_in(mechanism.drawing.groups)
     gravity = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
-    return gravity | found | parameters_in(groups_of(mechanism))
+    return gravity | drawn | parameters_in(groups_of(mechanism))
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
     """Return every number of some elements by name; the position of a pin has the name of the pin, `pin.A`."""
-    found = {}
+    fields = {}
     for section, elements in groups.items():
         for owner, element in elements.items():
             for path, value, shape in numbers_in(element):
                 name = (section, owner) if section == "pin" and path == ("position",) else (section, owner, *path)
-                found[".".join(name)] = NumberField(section, owner, path, value, shape)
-    return found
+                fields[".".join(name)] = NumberField(section, owner, path, value, shape)
+    return fields
 
 
 def groups_of(mechanism: Sections) -> ElementGroups:

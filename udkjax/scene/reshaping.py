@@ -108,7 +108,9 @@ def attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Ar
         for name, element in elements.items():
             points = getattr(element, "points", None)
             if points is not None:
-                yield from ((f"{section}.{name}.points[{k}]", points[k]) for k, b in enumerate(element.bodies) if b == body)
+                yield from (
+                    (f"{section}.{name}.points[{k}]", points[k]) for k, attached in enumerate(element.bodies) if attached == body
+                )
             if getattr(element, "body", None) == body and hasattr(element, "point"):
                 yield f"{section}.{name}.point", element.point
 
@@ -122,13 +124,15 @@ def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
     for body, holder, joint in spanning_tree(before, pins):
         if not joint:
             continue  # a root does not move
-        was, now = before.joints[joint], after.joints[joint]
-        one, two = (0, 1) if was.bodies[1] == body else (1, 0)
+        old_joint, new_joint = before.joints[joint], after.joints[joint]
+        holder_end, body_end = (0, 1) if old_joint.bodies[1] == body else (1, 0)
         frame = new[body]
         # Displacements of the pin on the holder and on the body; the body moves by their difference.
-        shift = _subtract(_pin_state(new[holder], now.points[one]), _pin_state(old[holder], was.points[one]))
-        own = _subtract(_pin_state(frame, now.points[two]), _pin_state(old[body], was.points[two]))
-        x, y, vx, vy = (a - b for a, b in zip(shift, own, strict=True))
+        holder_shift = _subtract(
+            _pin_state(new[holder], new_joint.points[holder_end]), _pin_state(old[holder], old_joint.points[holder_end])
+        )
+        body_shift = _subtract(_pin_state(frame, new_joint.points[body_end]), _pin_state(old[body], old_joint.points[body_end]))
+        x, y, vx, vy = (a - b for a, b in zip(holder_shift, body_shift, strict=True))
         frame = frame._replace(x=frame.x + x, y=frame.y + y, vx=frame.vx + vx, vy=frame.vy + vy)
         new[body] = frame
         values[f"body.{body}.position"] = jnp.stack([frame.x, frame.y])
@@ -142,5 +146,5 @@ def _pin_state(frame: Frame, local: Float[Array, "2"]) -> tuple[Number, Number, 
     return x, y, vx, vy
 
 
-def _subtract(one: tuple, two: tuple) -> tuple:
-    return tuple(a - b for a, b in zip(one, two, strict=True))
+def _subtract(first: tuple, second: tuple) -> tuple:
+    return tuple(a - b for a, b in zip(first, second, strict=True))

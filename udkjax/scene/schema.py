@@ -60,16 +60,16 @@ class Key(NamedTuple):
 
 def keys(cls: type) -> dict[str, Key]:
     """Return the keys of a class: the fields that its constructor takes, in order."""
-    found = {}
+    keys_by_name = {}
     for field in dataclasses.fields(cls):
         if field.init:
             annotation = field.type
             if get_origin(annotation) in (Union, types.UnionType):
-                some = [kind for kind in get_args(annotation) if kind is not type(None)]
-                annotation = some[0] if len(some) == 1 else annotation
+                kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+                annotation = kinds[0] if len(kinds) == 1 else annotation
             default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-            found[field.name] = Key(annotation, not default, cast(FieldMetadata, field.metadata))
-    return found
+            keys_by_name[field.name] = Key(annotation, not default, cast(FieldMetadata, field.metadata))
+    return keys_by_name
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:

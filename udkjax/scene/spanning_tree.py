@@ -29,9 +29,9 @@ def spanning_tree(mechanism: Mechanism, weights: Mapping[str, int]) -> Iterator[
     """
     neighbours: dict[str, list[tuple[int, str, str]]] = {name: [] for name in (GROUND, *mechanism.body_names)}
     for joint, weight in weights.items():
-        one, two = mechanism.joints[joint].bodies
-        neighbours[one].append((weight, two, joint))
-        neighbours[two].append((weight, one, joint))
+        body1, body2 = mechanism.joints[joint].bodies
+        neighbours[body1].append((weight, body2, joint))
+        neighbours[body2].append((weight, body1, joint))
     reached, order = set[str](), count()
     for root in neighbours:
         pending = [(0, next(order), TreeEdge(root, GROUND, ""))]
@@ -42,5 +42,5 @@ def spanning_tree(mechanism: Mechanism, weights: Mapping[str, int]) -> Iterator[
             reached.add(edge.body)
             if edge.body != GROUND:
                 yield edge
-            for weight, other, joint in neighbours[edge.body]:
-                heappush(pending, (weight, next(order), TreeEdge(other, edge.body, joint)))
+            for weight, neighbour, joint in neighbours[edge.body]:
+                heappush(pending, (weight, next(order), TreeEdge(neighbour, edge.body, joint)))

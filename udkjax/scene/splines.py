@@ -44,25 +44,25 @@ def spline_pieces(knots: AnyArray, values: AnyArray, xp: ModuleType) -> AnyArray
     inner = (_tridiagonal_by_numpy if xp is np else _tridiagonal)(*system)[:, 0]
     end = xp.zeros(1)
     inside = _cubics(knots, values, xp.concatenate([end, inner, end]), xp)
-    before = xp.stack([knots[0], values[0], inside[0, 2], end[0], end[0]])
+    first_line = xp.stack([knots[0], values[0], inside[0, 2], end[0], end[0]])
     _, _, slope, half_curvature, _ = inside[-1]
-    behind = xp.stack([knots[-1], values[-1], slope + steps[-1] * half_curvature, end[0], end[0]])
-    return xp.concatenate([before[None], inside, behind[None]])
+    last_line = xp.stack([knots[-1], values[-1], slope + steps[-1] * half_curvature, end[0], end[0]])
+    return xp.concatenate([first_line[None], inside, last_line[None]])
 
 
 def periodic_spline(x: Number, knots: Float[Array, " n"], values: Float[Array, " n"], period: Number) -> Array:
     """Evaluate the periodic cubic spline through at least three knots at a scalar x; the first knot follows the last."""
     n = knots.size
-    closed, around = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
-    steps, slopes = jnp.diff(closed), jnp.diff(around) / jnp.diff(closed)
+    all_knots, all_values = jnp.append(knots, knots[0] + period), jnp.append(values, values[0])
+    steps, slopes = jnp.diff(all_knots), jnp.diff(all_values) / jnp.diff(all_knots)
     right = 6 * (slopes - jnp.roll(slopes, 1))
     # Without its last row and column, the system is tridiagonal (Schur complement).
     diagonal = 2 * (jnp.roll(steps, 1) + steps)
     corner = jnp.concatenate([steps[-1:], jnp.zeros(n - 3, knots.dtype), steps[-2:-1]])
-    one, other = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
-    last = (right[-1] - jnp.sum(corner * one)) / (diagonal[-1] - jnp.sum(corner * other))
-    curvatures = jnp.append(one - last * other, last)
-    return _evaluate(wrap(x, knots[0], period), _cubics(closed, around, jnp.append(curvatures, curvatures[0]), jnp))
+    particular, response = _tridiagonal(diagonal[:-1], steps[: n - 2], jnp.stack([right[:-1], corner], 1)).T
+    last = (right[-1] - jnp.sum(corner * particular)) / (diagonal[-1] - jnp.sum(corner * response))
+    curvatures = jnp.append(particular - last * response, last)
+    return _evaluate(wrap(x, knots[0], period), _cubics(all_knots, all_values, jnp.append(curvatures, curvatures[0]), jnp))
 
 
 def wrap(x: Number, start: Number, period: Number) -> Array:
@@ -91,38 +91,40 @@ def _evaluate(x: Number, pieces: Float[Array, "pieces 5"]) -> Array:
     return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
 
 
-def _tridiagonal_by_numpy(diagonal: np.ndarray, beside: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _tridiagonal_by_numpy(diagonal: np.ndarray, off_diagonal: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve as `_tridiagonal`, for one column, with Python floats: nothing is compiled for each length."""
-    pivots, found, links = diagonal.tolist(), right[:, 0].tolist(), beside.tolist()
+    pivots, solution, links = diagonal.tolist(), right[:, 0].tolist(), off_diagonal.tolist()
     for k, link in enumerate(links):
         factor = link / pivots[k]
         pivots[k + 1] -= factor * link
-        found[k + 1] -= factor * found[k]
-    for k in reversed(range(len(found))):
-        after = links[k] * found[k + 1] if k < len(links) else 0.0
-        found[k] = (found[k] - after) / pivots[k]
-    return np.array(found)[:, None]
+        solution[k + 1] -= factor * solution[k]
+    for k in reversed(range(len(solution))):
+        coupled = links[k] * solution[k + 1] if k < len(links) else 0.0
+        solution[k] = (solution[k] - coupled) / pivots[k]
+    return np.array(solution)[:, None]
 
 
-def _tridiagonal(diagonal: Float[Array, " n"], beside: Float[Array, " n-1"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Solve a symmetric, diagonally dominant tridiagonal system with off-diagonal `beside` for columns (n, k)."""
+def _tridiagonal(
+    diagonal: Float[Array, " n"], off_diagonal: Float[Array, " n-1"], right: Float[Array, "n k"]
+) -> Float[Array, "n k"]:
+    """Solve a symmetric, diagonally dominant tridiagonal system for right-hand sides that are columns (n, k)."""
 
-    def eliminate(before, row):
-        pivot, found = before
-        d, left, b = row
-        factor = left / pivot
-        below = d - factor * left, b - factor * found
-        return below, below
+    def eliminate(carry, row):
+        pivot, reduced = carry
+        diagonal_entry, link, right_entry = row
+        factor = link / pivot
+        following = diagonal_entry - factor * link, right_entry - factor * reduced
+        return following, following
 
-    def substitute(after, row):
-        pivot, right, beside = row
-        found = (right - beside * after) / pivot
-        return found, found
+    def substitute(following, row):
+        pivot, right, link = row
+        solution = (right - link * following) / pivot
+        return solution, solution
 
     if not len(diagonal):
         return right
     zero = jnp.zeros(1, diagonal.dtype)
     start = jnp.ones((), diagonal.dtype), jnp.zeros_like(right[0])
-    _, (pivots, rights) = jax.lax.scan(eliminate, start, (diagonal, jnp.append(zero, beside), right))
-    rows = pivots, rights, jnp.append(beside, zero)
+    _, (pivots, rights) = jax.lax.scan(eliminate, start, (diagonal, jnp.append(zero, off_diagonal), right))
+    rows = pivots, rights, jnp.append(off_diagonal, zero)
     return jax.lax.scan(substitute, jnp.zeros_like(right[0]), rows, reverse=True)[1]

@@ -44,7 +44,7 @@ def _far_points(mechanism: Mechanism) -> Iterator[str]:
     gyration = max(2 * _gyration(body) for body in mechanism.bodies.values())
     owner = {number: name for name in mechanism.body_names for number, _ in attachments(mechanism, name)}
     for number, reach in reaches.items():
-        size = max(gyration, *(r for n, r in reaches.items() if n != number), 0.0)
+        size = max(gyration, *(other_reach for other, other_reach in reaches.items() if other != number), 0.0)
         if reach > FAR_OUT * size:
             yield f"{number} is {reach:.3g} m from the centre of mass of {quote(owner[number])}{_beside(size)}"
     places, size = np.asarray(mechanism.q0)[:, :2], max(gyration, *reaches.values(), 0.0)
@@ -69,7 +69,7 @@ def _degrees(mechanism: Mechanism) -> Iterator[str]:
 
 def _loose_bodies(mechanism: Mechanism) -> Iterator[str]:
     """Iterate over bodies without joint or driver, if other bodies have one."""
-    held = {name for element in mechanism.constraints.values() for name in mechanism.frames_of(element)}
-    for name in mechanism.body_names if held else ():
-        if name not in held:
+    connected = {name for element in mechanism.constraints.values() for name in mechanism.frames_of(element)}
+    for name in mechanism.body_names if connected else ():
+        if name not in connected:
             yield f"body {quote(name)} is in no joint: it flies by itself"

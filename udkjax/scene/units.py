@@ -71,17 +71,17 @@ def units_of(mechanism: Sections, name: str) -> str:
     if name in NUMBERS:
         return NUMBERS[name]
     known = parameters_of(mechanism)
-    found = known.get(split_index(name, known)[0])
-    if found is None:
+    field = known.get(split_index(name, known)[0])
+    if field is None:
         return ""
-    if not found.path:
+    if not field.path:
         return _FIELDS[name.partition("[")[0]]
-    driven = getattr(mechanism.drivers.get(found.owner), "coordinate", "")
-    owner = owner_of(mechanism, found)
+    driven = getattr(mechanism.drivers.get(field.owner), "coordinate", "")
+    owner = owner_of(mechanism, field)
     if isinstance(owner, Held):
-        found = found._replace(path=found.path[:-1])
-        owner = owner_of(mechanism, found)
-    return field_unit(getattr(owner, "measured_as", type(owner).__name__), found.path[-1], driven)
+        field = field._replace(path=field.path[:-1])
+        owner = owner_of(mechanism, field)
+    return field_unit(getattr(owner, "measured_as", type(owner).__name__), field.path[-1], driven)
 
 
 def field_unit(type_name: str, field: str, driven: str = "") -> str:
@@ -169,7 +169,7 @@ def read_quantity(text: str, wanted: str) -> float:
 
 def _usual_units(wanted: str) -> str:
     goal = _read(wanted)
-    return next((some for some in _USUAL if _read(some.partition(",")[0]).dimension == goal.dimension), wanted)
+    return next((unit for unit in _USUAL if _read(unit.partition(",")[0]).dimension == goal.dimension), wanted)
 
 
 def conversion_factor(units: str, wanted: str) -> float:
@@ -204,7 +204,7 @@ def _read(text: str) -> _Unit:
     plain = text
     for spelling, usual in _SPELLINGS.items():
         plain = plain.replace(spelling, usual)
-    found = _UNITS["1"]
+    product = _UNITS["1"]
     for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
         name = _WORDS.get(name, name)
         if name not in _UNITS:
@@ -212,5 +212,5 @@ def _read(text: str) -> _Unit:
             meant += ["; cycles a second are rev/s"] if f"{name}".endswith("Hz") else []
             cure = meant[0] if meant else f": they are made of {', '.join(_UNITS)}"
             raise ValueError(f"{quote(text)} is not a known unit{cure}")
-        found = found.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))
-    return found
+        product = product.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))
+    return product

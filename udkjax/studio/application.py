@@ -70,8 +70,8 @@ class Studio:
         if not request.get("export"):
             return {"path": path, "revision": self.folder.write(path, text.encode(), revision)}
         suffix = self.folder.locate(path, EXPORTS).suffix.lower()
-        made = self.examiner.call("export", {"text": text, "suffix": suffix}, EXPORT_SECONDS)
-        data = bytes.fromhex(made["data"])
+        exported = self.examiner.call("export", {"text": text, "suffix": suffix}, EXPORT_SECONDS)
+        data = bytes.fromhex(exported["data"])
         return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
 
     def compile(self, request: JsonObject) -> JsonObject:
@@ -129,15 +129,15 @@ async def _page_file(request: Request) -> Response:
 
 def page_files() -> Mapping[str, tuple[bytes, str]]:
     """Return the content and the media type of each file of the page by its address."""
-    found = {UNIT_SIZES: (_unit_sizes().encode(), MEDIA_TYPES[".js"])}
+    contents = {UNIT_SIZES: (_unit_sizes().encode(), MEDIA_TYPES[".js"])}
     for prefix, (package, folder) in FOLDERS.items():
         root = files(package).joinpath(folder)
         if root.is_dir():
             for entry in root.iterdir():
                 suffix = Path(entry.name).suffix
                 if suffix in MEDIA_TYPES and entry.is_file() and (not prefix or suffix == ".js"):
-                    found[prefix + entry.name] = (entry.read_bytes(), MEDIA_TYPES[suffix])
-    return found
+                    contents[prefix + entry.name] = (entry.read_bytes(), MEDIA_TYPES[suffix])
+    return contents
 
 
 def _unit_sizes() -> str:

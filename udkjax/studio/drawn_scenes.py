@@ -89,16 +89,16 @@ class _Draft:
         c, s = np.cos(angle), np.sin(angle)
         return np.array([x + c * px - s * py, y + s * px + c * py])
 
-    def pin(self, name: str, bodies: Sequence[str], place: np.ndarray) -> str:
+    def pin(self, name: str, bodies: Sequence[str], position: np.ndarray) -> str:
         """Return the pin of bodies at a place: one that they share there already, or a new one."""
-        for pin, other in self.places.items():
-            if np.abs(place - other).max() <= self.near and set(bodies) & set(self.members[pin]):
+        for pin, pin_position in self.places.items():
+            if np.abs(position - pin_position).max() <= self.near and set(bodies) & set(self.members[pin]):
                 self.members[pin] += [body for body in bodies if body not in self.members[pin]]
                 return pin
         fresh = name
         while fresh in self.places:
             fresh += "'"
-        self.places[fresh], self.members[fresh] = place, list(bodies)
+        self.places[fresh], self.members[fresh] = position, list(bodies)
         return fresh
 
     def add(self, section: str, name: str, element: Any) -> None:
@@ -114,13 +114,13 @@ class _Draft:
             case Revolute():
                 return
             case Slot():
-                one, two = joint.bodies
-                pin = self.pin(name, [two], self.place(two, joint.points[1]))
-                self.add("slot", name, {"pin": pin, "direction": self.world(one, joint.axis), "on": one, "link": two})
+                body1, body2 = joint.bodies
+                pin = self.pin(name, [body2], self.place(body2, joint.points[1]))
+                self.add("slot", name, {"pin": pin, "direction": self.world(body1, joint.axis), "on": body1, "link": body2})
             case Prismatic():
-                one, two = joint.bodies
-                self.pin(f"{two}'", [two], self.place(two, joint.points[1]))
-                self.add("slide", name, {"link": two, "direction": self.world(one, joint.axis), "on": one})
+                body1, body2 = joint.bodies
+                self.pin(f"{body2}'", [body2], self.place(body2, joint.points[1]))
+                self.add("slide", name, {"link": body2, "direction": self.world(body1, joint.axis), "on": body1})
             case Gear() if all(self.has_centre(body, joint.carrier) for body in joint.bodies):
                 gear = {"links": list(joint.bodies), "radii": np.asarray(joint.radii), "internal": joint.internal}
                 self.add("gear", name, gear | {"carrier": joint.carrier})
@@ -191,13 +191,13 @@ class _Draft:
         """Return an element with its points in link frames: origin at the centre of mass, x from the first pin to the second."""
         moved = []
         for body, point in zip(element.bodies, np.asarray(element.points), strict=True):
-            place = self.place(body, point)
+            position = self.place(body, point)
             if body != GROUND:
                 pins = [self.places[pin] for pin in self.pins_of(body)]
-                way = pins[1] - pins[0] if len(pins) > 1 else np.array([1.0, 0.0])
-                c, s = way / np.linalg.norm(way)
-                place = np.array([[c, s], [-s, c]]) @ (place - self.frames[body][:2])
-            moved.append(place)
+                axis = pins[1] - pins[0] if len(pins) > 1 else np.array([1.0, 0.0])
+                c, s = axis / np.linalg.norm(axis)
+                position = np.array([[c, s], [-s, c]]) @ (position - self.frames[body][:2])
+            moved.append(position)
         return eqx.tree_at(lambda e: e.points, element, jnp.asarray(moved))
 
     def pins_of(self, body: str) -> list[str]:

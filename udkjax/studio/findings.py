@@ -43,33 +43,33 @@ def examine(mechanism: Mechanism, about: str) -> JsonObject:
 
 def structure(mechanism: Mechanism) -> JsonObject:
     """Return degrees of freedom, sets of redundant constraints with their fixes, and reactions that are not unique."""
-    found = diagnose(mechanism, walk=False)
+    diagnosis = diagnose(mechanism, walk=False)
     not_unique = {
         name: {"components": [bool(x) for x in forces.unique], "direction": forces.direction}
-        for name, forces in found.forces.items()
+        for name, forces in diagnosis.forces.items()
         if not all(forces.unique)
     }
     return {
-        "degrees_of_freedom": found.degrees_of_freedom,
-        "joint_mobility": found.joint_mobility,
-        "gruebler": found.gruebler,
-        "redundant": found.rows - found.ordinary_rank,
-        "singular": bool(found.is_singular),
-        "motion": _why(found, mechanism),
+        "degrees_of_freedom": diagnosis.degrees_of_freedom,
+        "joint_mobility": diagnosis.joint_mobility,
+        "gruebler": diagnosis.gruebler,
+        "redundant": diagnosis.rows - diagnosis.ordinary_rank,
+        "singular": bool(diagnosis.is_singular),
+        "motion": _why(diagnosis, mechanism),
         "sets": [
             {
-                "constraints": list(r.constraints),
-                "count": r.count,
-                "permanent": r.permanent,
+                "constraints": list(redundancy.constraints),
+                "count": redundancy.count,
+                "permanent": redundancy.permanent,
                 "fixes": [
                     {"constraint": fix.constraint, "change": fix.change, "drawn": drawn_change(fix)}
-                    for fix in r.fixes[:MOST_FIXES]
+                    for fix in redundancy.fixes[:MOST_FIXES]
                 ],
             }
-            for r in found.redundancies
+            for redundancy in diagnosis.redundancies
         ],
         "not_unique": not_unique,
-        "text": str(found),
+        "text": str(diagnosis),
     }
 
 
@@ -80,25 +80,25 @@ def drawn_change(fix: Fix) -> JsonObject | None:
         return {"kind": "remove"}
     if not isinstance(joint, Slot):
         return None
-    on, guided = joint.bodies
-    angle = float(joint.axis) + (0.0 if on == GROUND else float(fix.mechanism.bodies[on].angle))
-    return {"kind": "slot", "on": on, "link": guided, "direction": [math.cos(angle), math.sin(angle)]}
+    base, guided = joint.bodies
+    angle = float(joint.axis) + (0.0 if base == GROUND else float(fix.mechanism.bodies[base].angle))
+    return {"kind": "slot", "on": base, "link": guided, "direction": [math.cos(angle), math.sin(angle)]}
 
 
-def _why(found: Diagnosis, mechanism: Mechanism) -> str:
+def _why(diagnosis: Diagnosis, mechanism: Mechanism) -> str:
     """Describe how the mechanism moves, or why it does not."""
     drivers = list(mechanism.drivers)
-    if found.joint_mobility <= 0:
-        if found.is_singular:
+    if diagnosis.joint_mobility <= 0:
+        if diagnosis.is_singular:
             return "The mechanism cannot move, except infinitesimally"
-        return f"The mechanism cannot move: its joints fix all {found.coordinates} coordinates. Remove a joint or a link"
+        return f"The mechanism cannot move: its joints fix all {diagnosis.coordinates} coordinates. Remove a joint or a link"
     names = ", ".join(drivers)
-    if drivers and found.mobility == 0 and not found.is_singular:
+    if drivers and diagnosis.mobility == 0 and not diagnosis.is_singular:
         return f"{names} {'determines' if len(drivers) == 1 else 'determine'} the whole motion"
-    if len(drivers) > found.joint_mobility:
-        return f"{plural(len(drivers), 'motor')} for {_freedom(found.joint_mobility)}: their motions must agree"
+    if len(drivers) > diagnosis.joint_mobility:
+        return f"{plural(len(drivers), 'motor')} for {_freedom(diagnosis.joint_mobility)}: their motions must agree"
     if drivers:
-        return f"{names} and the loads move the mechanism; {_freedom(found.degrees_of_freedom)} left to the loads"
+        return f"{names} and the loads move the mechanism; {_freedom(diagnosis.degrees_of_freedom)} left to the loads"
     if mechanism.forces or np.any(np.asarray(mechanism.gravity)):
         return "Gravity and loads move the mechanism; add a motor to drive it"
     return "Nothing moves the mechanism: add a motor or a load"
@@ -110,18 +110,18 @@ def _freedom(count: int) -> str:
 
 def rest(mechanism: Mechanism) -> JsonObject:
     """Return the stable equilibrium next to the drawn position, and its natural frequencies (Hz)."""
-    found = equilibrium(mechanism, stable=True)
-    rates = [float(x) for x in np.asarray(found.omega2)]
+    balance = equilibrium(mechanism, stable=True)
+    rates = [float(x) for x in np.asarray(balance.omega2)]
     return {
-        "q": np.asarray(found.q).ravel().tolist() if bool(found.balanced) else None,
-        "kind": found.kind,
+        "q": np.asarray(balance.q).ravel().tolist() if bool(balance.balanced) else None,
+        "kind": balance.kind,
         "frequencies": [math.sqrt(x) / (2 * math.pi) for x in rates if x > 0],
     }
 
 
 def motor_travel(mechanism: Mechanism) -> JsonObject:
     """Return the travel of each motor from the drawn position, with the others held, and the pins in line at its limits."""
-    found = []
+    travels = []
     for name, driver in mechanism.drivers.items():
         if driver.coordinate == "y":
             continue
@@ -135,8 +135,8 @@ def motor_travel(mechanism: Mechanism) -> JsonObject:
             if np.isfinite(float(limit)):
                 ends.append({"value": float(limit) - start, "in_line": pins_in_line(mechanism, np.asarray(q))})
         lost = [side for side, code in zip(("lower", "upper"), np.asarray(ends_of.status), strict=True) if code == Reached.lost]
-        found.append({"motor": name, "unit": ends_of.unit, "ends": ends, "lost": lost})
-    return {"travel": found}
+        travels.append({"motor": name, "unit": ends_of.unit, "ends": ends, "lost": lost})
+    return {"travel": travels}
 
 
 def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
@@ -148,21 +148,21 @@ def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
         body = joint.bodies[0] if joint.bodies[0] in frames else joint.bodies[1]
         point = np.asarray(joint.points)[joint.bodies.index(body)]
         x, y, angle = frames[body]
-        c, s = math.cos(angle), math.sin(angle)
-        places[name] = np.array([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
-    found: list[list[str]] = []
+        third, s = math.cos(angle), math.sin(angle)
+        places[name] = np.array([x + third * point[0] - s * point[1], y + s * point[0] + third * point[1]])
+    lines: list[list[str]] = []
     for middle, joint in pins.items():
-        one, two = joint.bodies
-        if "ground" in (one, two):
+        body1, body2 = joint.bodies
+        if "ground" in (body1, body2):
             continue
-        for a, other in pins.items():
-            for c, last in pins.items():
-                if len({a, middle, c}) == 3 and one in other.bodies and two in last.bodies:
-                    u, w = places[a] - places[middle], places[c] - places[middle]
-                    size = np.linalg.norm(u) * np.linalg.norm(w)
-                    if size > 0 and abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE * size:
-                        _add_to_line(found, [a, middle, c], places)
-    return found
+        for first, first_joint in pins.items():
+            for third, last_joint in pins.items():
+                if len({first, middle, third}) == 3 and body1 in first_joint.bodies and body2 in last_joint.bodies:
+                    to_first, to_third = places[first] - places[middle], places[third] - places[middle]
+                    size = np.linalg.norm(to_first) * np.linalg.norm(to_third)
+                    if size > 0 and abs(to_first[0] * to_third[1] - to_first[1] * to_third[0]) <= IN_LINE * size:
+                        _add_to_line(lines, [first, middle, third], places)
+    return lines
 
 
 def _add_to_line(lines: list[list[str]], pins: list[str], places: dict[str, np.ndarray]) -> None:

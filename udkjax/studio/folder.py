@@ -34,12 +34,12 @@ class Folder:
                 if entry.name.startswith(".") or entry.is_symlink():
                     continue
                 if entry.is_dir(follow_symlinks=False) and deep > 1 and not (Path(entry.path) / "pyvenv.cfg").exists():
-                    found = self._walk(Path(entry.path), deep - 1)
+                    names = self._walk(Path(entry.path), deep - 1)
                 elif entry.is_file(follow_symlinks=False) and entry.name.endswith(SCENE_SUFFIX):
-                    found = iter([Path(entry.path).relative_to(self.root).as_posix()])
+                    names = iter([Path(entry.path).relative_to(self.root).as_posix()])
                 else:
                     continue
-                for name in found:
+                for name in names:
                     count += 1
                     if count > MOST_LISTED:
                         return
@@ -92,8 +92,8 @@ class Folder:
         path = self.locate(name, suffixes)
         present = revision_of(path.read_bytes()) if path.exists() else None
         if present != revision:
-            found = "has been deleted" if present is None else "has been created or changed by another program"
-            raise RefusedError(409, f"{name} {found} since it was opened here", revision=present)
+            change = "has been deleted" if present is None else "has been created or changed by another program"
+            raise RefusedError(409, f"{name} {change} since it was opened here", revision=present)
         try:
             handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".studio-")
             try:

@@ -28,12 +28,12 @@ TOLERANCE = 1e-8  # rtol and atol of a run
 
 def duration_of(mechanism: Mechanism) -> float:
     """Return the duration of a run (s): turns of the slowest motor, a slide's way across the mechanism, or else some swings."""
-    scales, ways = analyse(mechanism), []
+    scales, durations = analyse(mechanism), []
     for name, driver in mechanism.drivers.items():
         if (speed := constant_speed(mechanism, name)) != 0:
-            ways.append((TURNS * 2 * math.pi if driver.coordinate == "angle" else float(scales.length)) / abs(speed))
+            durations.append((TURNS * 2 * math.pi if driver.coordinate == "angle" else float(scales.length)) / abs(speed))
     swing = float(scales.time)
-    exact = max(ways) if ways else SWINGS * swing if math.isfinite(swing) else STILL
+    exact = max(durations) if durations else SWINGS * swing if math.isfinite(swing) else STILL
     return float(f"{exact:.{DIGITS}g}")
 
 
@@ -49,19 +49,23 @@ def recorded_motion(mechanism: Mechanism) -> JsonObject:
     q, v = np.asarray(run.q), np.asarray(run.v)
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
     count = int(np.argmin(alive)) if not alive.all() else len(q)
-    kept = {"times": np.asarray(run.ts)[:count], "q": q[:count].ravel(), "v": v[:count].ravel()}
-    return {name: values.tolist() for name, values in kept.items()} | {"cause": run.cause if count < len(q) else ""}
+    arrays = {"times": np.asarray(run.ts)[:count], "q": q[:count].ravel(), "v": v[:count].ravel()}
+    return {name: values.tolist() for name, values in arrays.items()} | {"cause": run.cause if count < len(q) else ""}
 
 
 def force_curves(mechanism: Mechanism) -> JsonObject:
     """Return curves of the run: driving torques, forces and powers of motors, forces at pins, energies, constraint violation."""
     run = shown_run(mechanism)
-    ts, found = np.asarray(run.ts), _efforts(mechanism, run, "driving")
+    ts, effort_curves = np.asarray(run.ts), _efforts(mechanism, run, "driving")
     powers = [
         _curve(f"{n}: power", "W", np.asarray(x) * _rate(mechanism.drivers[n], ts)) for n, x in efforts(mechanism, run).items()
     ]
     measures = [_curve(m.name, m.unit, m.values) for m in measures_of(mechanism, run, ("energy", "violation"), "")]
-    return {"times": ts.tolist(), "curves": [*found, *powers, *_pin_forces(mechanism, run), *measures], "cause": run.cause}
+    return {
+        "times": ts.tolist(),
+        "curves": [*effort_curves, *powers, *_pin_forces(mechanism, run), *measures],
+        "cause": run.cause,
+    }
 
 
 def holding_curves(mechanism: Mechanism) -> JsonObject:
@@ -73,9 +77,9 @@ def holding_curves(mechanism: Mechanism) -> JsonObject:
     if mobility_of(mechanism) > 0:
         raise SceneError(["motors do not hold the whole mechanism at rest: loads would move the rest of it"])
     run = shown_run(mechanism)
-    held = with_halted_drivers(mechanism, 0.0)
-    rest = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
-    curves = [*_efforts(held, rest, "holding"), *_pin_forces(held, rest)]
+    halted = with_halted_drivers(mechanism, 0.0)
+    positions = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))
+    curves = [*_efforts(halted, positions, "holding"), *_pin_forces(halted, positions)]
     return {"times": np.asarray(run.ts).tolist(), "curves": curves, "cause": run.cause}
 
 

@@ -81,7 +81,7 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
     try:
         if document is not None:
             text = merge_document(text, document)
-        found = read_document(text)
+        tables = read_document(text)
         with np.errstate(over="ignore", invalid="ignore"):  # reported below
             mechanism = loads(text)
             if not np.isfinite(analyse(mechanism).length):
@@ -92,10 +92,10 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
             raise SceneError(["format: the studio draws files of format 2"])
     except SceneError as error:
         return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None}
-    moving = engine_of(mechanism, found) if engine == "wasm" else {}
+    moving = engine_of(mechanism, tables) if engine == "wasm" else {}
     if engine == "recorded":
         moving = {"motion": recorded_motion(mechanism)}
-    return {"text": text, "document": found, "problems": [], "scene": scene_of(mechanism), **moving}
+    return {"text": text, "document": tables, "problems": [], "scene": scene_of(mechanism), **moving}
 
 
 def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:

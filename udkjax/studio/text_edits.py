@@ -101,10 +101,10 @@ def _holds_tables(item: Any) -> bool:
 
 def _merge_list(old: Any, new: Sequence[Mapping[str, Any]]) -> None:
     """Change a list of tables; tables with the same name or content keep their place and comments."""
-    before = [_mark(_unwrapped(table)) for table in old]
-    after = [_mark(table) for table in new]
+    old_keys = [_mark(_unwrapped(table)) for table in old]
+    new_keys = [_mark(table) for table in new]
     offset = 0
-    for _, a0, a1, b0, b1 in SequenceMatcher(None, before, after, autojunk=False).get_opcodes():
+    for _, a0, a1, b0, b1 in SequenceMatcher(None, old_keys, new_keys, autojunk=False).get_opcodes():
         shared = min(a1 - a0, b1 - b0)
         for k in range(shared):
             _merge_table(old[a0 + offset + k], new[b0 + k], 2)
@@ -125,27 +125,27 @@ def _fresh(key: str, value: Any, depth: int) -> Any:
     if depth == 0 and key in NEW_TABLES and isinstance(value, Mapping):
         return _fresh_table(value)
     if depth == 0 and key in HEADED and isinstance(value, list) and _is_tables(value):
-        found = tomlkit.aot()
+        tables = tomlkit.aot()
         for table in value:
-            found.append(_fresh_table(table))
-        return found
+            tables.append(_fresh_table(table))
+        return tables
     return _inline(value)
 
 
 def _fresh_table(table: Mapping[str, Any], indent: str = "") -> Table:
-    found = tomlkit.table()
-    found.trivia.indent = indent
+    fresh = tomlkit.table()
+    fresh.trivia.indent = indent
     for key, value in table.items():
-        found.add(key, _inline(value))
-    return found
+        fresh.add(key, _inline(value))
+    return fresh
 
 
 def _inline(value: Any) -> Any:
     if isinstance(value, Mapping):
-        found = tomlkit.inline_table()
+        inline = tomlkit.inline_table()
         for key, item in value.items():
-            found.append(key, _inline(item))
-        return found
+            inline.append(key, _inline(item))
+        return inline
     if isinstance(value, list):
         array = tomlkit.array()
         for item in value:

@@ -57,10 +57,10 @@ class Worker:
         if self._process is None or not self._process.is_alive() or self._connection is None:
             self._stop()
             context = multiprocessing.get_context("spawn")
-            self._connection, other = context.Pipe()
-            self._process = context.Process(target=_serve, args=(other,), daemon=True, name="udkjax studio")
+            self._connection, child_end = context.Pipe()
+            self._process = context.Process(target=_serve, args=(child_end,), daemon=True, name="udkjax studio")
             self._process.start()
-            other.close()
+            child_end.close()
         return self._connection
 
     def _stop(self) -> None:

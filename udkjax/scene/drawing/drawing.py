@@ -106,18 +106,18 @@ class Drawing(AbstractDrawing):
             f"velocities.{pin}: no pin named {quote(pin)}{suggestion(pin, pins)}" for pin in velocities or {} if pin not in pins
         ]
         entries = [entry for section, group in given.items() for entry in _entries(section, group)]
-        found = read_drawing(entries, ground, gravity, Units(units))
-        if unknown or found.problems:
-            raise SceneError([*unknown, *found.problems], name)
-        self.name, self.gravity, self.ground = name, number(found.gravity), tuple(ground)
+        checked = read_drawing(entries, ground, gravity, Units(units))
+        if unknown or checked.problems:
+            raise SceneError([*unknown, *checked.problems], name)
+        self.name, self.gravity, self.ground = name, number(checked.gravity), tuple(ground)
         self.units = tuple((units or {}).items())
-        self._names, self._elements = _in_order(found.groups)
+        self._names, self._elements = _in_order(checked.groups)
 
     @classmethod
-    def of_elements(cls, found: DrawingElements, ground: Sequence[str], name: str, units: Mapping[str, str]) -> "Drawing":
+    def of_elements(cls, checked: DrawingElements, ground: Sequence[str], name: str, units: Mapping[str, str]) -> "Drawing":
         """Return the drawing of elements that were read without mistakes."""
-        names, elements = _in_order(found.groups)
-        gravity, choices = number(found.gravity), tuple(units.items())
+        names, elements = _in_order(checked.groups)
+        gravity, choices = number(checked.gravity), tuple(units.items())
         return make_module(cls, name=name, gravity=gravity, ground=tuple(ground), units=choices, _names=names, _elements=elements)
 
     @property
@@ -151,20 +151,20 @@ class Drawing(AbstractDrawing):
 
     def shapes(self) -> dict[str, Array]:
         """Return the pins or the outline (n, 2) of each link, in its own frame (m), by name."""
-        placement, found = placement_of(concrete_elements(self.groups), self.ground), {}
+        placement, shapes = placement_of(concrete_elements(self.groups), self.ground), {}
         for name, link in placement.links.items():
-            places = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
-            found[name] = number([placement.local(name, place) for place in places])
-        return found
+            positions = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
+            shapes[name] = number([placement.local(name, position) for position in positions])
+        return shapes
 
     def free_pins(self) -> dict[str, tuple[str, Array]]:
         """Return the pins that belong to a single link: the link, and the position in its frame (m)."""
-        placement, found = placement_of(concrete_elements(self.groups), self.ground), {}
-        for pin, place in placement.places.items():
+        placement, free = placement_of(concrete_elements(self.groups), self.ground), {}
+        for pin, position in placement.places.items():
             members = placement.members(pin)
             if len(members) == 1 and members[0] in placement.links:
-                found[pin] = members[0], number(placement.local(members[0], place))
-        return found
+                free[pin] = members[0], number(placement.local(members[0], position))
+        return free
 
     def _table(self) -> PrintedTable:
         return drawing_table(self.name, self.groups, self.ground)
@@ -185,8 +185,8 @@ class Drawing(AbstractDrawing):
         joints |= {name: part.joint for name, part in parts.items() if part.joint is not None}
         drivers = {name: part.driver for name, part in motors.items() if part.driver is not None}
         forces = {name: part.force for name, part in (*parts.items(), *motors.items()) if part.force is not None}
-        own = self.groups
-        joints, drivers, forces = joints | own["joint"], drivers | own["driver"], forces | own["force"]
+        given = self.groups
+        joints, drivers, forces = joints | given["joint"], drivers | given["driver"], forces | given["force"]
         try:
             return Mechanism(bodies, joints, drivers, forces, self.gravity, self.name, drawing=self)
         except SceneError as error:
@@ -195,10 +195,10 @@ class Drawing(AbstractDrawing):
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
         entries = [entry for section, group in groups.items() for entry in _entries(section, group)]
-        found = read_drawing(entries, self.ground, gravity, Units())
-        if found.problems:
-            raise SceneError(found.problems, self.name)
-        return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(found.groups)[1]})
+        checked = read_drawing(entries, self.ground, gravity, Units())
+        if checked.problems:
+            raise SceneError(checked.problems, self.name)
+        return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(checked.groups)[1]})
 
 
 def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...], ...]]:
@@ -223,16 +223,16 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
         items = list(zip(name_elements(group or []), group or [], strict=True))
     else:
         items = [(f"{section}{k + 1}", item) for k, item in enumerate(group or [])]
-    found = []
+    entries = []
     for k, (name, item) in enumerate(items):
         if isinstance(item, cls):
-            found.append(SceneEntry(section, k, name, type(item), table_of(item), element=item))
+            entries.append(SceneEntry(section, k, name, type(item), table_of(item), element=item))
         elif isinstance(item, Mapping) and section in DRAWN:
-            found.append(SceneEntry(section, k, name, cls, item))
+            entries.append(SceneEntry(section, k, name, cls, item))
         else:
             problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, is a {type(item).__name__}"
-            found.append(SceneEntry(section, k, name, None, {}, problem))
-    return found
+            entries.append(SceneEntry(section, k, name, None, {}, problem))
+    return entries
 
 
 def _with_link(problem: str, links: Iterable[str]) -> str:

@@ -86,12 +86,12 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
 
 def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, group: dict[str, Any], problems: list[str]) -> None:
     """Add an element to its group, or its mistakes to the problems."""
-    place = entry.where if entry.section != "pin" else where("pin", entry.index, str(entry.name))
+    path = entry.where if entry.section != "pin" else where("pin", entry.index, str(entry.name))
     if not isinstance(entry.name, str) or not entry.name:
-        given = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
-        problems.append(f"{place}.name: {given}")
+        mistake = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
+        problems.append(f"{path}.name: {mistake}")
     elif entry.name in group:
-        problems.append(f"{place}.name: taken by another {entry.section}; names must be unique")
+        problems.append(f"{path}.name: taken by another {entry.section}; names must be unique")
     if entry.cls is None:
         problems.append(entry.problem)
         return
@@ -99,12 +99,12 @@ def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, gro
     table, cls = entry.table, entry.cls
     if not isinstance(entry.element, cls):
         variant, law = units_of_element(cls, table)
-        table = units.convert_table(place, cls, table, failed, variant, law)
-    found = [*failed, *without_failed(check_table(place, cls, table, known), failed)]
+        table = units.convert_table(path, cls, table, failed, variant, law)
+    mistakes = [*failed, *without_failed(check_table(path, cls, table, known), failed)]
     if entry.section == "pin":
-        found = [problem.replace(f"{place}.position", place, 1) for problem in found]
-    problems += found
-    if not found and isinstance(entry.name, str):
+        mistakes = [problem.replace(f"{path}.position", path, 1) for problem in mistakes]
+    problems += mistakes
+    if not mistakes and isinstance(entry.name, str):
         group.setdefault(entry.name, entry.element if isinstance(entry.element, cls) else build(cls, table))
 
 

@@ -26,11 +26,11 @@ def drawing_of_tables(scene: Mapping[str, Any], source: str) -> Drawing:
         is_counted = section in LISTS and section != "link"
         entries.extend(read_section(section, scene.get(section, []), problems, (DRAWN | BY_HAND)[section], is_counted))
     ground, gravity, units = scene.get("ground", []), scene.get("gravity"), scene.get("units", {})
-    found = read_drawing(entries, ground, gravity, Units(units))
-    problems.extend(found.problems)
+    elements = read_drawing(entries, ground, gravity, Units(units))
+    problems.extend(elements.problems)
     if problems:
         raise SceneError(problems, source)
-    return Drawing.of_elements(found, ground, scene.get("name", ""), units)
+    return Drawing.of_elements(elements, ground, scene.get("name", ""), units)
 
 
 def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneEntry]:
@@ -41,9 +41,9 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
             return
     pins, velocities = tables.values()
     problems += [f"velocities.{name}: no pin of this name{suggestion(name, pins)}" for name in velocities if name not in pins]
-    for k, (name, place) in enumerate(pins.items()):
+    for k, (name, position) in enumerate(pins.items()):
         speed = {"velocity": velocities[name]} if name in velocities else {}
-        yield SceneEntry("pin", k, name, Pin, {"position": place, **speed})
+        yield SceneEntry("pin", k, name, Pin, {"position": position, **speed})
 
 
 def drawing_text(drawing: Drawing) -> str:

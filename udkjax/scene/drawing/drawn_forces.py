@@ -49,9 +49,9 @@ class Motor(DrawnElement):
     def parts(self, placement):
         if self.slide is not None:
             slide = placement.slides[self.slide]
-            pair, place = (slide.on, slide.link), placement.places[placement.links[slide.link].pins[0]]
+            pair, position = (slide.on, slide.link), placement.places[placement.links[slide.link].pins[0]]
             axis = placement.direction(slide.on, slide.along, slide.direction)
-            return Parts(driver=Driver(pair, "x", self._law(0.0), placement.points(pair, (place, place)), axis))
+            return Parts(driver=Driver(pair, "x", self._law(0.0), placement.points(pair, (position, position)), axis))
         if self.pin is None:
             law, ends = self._law(placement.distance(*self.between)), placement.ends(self.between)
             return Parts(driver=Driver(ends, "distance", law, _points_of(placement, self.between)))
@@ -227,8 +227,14 @@ def _mistakes_of_ends(layout: PinLayout, between: tuple[str, ...], pin: str | No
     elif len(between) != 2 or between[0] == between[1]:
         yield "between: must name two pins"
     else:
-        one, two = map(layout.members, between)
+        members1, members2 = map(layout.members, between)
         yield from (
-            f"between: no link has pin {quote(p)}, nor the ground" for p, m in zip(between, (one, two), strict=True) if not m
+            f"between: no link has pin {quote(p)}, nor the ground"
+            for p, members in zip(between, (members1, members2), strict=True)
+            if not members
         )
-        yield from (f"between: both pins are on {quote(m)}, so their distance never changes" for m in one if m in two)
+        yield from (
+            f"between: both pins are on {quote(members)}, so their distance never changes"
+            for members in members1
+            if members in members2
+        )

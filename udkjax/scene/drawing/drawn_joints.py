@@ -28,10 +28,10 @@ class Slide(DrawnElement):
             yield f"on: {quote(self.on)} is connected to itself"
 
     def parts(self, placement):
-        place = placement.places[placement.links[self.link].pins[0]]
+        position = placement.places[placement.links[self.link].pins[0]]
         axis = placement.direction(self.on, self.along, self.direction)
         pair = (self.on, self.link)
-        return Parts(joint=Prismatic(pair, placement.points(pair, (place, place)), axis, placement.angle_between(*pair)))
+        return Parts(joint=Prismatic(pair, placement.points(pair, (position, position)), axis, placement.angle_between(*pair)))
 
     @property
     def anchors(self):
@@ -102,8 +102,8 @@ class GearPair(DrawnElement):
         """Return the distance between the centres, and the distance required by the radii (m); None without radii."""
         if self.radii is None:
             return None
-        one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
-        return float(placement.distance(one, two)), float(self._apart(self.radii))
+        centre1, centre2 = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
+        return float(placement.distance(centre1, centre2)), float(self._apart(self.radii))
 
     def _apart(self, sizes: Array) -> Number:
         difference = array_namespace(sizes).abs(sizes[0] - sizes[1])
@@ -135,5 +135,5 @@ class CamPair(DrawnElement):
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
         """Return the links, by default the only moving link of each pin."""
-        found = [[m for m in layout.members(pin) if m != GROUND] for pin in self.pins]
-        return self.links or tuple(members[0] for members in found if len(members) == 1)
+        moving = [[m for m in layout.members(pin) if m != GROUND] for pin in self.pins]
+        return self.links or tuple(members[0] for members in moving if len(members) == 1)

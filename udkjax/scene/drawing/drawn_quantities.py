@@ -69,8 +69,8 @@ class Units:
     def convert(self, path: str, value: object, unit: str, problems: list[str]) -> object:
         """Convert a number, a string with its unit, or nested lists of them, to SI units; None if it is added to the problems."""
         if isinstance(value, list | tuple):
-            found = [self.convert(f"{path}[{i}]", item, unit, problems) for i, item in enumerate(value)]
-            return None if any(x is None for x in found) else found
+            converted = [self.convert(f"{path}[{i}]", item, unit, problems) for i, item in enumerate(value)]
+            return None if any(x is None for x in converted) else converted
         try:
             if isinstance(value, str):
                 return read_quantity(value, unit)
@@ -85,10 +85,10 @@ class Units:
         factor = self._factor(unit)
         if factor is None and (isinstance(value, Tracer) or np.any(value)):
             kind = _KIND_OF.get(unit)
-            which = " and ".join(f"{k} is in {u}" for k, u in self._changed(unit).items())
-            under = f", or choose a unit for {kind} under units" if kind else ""
+            chosen = " and ".join(f"{k} is in {u}" for k, u in self._changed(unit).items())
+            advice = f", or choose a unit for {kind} under units" if kind else ""
             example = quote(f"{value} {unit}")
-            raise ValueError(f"{value} needs a unit, as {which} here: write {example}{under}")
+            raise ValueError(f"{value} needs a unit, as {chosen} here: write {example}{advice}")
         return value if factor in (None, 1.0) else value * factor
 
     def _factor(self, unit: str) -> float | None:
@@ -100,9 +100,9 @@ class Units:
 
     def _changed(self, unit: str) -> dict[str, str]:
         """Return the units of the file that differ from parts of an SI unit."""
-        parts = [_KIND_OF.get(part, "") for part in re.findall(r"[A-Za-z]+", unit)]
+        kinds = [_KIND_OF.get(symbol, "") for symbol in re.findall(r"[A-Za-z]+", unit)]
         return {
-            k: self.chosen[k] for k in parts if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
+            k: self.chosen[k] for k in kinds if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
         }
 
     @staticmethod
@@ -129,19 +129,19 @@ class Units:
 
     def write_table(self, element: eqx.Module, variant: str = "", law: str = "") -> dict[str, object]:
         """Return an element as a table from which the same numbers are read."""
-        cls, found = type(element), {}
+        cls, table = type(element), {}
         for name, value in table_of(element).items():
             if isinstance(value, eqx.Module):
                 kind = {} if isinstance(value, Profile) else {"type": type_name(type(value))}
-                found[name] = {**kind, **self.write_table(value, law=law)}
+                table[name] = {**kind, **self.write_table(value, law=law)}
             elif not eqx.is_array(value):
-                found[name] = value
+                table[name] = value
             elif name == "coefficients":
-                found[name] = [self.write(x, _per_power(law, k)) for k, x in enumerate(np.asarray(value).tolist())]
+                table[name] = [self.write(x, _per_power(law, k)) for k, x in enumerate(np.asarray(value).tolist())]
             else:
                 unit = _unit(cls, name, variant, law)
-                found[name] = jax.tree.map(lambda x, unit=unit: self.write(x, unit), np.asarray(value).tolist())
-        return found
+                table[name] = jax.tree.map(lambda x, unit=unit: self.write(x, unit), np.asarray(value).tolist())
+        return table
 
     def convert_table(
         self, path: str, cls: type, table: TomlTable, problems: list[str], variant: str = "", law: str = ""
@@ -150,26 +150,26 @@ class Units:
 
         `variant` is the name under which the units of its fields are listed, by default the class; `law` is that of a motion.
         """
-        expected, found = keys(cls), {}
+        expected, converted = keys(cls), {}
         for name, value in table.items():
-            place = f"{path}.{name}"
+            key_path = f"{path}.{name}"
             if name not in expected or not _is_number(expected[name].annotation):
-                found[name] = (
-                    self._convert_nested(place, expected[name].annotation, value, problems, law) if name in expected else value
+                converted[name] = (
+                    self._convert_nested(key_path, expected[name].annotation, value, problems, law) if name in expected else value
                 )
                 continue
             unit = _unit(cls, name, variant, law)
             if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and name in (*VECTORS, "coefficients"):
                 value = list(value)
             if name in VECTORS and isinstance(value, list | tuple):
-                found[name] = vector_as_angle(value)
+                converted[name] = vector_as_angle(value)
                 continue
             if name == "coefficients" and isinstance(value, list | tuple):
-                parts = [self.convert(f"{place}[{k}]", x, _per_power(law, k), problems) for k, x in enumerate(value)]
-                found[name] = None if any(x is None for x in parts) else parts
+                coefficients = [self.convert(f"{key_path}[{k}]", x, _per_power(law, k), problems) for k, x in enumerate(value)]
+                converted[name] = None if any(x is None for x in coefficients) else coefficients
             else:
-                found[name] = self.convert(place, value, unit, problems)
-        return found
+                converted[name] = self.convert(key_path, value, unit, problems)
+        return converted
 
     def _convert_nested(self, path: str, annotation: Any, value: object, problems: list[str], law: str) -> object:
         """Convert the table of a motion law or of a profile to SI units; return anything else unchanged."""
@@ -179,10 +179,10 @@ class Units:
         return value if cls is None else self.convert_table(path, cls, value, problems, law=law)
 
 
-def without_failed(found: Iterable[str], failed: Iterable[str]) -> list[str]:
+def without_failed(mistakes: Iterable[str], failed: Iterable[str]) -> list[str]:
     """Return the mistakes in tables without those of numbers already reported."""
     fields = {_field(problem) for problem in failed}
-    return [problem for problem in found if _field(problem) not in fields]
+    return [problem for problem in mistakes if _field(problem) not in fields]
 
 
 def _field(problem: str) -> str:

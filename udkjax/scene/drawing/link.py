@@ -36,8 +36,8 @@ def bar(start: PointArray, end: PointArray, width: Number) -> Shape:
     l w (l^2 + w^2) / 12 and, for both together, pi r^4 / 2 + pi r^2 l^2 / 4 + 4 r^3 l / 3. With zero width it is a thin rod.
     """
     xp = array_namespace(start, end, width)
-    way = end - start
-    length, w = xp.sqrt(way @ way), width
+    axis = end - start
+    length, w = xp.sqrt(axis @ axis), width
     # Both divided by the width, which may be zero.
     area = length + np.pi * w / 4
     moment = length * (length**2 + w**2) / 12 + np.pi * w**3 / 32 + np.pi * w * length**2 / 16 + w**2 * length / 6
@@ -72,8 +72,8 @@ def twice_area(points: PointArray) -> Number:
 
 def _next_and_cross(points: PointArray) -> tuple[PointArray, PointArray]:
     """Return the successor of each point, and the cross product of both."""
-    after = array_namespace(points).roll(points, -1, axis=0)
-    return after, points[:, 0] * after[:, 1] - after[:, 0] * points[:, 1]
+    following = array_namespace(points).roll(points, -1, axis=0)
+    return following, points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]
 
 
 Places = Mapping[str, PointArray]  # world coordinates of pins (m)
@@ -149,14 +149,16 @@ class Link(PrintsLine):
         inertia = mass * shape.square_radius if self.inertia is None else self.inertia
         centre = shape.centre if self.centre is None else self.centre
         first, angle, rate = places[self.pins[0]], 0.0, 0.0
-        speed = velocities[self.pins[0]]
+        first_velocity = velocities[self.pins[0]]
         if len(self.pins) > 1:
-            way = places[self.pins[1]] - first
-            angle = array_namespace(way).arctan2(way[1], way[0])
-            change = velocities[self.pins[1]] - speed
-            rate = (way[0] * change[1] - way[1] * change[0]) / (way @ way)
+            axis = places[self.pins[1]] - first
+            angle = array_namespace(axis).arctan2(axis[1], axis[0])
+            difference = velocities[self.pins[1]] - first_velocity
+            rate = (axis[0] * difference[1] - axis[1] * difference[0]) / (axis @ axis)
         arm = centre - first
-        velocity = array_namespace(arm, rate, speed).stack([speed[0] - rate * arm[1], speed[1] + rate * arm[0]])
+        velocity = array_namespace(arm, rate, first_velocity).stack(
+            [first_velocity[0] - rate * arm[1], first_velocity[1] + rate * arm[0]]
+        )
         return DrawnBody(Frame.at((centre[0], centre[1]), angle), Body(mass, inertia, centre, angle, velocity, rate))
 
 

@@ -30,12 +30,12 @@ def where(section: str, index: int, name: str) -> str:
 
 def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     """Return pin and two links of each revolute, by name: a pin shared by k links has k - 1 revolutes."""
-    found = {}
+    joints = {}
     for pin in pins:
         first, *others = layout.members(pin) or ("",)
         for k, other in enumerate(others):
-            found[pin if k == 0 else f"{pin}-{k + 1}"] = (pin, first, other)
-    return found
+            joints[pin if k == 0 else f"{pin}-{k + 1}"] = (pin, first, other)
+    return joints
 
 
 def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str], all_read: bool) -> Iterator[str]:
@@ -55,10 +55,10 @@ def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str
             yield f"pins.{pin}: no link uses it"
     attached = _attached(layout, groups)
     for k, (name, link) in enumerate(layout.links.items()):
-        place = where("link", k, name)
-        yield from (f"{place}{problem}" for problem in _link_mistakes(link))
+        path = where("link", k, name)
+        yield from (f"{path}{problem}" for problem in _link_mistakes(link))
         if all_read and name not in attached:
-            yield f"{place}.pins: the link is not connected to the ground or to another link"
+            yield f"{path}.pins: the link is not connected to the ground or to another link"
     for section, group in elements.items():
         for k, (name, element) in enumerate(group.items()):
             yield from (f"{where(section, k, name)}.{problem}" for problem in element.mistakes(layout))
@@ -91,14 +91,14 @@ def _taken_names(layout: PinLayout, groups: DrawnGroups) -> Iterator[str]:
 
 def _attached(layout: PinLayout, groups: DrawnGroups) -> set[str]:
     """Return the links that are connected to another element."""
-    found = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
+    attached = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
     for section in ("slide", "slot", "cam", "gear", "motor", "spring", "damper", "load", "joint", "driver", "force"):
         for element in groups[section].values():
             pins = (getattr(element, "pin", None), *getattr(element, "pins", ()), *getattr(element, "between", ()))
             named = (getattr(element, name, None) for name in ("link", "on", "body"))
-            found |= {*named, *getattr(element, "links", ()), *getattr(element, "bodies", ())}
-            found |= {name for pin in pins if pin for name in layout.members(pin)}
-    return {name for name in found if name}
+            attached |= {*named, *getattr(element, "links", ()), *getattr(element, "bodies", ())}
+            attached |= {name for pin in pins if pin for name in layout.members(pin)}
+    return {name for name in attached if name}
 
 
 def _link_mistakes(link: Link) -> Iterator[str]:
@@ -122,9 +122,9 @@ def _link_mistakes(link: Link) -> Iterator[str]:
 def shape_mistakes(places: Mapping[str, PointArray], links: Mapping[str, Link]) -> Iterator[str]:
     """Iterate over implausible pins and shapes; all numbers are concrete and finite."""
     size = extent(list(places.values()))
-    for one, two in combinations(places, 2):
-        if np.linalg.norm(places[two] - places[one]) <= SAME_PLACE * size:
-            yield f"pins.{two}: is at the same place as pin {quote(one)}: give all links there one pin, or move it"
+    for pin1, pin2 in combinations(places, 2):
+        if np.linalg.norm(places[pin2] - places[pin1]) <= SAME_PLACE * size:
+            yield f"pins.{pin2}: is at the same place as pin {quote(pin1)}: give all links there one pin, or move it"
     yield from _far_pins(places)
     for k, (name, link) in enumerate(links.items()):
         yield from (f"{where('link', k, name)}{problem}" for problem in _shape_mistakes(places, link))
@@ -139,9 +139,9 @@ def extent(points: Sequence[PointArray]) -> float:
 def _far_pins(places: Mapping[str, PointArray]) -> Iterator[str]:
     if len(places) < 3:
         return
-    for name, place in places.items():
-        rest = [other for key, other in places.items() if key != name]
-        distance, size = min(np.linalg.norm(place - other) for other in rest), extent(rest)
+    for name, position in places.items():
+        others = [other for key, other in places.items() if key != name]
+        distance, size = min(np.linalg.norm(position - other) for other in others), extent(others)
         if distance > FAR_POINT_RATIO * size > 0:
             yield (
                 f"pins.{name}: is {distance:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
@@ -156,13 +156,13 @@ def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[st
         return  # such a link needs no shape
     points = [places[pin] for pin in link.pins]
     if link.kind == "bar" and len(points) > 2:
-        start, way = points[0], points[-1] - points[0]
+        start, axis = points[0], points[-1] - points[0]
         for pin, point in list(zip(link.pins, points, strict=True))[1:-1]:
-            off = abs(way[0] * (point - start)[1] - way[1] * (point - start)[0]) / max(np.linalg.norm(way), 1e-300)
-            half = 0.5 * float(np.asarray(link.width))
-            if off > max(half, DRAWN_GAP * np.linalg.norm(way)):
+            distance = abs(axis[0] * (point - start)[1] - axis[1] * (point - start)[0]) / max(np.linalg.norm(axis), 1e-300)
+            half_width = 0.5 * float(np.asarray(link.width))
+            if distance > max(half_width, DRAWN_GAP * np.linalg.norm(axis)):
                 yield (
-                    f".pins: {quote(pin)} is {off:.3g} m off the bar from {quote(link.pins[0])} to {quote(link.pins[-1])}: "
+                    f".pins: {quote(pin)} is {distance:.3g} m off the bar from {quote(link.pins[0])} to {quote(link.pins[-1])}: "
                     "leave out the width for a plate, give an outline, or put the ends of the bar first and last"
                 )
     elif link.kind in ("plate", "outline"):
@@ -189,14 +189,14 @@ def _crosses_itself(corners: np.ndarray) -> bool:
 
 def _reaches(corners: np.ndarray, point: PointArray) -> bool:
     """Return True if a point is within a polygon, or as near to it as in a drawing to scale."""
-    near = DRAWN_GAP * extent(list(corners))
+    tolerance = DRAWN_GAP * extent(list(corners))
     inside = False
     for a, b in [*pairwise(corners), (corners[-1], corners[0])]:
-        way, arm = b - a, point - a
-        share = np.clip(way @ arm / max(way @ way, 1e-300), 0.0, 1.0)
-        if np.linalg.norm(arm - share * way) <= near:
+        side, arm = b - a, point - a
+        fraction = np.clip(side @ arm / max(side @ side, 1e-300), 0.0, 1.0)
+        if np.linalg.norm(arm - fraction * side) <= tolerance:
             return True
-        if (a[1] > point[1]) != (b[1] > point[1]) and point[0] < a[0] + way[0] * arm[1] / way[1]:
+        if (a[1] > point[1]) != (b[1] > point[1]) and point[0] < a[0] + side[0] * arm[1] / side[1]:
             inside = not inside
     return inside
 
@@ -205,10 +205,10 @@ def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:
     """Iterate over slots and gears that do not fit as drawn; all numbers are concrete."""
     size = extent(list(placement.places.values()))
     for k, (name, slot) in enumerate(groups["slot"].items()):
-        off = _off_line(placement, slot) if slot.along else 0.0
-        if off > DRAWN_GAP * size:
+        distance = _off_line(placement, slot) if slot.along else 0.0
+        if distance > DRAWN_GAP * size:
             line = " and ".join(map(quote, slot.along))
-            yield f"{where('slot', k, name)}.pin: {quote(slot.pin)} is {off:.3g} m off the line through {line}, its slot"
+            yield f"{where('slot', k, name)}.pin: {quote(slot.pin)} is {distance:.3g} m off the line through {line}, its slot"
     for k, (name, gear) in enumerate(groups["gear"].items()):
         assert isinstance(gear, GearPair)
         misfit = gear.misfit(placement)
@@ -221,5 +221,5 @@ def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:
 
 def _off_line(placement: Placement, slot: PinInSlot) -> float:
     start, end = (placement.places[pin] for pin in slot.along)
-    way, arm = end - start, placement.places[slot.pin] - start
-    return float(abs(way[0] * arm[1] - way[1] * arm[0]) / np.linalg.norm(way))
+    direction, arm = end - start, placement.places[slot.pin] - start
+    return float(abs(direction[0] * arm[1] - direction[1] * arm[0]) / np.linalg.norm(direction))

@@ -66,31 +66,31 @@ class Placement(PinLayout):
         """Return the angle of a body (rad)."""
         return self._frames[body].angle
 
-    def angle_between(self, one: str, two: str) -> Number:
+    def angle_between(self, body1: str, body2: str) -> Number:
         """Return the angle of body 2 relative to body 1 (rad)."""
-        return self.angle(two) - self.angle(one)
+        return self.angle(body2) - self.angle(body1)
 
-    def local(self, body: str, place: PointArray) -> Float[Array, "2"]:
+    def local(self, body: str, position: PointArray) -> Float[Array, "2"]:
         """Return a position in the frame of a body (m)."""
         frame = self._frames[body]
-        x, y = frame.local((place[0] - frame.x, place[1] - frame.y))
+        x, y = frame.local((position[0] - frame.x, position[1] - frame.y))
         return array_namespace(x, y).stack([x, y])
 
     def points(self, bodies: Sequence[str], places: Sequence[PointArray]) -> Float[Array, "2 2"]:
         """Return two positions, each in the frame of its body (m)."""
-        found = [self.local(body, place) for body, place in zip(bodies, places, strict=True)]
-        return array_namespace(*found).stack(found)
+        positions = [self.local(body, position) for body, position in zip(bodies, places, strict=True)]
+        return array_namespace(*positions).stack(positions)
 
-    def distance(self, one: str, two: str) -> Number:
+    def distance(self, pin1: str, pin2: str) -> Number:
         """Return the distance between two pins (m)."""
-        way = self.places[two] - self.places[one]
-        return array_namespace(way).sqrt(way @ way)
+        difference = self.places[pin2] - self.places[pin1]
+        return array_namespace(difference).sqrt(difference @ difference)
 
     def direction(self, on: str, along: Sequence[str], direction: Number | None) -> Number:
         """Return the direction of a line in the frame of a body (rad), given by two pins or by its angle in world coordinates."""
         if along:
-            way = self.places[along[1]] - self.places[along[0]]
-            direction = array_namespace(way).arctan2(way[1], way[0])
+            line = self.places[along[1]] - self.places[along[0]]
+            direction = array_namespace(line).arctan2(line[1], line[0])
         assert direction is not None  # one of them is given
         return direction - self.angle(on)
 

@@ -109,10 +109,10 @@ def scissor_lift(
 
     def places(s):
         x, y = length * unit_vector(s)
-        found = {f"middle{i}": (0.5 * x, (i + 0.5) * y) for i in range(stages)}
-        found |= {pin: (x * k, i * y) for k, side in enumerate((left, right)) for i, pin in enumerate(side)}
-        found["end"] = (0.0 * x + length, stages * y)
-        return {name: as_array(place) for name, place in found.items()}
+        positions = {f"middle{i}": (0.5 * x, (i + 0.5) * y) for i in range(stages)}
+        positions |= {pin: (x * k, i * y) for k, side in enumerate((left, right)) for i, pin in enumerate(side)}
+        positions["end"] = (0.0 * x + length, stages * y)
+        return {name: as_array(position) for name, position in positions.items()}
 
     links = {}
     for i in range(stages):

@@ -76,25 +76,27 @@ def excavator(
     def extents_and_energy(s):
         """Return the lengths of the cylinders (m) and the potential energy of the weights (J)."""
         placed = pose(s)
-        frames = {GROUND: GROUND_FRAME} | {name: Frame.at(*place) for name, place in zip(names, placed, strict=True)}
-        ways = [between(points, *(frames[n] for n in pair)) for pair, points in cylinders.values()]
+        frames = {GROUND: GROUND_FRAME} | {
+            name: Frame.at(*pose_of_body) for name, pose_of_body in zip(names, placed, strict=True)
+        }
+        vectors = [between(points, *(frames[n] for n in pair)) for pair, points in cylinders.values()]
         energy = gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, placed, strict=True))
-        squares = as_array([way.dot(way) for way in ways])
+        squares = as_array([vector.dot(vector) for vector in vectors])
         return array_namespace(squares).sqrt(squares), energy
 
     # Free minus actual length of each cylinder, by the principle of virtual work over the three angles.
     start = as_array(angles)
-    values, rates = zip(*(derivative(extents_and_energy, start, along) for along in np.eye(3)), strict=True)
+    values, rates = zip(*(derivative(extents_and_energy, start, direction) for direction in np.eye(3)), strict=True)
     length, virtual_work = values[0][0], as_array([energy for _, energy in rates])
     arms = as_array([extents for extents, _ in rates])
-    shorter = array_namespace(arms, virtual_work).linalg.solve(arms, virtual_work) / as_array(stiffness)
-    half = 0.5 * as_array(strokes)
+    shortening = array_namespace(arms, virtual_work).linalg.solve(arms, virtual_work) / as_array(stiffness)
+    half_stroke = 0.5 * as_array(strokes)
     drivers = {
-        name: Driver(pair, "distance", Sine(half[k], frequencies[k], -np.pi / 2, length[k] + half[k]), points)
+        name: Driver(pair, "distance", Sine(half_stroke[k], frequencies[k], -np.pi / 2, length[k] + half_stroke[k]), points)
         for k, (name, (pair, points)) in enumerate(cylinders.items())
     }
     springs = {
-        name: Spring(pair, points, stiffness[k], length[k] + shorter[k], damping[k])
+        name: Spring(pair, points, stiffness[k], length[k] + shortening[k], damping[k])
         for k, (name, (pair, points)) in enumerate(cylinders.items())
     }
     physics = [uniform_rod(mass, k) for mass, k in zip(masses, (boom, stick, rocker, link, bucket), strict=True)]
@@ -117,7 +119,7 @@ def excavator(
 
 def _points(places, length) -> dict[str, Numbers]:
     """Return the points of a body in its own frame, relative to its centre of mass."""
-    return {name: length * (np.array(place) - np.array(places["centre"])) for name, place in places.items()}
+    return {name: length * (np.array(point) - np.array(places["centre"])) for name, point in places.items()}
 
 
 def _spot(placed, local):

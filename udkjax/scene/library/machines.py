@@ -51,8 +51,8 @@ def peaucellier(
     lengths = (r, a, a, b, b, b, b)
     ends = {name: ((-0.5 * length, 0.0), (0.5 * length, 0.0)) for name, length in zip(names, lengths, strict=True)}
 
-    def pin(one, end, two, other):
-        return Revolute((one, two), [ends[one][end], ends[two][other]])
+    def pin(bar1, end1, bar2, end2):
+        return Revolute((bar1, bar2), [ends[bar1][end1], ends[bar2][end2]])
 
     joints = {
         "Q": Revolute((GROUND, "crank"), [(r, 0.0), ends["crank"][0]]),
@@ -87,21 +87,21 @@ def planetary_gear(
     """
     r, p = sun, planet
     ring, reach = r + 2 * p, r + p
-    spots = [2 * np.pi * i / planets for i in range(planets)]
+    angles = [2 * np.pi * i / planets for i in range(planets)]
 
     def pose(s):
-        turned = s * r / (r + ring)  # the carrier
-        spin = turned - (s - turned) * r / p
-        centres = [(reach * unit_vector(turned + spot), spin) for spot in spots]
-        return [(np.zeros(2), s), *centres, (np.zeros(2), turned)]
+        carrier_angle = s * r / (r + ring)  # the carrier
+        spin = carrier_angle - (s - carrier_angle) * r / p
+        centres = [(reach * unit_vector(carrier_angle + angle), spin) for angle in angles]
+        return [(np.zeros(2), s), *centres, (np.zeros(2), carrier_angle)]
 
     joints: dict[str, Joint] = {
         "sun axle": Revolute((GROUND, "sun"), ORIGINS),
         "carrier axle": Revolute((GROUND, "carrier"), ORIGINS),
     }
-    for i, spot in enumerate(spots):
+    for i, angle in enumerate(angles):
         name = f"planet{i + 1}"
-        joints[f"axle{i + 1}"] = Revolute(("carrier", name), [(reach * np.cos(spot), reach * np.sin(spot)), (0.0, 0.0)])
+        joints[f"axle{i + 1}"] = Revolute(("carrier", name), [(reach * np.cos(angle), reach * np.sin(angle)), (0.0, 0.0)])
         joints[f"sun mesh{i + 1}"] = Gear(("sun", name), [r, p], carrier="carrier")
         joints[f"ring mesh{i + 1}"] = Gear((GROUND, name), [ring, p], internal=True, carrier="carrier")
     physics = [uniform_disc(masses[0], r), *[uniform_disc(masses[1], p)] * planets, uniform_disc(masses[2], reach)]

@@ -58,17 +58,19 @@ def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -
         return jax.jvp(function, (number(s),), (number(rate),))
     axes = np.eye(np.size(s)).reshape(-1, *np.shape(s))
     slopes = [jax.tree.map(np.imag, function(s + 1j * COMPLEX_STEP * axis)) for axis in axes]
-    rates = [r / COMPLEX_STEP for r in as_array(rate).ravel()]
-    return value, jax.tree.map(lambda *along: sum(slope * r for slope, r in zip(along, rates, strict=True)), *slopes)
+    rates = [component / COMPLEX_STEP for component in as_array(rate).ravel()]
+    return value, jax.tree.map(
+        lambda *partials: sum(slope * component for slope, component in zip(partials, rates, strict=True)), *slopes
+    )
 
 
 def bodies_on_pose(
     names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: OneOrMore, rate: OneOrMore
 ) -> dict[str, Body]:
     """Make bodies from their (mass, inertia), at pose(s) = [(position, angle), ...], with velocities from the rate of s."""
-    places, rates = derivative(pose, as_array(s), rate)
-    bodies = zip(names, physics, places, rates, strict=True)
-    return {name: Body(mass, inertia, *place, *speed) for name, (mass, inertia), place, speed in bodies}
+    poses, rates = derivative(pose, as_array(s), rate)
+    bodies = zip(names, physics, poses, rates, strict=True)
+    return {name: Body(mass, inertia, *body_pose, *body_rate) for name, (mass, inertia), body_pose, body_rate in bodies}
 
 
 def as_array(numbers: OneOrMore) -> Array | np.ndarray:
@@ -114,11 +116,11 @@ def hanging_rod_pose(pivot, length, angle):
 def apex(start, end, a, b):
     """Return the point at distances a from start and b from end, to the left of the line from start to end."""
     xp = array_namespace(start, end, a, b)
-    along = end - start
-    square = along @ along
+    base = end - start
+    square = base @ base
     x = (square + a**2 - b**2) / (2 * square)
     y = xp.sqrt(a**2 / square - x**2)
-    return start + x * along + y * as_array([-along[1], along[0]])
+    return start + x * base + y * as_array([-base[1], base[0]])
 
 
 def gravity_vector(gravity: ArrayLike) -> Float[Array, "2"]:

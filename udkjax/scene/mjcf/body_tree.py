@@ -38,7 +38,7 @@ class TreeGeom(NamedTuple):
 
 def unique_name(name: str, taken: Container[str]) -> str:
     """Return a name, with a number appended if it is taken."""
-    return next(found for k in count(1) if (found := name if k == 1 else f"{name}-{k}") not in taken)
+    return next(candidate for k in count(1) if (candidate := name if k == 1 else f"{name}-{k}") not in taken)
 
 
 class TreeBody:
@@ -90,14 +90,14 @@ class BodyTree:
     def masses_of(self, host: int) -> list[SpaceMass]:
         """Return the masses of a body and of the bodies fixed to it."""
         chosen, (low, high) = self.settings.mass_from_geoms, self.settings.mass_groups
-        found: list[SpaceMass] = []
+        masses: list[SpaceMass] = []
         for body in (body for k, body in enumerate(self.bodies) if k and self.hosts[k] == host):
             if chosen == "false" or (chosen == "auto" and body.given):
-                found += body.given
+                masses += body.given
             else:
                 shapes = [shape for shape in body.geoms if low <= shape[0].number("group") <= high]
-                found += [mass for mass in (geom_mass(*shape) for shape in shapes) if mass]
-        return found
+                masses += [mass for mass in (geom_mass(*shape) for shape in shapes) if mass]
+        return masses
 
     def moving(self) -> Iterator[tuple[int, TreeBody]]:
         """Iterate over the bodies that have joints, with their indices."""
@@ -142,16 +142,16 @@ class BodyTree:
             self.bodies[body].joints.append(self.joints[name])
 
     def _add_site(self, read: AttributeReader, body: int, frame: SpaceFrame) -> None:
-        found = self.settings.frame(read)
+        site_frame = self.settings.frame(read)
         if "fromto" in read:
-            found = found._replace(origin=read.numbers("fromto", np.zeros(6)).reshape(2, 3).mean(axis=0))
-        self.sites[read.text("name")] = body, frame.within(found)
+            site_frame = site_frame._replace(origin=read.numbers("fromto", np.zeros(6)).reshape(2, 3).mean(axis=0))
+        self.sites[read.text("name")] = body, frame.within(site_frame)
 
     def _add_geom(self, read: AttributeReader, body: int, frame: SpaceFrame) -> None:
         inside = frame if "fromto" in read else frame.within(self.settings.frame(read))
-        kind, size, place = geom_shape(read, inside)
-        self.bodies[body].geoms.append((read, kind, size, place))
+        kind, size, geom_frame = geom_shape(read, inside)
+        self.bodies[body].geoms.append((read, kind, size, geom_frame))
         reach = float(np.linalg.norm(size)) if kind in ("box", "ellipsoid", "cylinder") else float(np.sum(size[:2]))
         types = int(read.number("contype", 1)), int(read.number("conaffinity", 1))
         name = read.text("name") or f"{kind} (line {read.element.line})"
-        self.geoms.append(TreeGeom(name, body, types, place.origin, reach if np.any(size) else np.inf))
+        self.geoms.append(TreeGeom(name, body, types, geom_frame.origin, reach if np.any(size) else np.inf))

@@ -57,12 +57,12 @@ class CoupledLengths:
         return CoupledLength(*lengths, angles={holder: -sign, body: sign})
 
     def _tendon_length(self, read: AttributeReader) -> CoupledLength | None:
-        parts = [AttributeReader(child, child.attributes, self.settings.problems) for child in read.element.children]
+        readers = [AttributeReader(child, child.attributes, self.settings.problems) for child in read.element.children]
         if read.element.tag == "fixed":
-            found = [(self.named_joint(part, "joint"), part.number("coef")) for part in parts]
-            length = self.sum_lengths([(joint, coef) for joint, coef in found if joint], read)
+            terms = [(self.named_joint(reader, "joint"), reader.number("coef")) for reader in readers]
+            length = self.sum_lengths([(joint, coef) for joint, coef in terms if joint], read)
         else:
-            length = self._distance(parts, read)
+            length = self._distance(readers, read)
         given = read.numbers("springlength", (-1.0, -1.0), fewest=1)
         if "springlength" in read and len(read.text("springlength").split()) == 2 and given[1] > given[0]:
             read.refuse("a springlength of two different values, between which a tendon is slack, is not taken over")
@@ -80,14 +80,14 @@ class CoupledLengths:
             read.refuse("a spatial tendon between two sites is a spring; over more sites, geoms or pulleys it is not taken over")
             return None
         known = self.model.tree.sites
-        found = [known[site.text("site")] for site in sites if self.model.tree.find(site, "site", known, "site")]
-        if len(found) < 2:
+        located = [known[site.text("site")] for site in sites if self.model.tree.find(site, "site", known, "site")]
+        if len(located) < 2:
             return None
-        (one, first), (two, second) = found
-        if abs((second.origin - first.origin) @ self.model.plane.normal) > AXES_TOL * self.model.size:
+        (body1, frame1), (body2, frame2) = located
+        if abs((frame2.origin - frame1.origin) @ self.model.plane.normal) > AXES_TOL * self.model.size:
             read.refuse("its sites are not at one height above the plane of the motion")
         hosts = self.model.tree.hosts
-        return Ends((hosts[one], hosts[two]), (self.model.plane.flat(first.origin), self.model.plane.flat(second.origin)))
+        return Ends((hosts[body1], hosts[body2]), (self.model.plane.flat(frame1.origin), self.model.plane.flat(frame2.origin)))
 
     def sum_lengths(self, terms: list[tuple[CoupledLength, float]], read: AttributeReader) -> CoupledLength | None:
         """Return a weighted sum of coordinates; if slides are among them, refuse it and return None."""
@@ -98,10 +98,10 @@ class CoupledLengths:
             return None
         angles: dict[int, float] = {}
         for term, factor in terms:
-            for body, part in term.angles.items():
-                angles[body] = angles.get(body, 0.0) + factor * part
+            for body, coefficient in term.angles.items():
+                angles[body] = angles.get(body, 0.0) + factor * coefficient
         largest = max(map(abs, angles.values()), default=0.0)
-        angles = {body: part for body, part in sorted(angles.items()) if abs(part) > EVEN * largest}
+        angles = {body: coefficient for body, coefficient in sorted(angles.items()) if abs(coefficient) > EVEN * largest}
         length, at_rest = (sum(factor * getattr(term, name) for term, factor in terms) for name in ("length", "at_rest"))
         if min(angles, default=0) < 0:
             read.refuse("couples one of the two hinges of a body: not taken over")

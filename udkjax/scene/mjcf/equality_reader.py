@@ -52,12 +52,12 @@ class EqualityReader:
         """Return the points that an equality joins, and the rotation (3, 3) of body 2 from its position in the file."""
         tree, turned = self.model.tree, np.eye(3)
         if "site1" in read or "site2" in read:
-            found = [tree.find(read, f"site{k}", tree.sites, "site") or (0, tree.bodies[0].frame) for k in (1, 2)]
-            (one, first), (two, second) = found
-            points, turned = (first.origin, second.origin), first.axes @ second.axes.T
+            located = [tree.find(read, f"site{k}", tree.sites, "site") or (0, tree.bodies[0].frame) for k in (1, 2)]
+            (body1, frame1), (body2, frame2) = located
+            points, turned = (frame1.origin, frame2.origin), frame1.axes @ frame2.axes.T
         else:
-            one, two = tree.index_of(read, "body1", ""), tree.index_of(read, "body2")
-            frames = {"body1": tree.bodies[one].frame, "body2": tree.bodies[two].frame}
+            body1, body2 = tree.index_of(read, "body1", ""), tree.index_of(read, "body2")
+            frames = {"body1": tree.bodies[body1].frame, "body2": tree.bodies[body2].frame}
             anchor = frames[anchored].point(read.numbers("anchor", (0.0, 0.0, 0.0)))
             points = anchor, anchor
             pose = read.numbers("relpose", (0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -67,17 +67,17 @@ class EqualityReader:
                 points, turned = (wanted.origin, anchor), wanted.axes @ frames["body2"].axes.T
         if abs((points[1] - points[0]) @ self.model.plane.normal) > AXES_TOL * self.model.size:
             read.refuse("its two points are not at one height above the plane of the motion")
-        if tree.hosts[one] == tree.hosts[two]:
+        if tree.hosts[body1] == tree.hosts[body2]:
             read.refuse("connects a body to itself")
         flat = self.model.plane.flat(points[0]), self.model.plane.flat(points[1])
-        return Ends((tree.hosts[one], tree.hosts[two]), flat), turned
+        return Ends((tree.hosts[body1], tree.hosts[body2]), flat), turned
 
     def _add_joint(self, read: AttributeReader) -> None:
         offset, slope = self._line(read)
-        one = self.lengths.named_joint(read, "joint1")
-        two = self.lengths.named_joint(read, "joint2") if "joint2" in read else None
-        terms = [(length, factor) for length, factor in ((one, 1.0), (two, -slope)) if length]
-        if one and (two or "joint2" not in read):
+        length1 = self.lengths.named_joint(read, "joint1")
+        length2 = self.lengths.named_joint(read, "joint2") if "joint2" in read else None
+        terms = [(length, factor) for length, factor in ((length1, 1.0), (length2, -slope)) if length]
+        if length1 and (length2 or "joint2" not in read):
             self._hold(read, self.lengths.sum_lengths(terms, read), offset)
 
     def _add_tendon(self, read: AttributeReader) -> None:
@@ -87,10 +87,10 @@ class EqualityReader:
         self._hold(read, self.lengths.named_tendon(read, "tendon1"), offset)
 
     def _line(self, read: AttributeReader) -> tuple[float, float]:
-        found = read.numbers("polycoef", (0.0, 1.0, 0.0, 0.0, 0.0), fewest=1)
-        if found[2:].any():
+        coefficients = read.numbers("polycoef", (0.0, 1.0, 0.0, 0.0, 0.0), fewest=1)
+        if coefficients[2:].any():
             read.refuse(f"polycoef={quote(read.text('polycoef'))} is not linear: only its first two numbers are taken over")
-        return float(found[0]), float(found[1])
+        return float(coefficients[0]), float(coefficients[1])
 
     def _hold(self, read: AttributeReader, length: CoupledLength | None, offset: float) -> None:
         """Add the joint that fixes a length at its value in the file plus an offset."""
@@ -100,9 +100,9 @@ class EqualityReader:
         if length.ends:
             self._put_joint(read, length.ends, Distance(*self.model.attached(length.ends), length.ends.distance + offset))
         elif len(angles) == 2:
-            (one, _), (two, factor) = angles.items()
-            angle = self.model.relative_angle(one, two) + offset / factor
-            self.joints[self._joint_name(read)] = Angle(self.model.names((one, two)), angle)
+            (body1, _), (body2, factor) = angles.items()
+            angle = self.model.relative_angle(body1, body2) + offset / factor
+            self.joints[self._joint_name(read)] = Angle(self.model.names((body1, body2)), angle)
         elif len(angles) == 3:
             turned = sum(factor * self._motions[body].angle for body, factor in angles.items())
             if offset or abs(turned) > MESHED * max(map(abs, angles.values())):
@@ -111,10 +111,10 @@ class EqualityReader:
                 )
             # The three factors add up to zero, so that any body may be the carrier: the ground, or that with the largest factor.
             carrier = 0 if 0 in angles else max(angles, key=lambda body: abs(angles[body]))
-            one, two = (body for body in angles if body != carrier)
-            radii, internal = (abs(angles[one]), abs(angles[two])), angles[one] * angles[two] < 0
+            body1, body2 = (body for body in angles if body != carrier)
+            radii, internal = (abs(angles[body1]), abs(angles[body2])), angles[body1] * angles[body2] < 0
             self.joints[self._joint_name(read)] = Gear(
-                self.model.names((one, two)), radii, internal, self.model.names((carrier,))[0]
+                self.model.names((body1, body2)), radii, internal, self.model.names((carrier,))[0]
             )
         else:
             read.refuse("holds a slide, or couples more than three bodies: not taken over")

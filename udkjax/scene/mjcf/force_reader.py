@@ -117,29 +117,29 @@ class ForceReader:
         elif length.ends and constant is None:
             self._put(name, Spring(*self.model.attached(length.ends), stiffness, max(at_rest, 0.0), damping or None))
         elif len(length.angles) == 2 and min(length.angles) >= 0:
-            (one, _), (two, factor) = length.angles.items()
-            bodies, angle = self.model.names((one, two)), self.model.relative_angle(one, two)
+            (body1, _), (body2, factor) = length.angles.items()
+            bodies, angle = self.model.names((body1, body2)), self.model.relative_angle(body1, body2)
             if stiffness or damping:
                 free = angle + (at_rest - length.length) / factor
                 self._put(name, TorsionSpring(bodies, factor**2 * stiffness, factor**2 * damping or None, free))
             if constant is not None:
                 self._put(name, Torque(bodies, factor * constant))
         else:
-            what = "with a constant force between two sites" if length.ends else "on angles of more bodies than two"
-            read.refuse(f"acts {what}, or on one of two hinges of a body: not taken over")
+            action = "with a constant force between two sites" if length.ends else "on angles of more bodies than two"
+            read.refuse(f"acts {action}, or on one of two hinges of a body: not taken over")
 
     def _add_slide_force(self, name: str, length: CoupledLength, read: AttributeReader, force: LinearForce) -> None:
         stiffness, damping, at_rest, constant = force
         joint = length.slide
         assert joint is not None
-        held, holder = joint.body, self.model.holder(joint.body)
-        kinds = "".join(j.kind[0] for j in self.model.tree.bodies[held].joints)
-        hinges = [j for j in self.model.tree.bodies[held].joints if j.kind == "hinge"]
+        slider, holder = joint.body, self.model.holder(joint.body)
+        kinds = "".join(j.kind[0] for j in self.model.tree.bodies[slider].joints)
+        hinges = [j for j in self.model.tree.bodies[slider].joints if j.kind == "hinge"]
         pin, axis = self.model.plane.flat((hinges or [joint])[0].anchor), self.model.plane.flat(joint.axis)
         if kinds not in ("s", "sh", "hs"):
             read.refuse("acts on a slide of a body that has several: not taken over")
             return
-        owner, other, axis = (held, holder, -axis) if kinds == "hs" else (holder, held, axis)
+        owner, other, axis = (slider, holder, -axis) if kinds == "hs" else (holder, slider, axis)
         bodies, end = self.model.names((owner, other)), self.model.local(other, pin)
         if stiffness:  # with zero length, from the rest position: linear along the slide in both directions
             self._put(

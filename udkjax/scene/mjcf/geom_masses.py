@@ -82,6 +82,6 @@ def geom_mass(read: AttributeReader, kind: str, size: np.ndarray, frame: SpaceFr
 
 def sum_masses(masses: list[SpaceMass], axis: np.ndarray) -> tuple[float, np.ndarray, float]:
     """Return mass (kg), centre (3,) (m), and moment of inertia (kg m^2) about the line through the centre along a unit axis."""
-    mass = sum(each.mass for each in masses)
-    centre = sum((each.mass * each.centre for each in masses), np.zeros(3)) / (mass or 1.0)
-    return mass, centre, sum(each.about(axis, centre) for each in masses)
+    mass = sum(part.mass for part in masses)
+    centre = sum((part.mass * part.centre for part in masses), np.zeros(3)) / (mass or 1.0)
+    return mass, centre, sum(part.about(axis, centre) for part in masses)

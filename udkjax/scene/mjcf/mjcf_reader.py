@@ -78,12 +78,12 @@ def mechanism_of_text(
     model = PlaneModel(tree, plane)
     values, rates, controls = _initial_state(root, model, key)
     motions = model.motions(values, rates)
-    held = {name: joint for name, body, joints in model.named_joints() if (joint := _tree_joint(model, body, joints))}
+    tree_joints = {name: joint for name, body, joints in model.named_joints() if (joint := _tree_joint(model, body, joints))}
     lengths = CoupledLengths(root, model)
     forces = ForceReader(root, lengths, controls, leave_out).forces
-    loops = EqualityReader(root, lengths, motions, list(held)).joints
+    loops = EqualityReader(root, lengths, motions, list(tree_joints)).joints
     bodies = {model.bodies[k].name: _body(model, k, motions[k]) for k, _ in tree.moving()}
-    joints = held | loops
+    joints = tree_joints | loops
     for name, body, of_body in model.named_joints():
         for joint in of_body:
             _add_armature(model, joint, name, body, bodies, joints)
@@ -116,11 +116,11 @@ def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tupl
         return {}, {}, {}
     read = AttributeReader(element, element.attributes, problems)
     actuators = [child.attributes.get("name", "") for child in merge_parts(root, ("actuator",)).children]
-    found = []
+    values = []
     for attribute, names in (("qpos", joints), ("qvel", joints), ("ctrl", actuators)):
         given = attribute in read and names
-        found.append(dict(zip(names, read.numbers(attribute, np.zeros(len(names))).tolist(), strict=True)) if given else {})
-    return tuple(found)
+        values.append(dict(zip(names, read.numbers(attribute, np.zeros(len(names))).tolist(), strict=True)) if given else {})
+    return tuple(values)
 
 
 def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint | None:
@@ -155,10 +155,10 @@ def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint 
 def _body(model: PlaneModel, number: int, motion: PlaneMotion) -> Body:
     """Return a moving body in its initial state."""
     body = model.bodies[number]
-    place = motion.point(body.centre)
-    speed = motion.velocity(place)
+    centre = motion.point(body.centre)
+    velocity = motion.velocity(centre)
     angle = body.angle + motion.angle
-    return Body(body.mass, body.inertia, (place.real, place.imag), angle, (speed.real, speed.imag), motion.omega)
+    return Body(body.mass, body.inertia, (centre.real, centre.imag), angle, (velocity.real, velocity.imag), motion.omega)
 
 
 def _add_armature(
@@ -176,8 +176,8 @@ def _add_armature(
     armature, holder = joint.read.number("armature"), model.holder(number)
     if not armature:
         return
-    one, two = model.names((holder, number))
-    body, alone = bodies[two], len(model.tree.bodies[number].joints) == 1
+    body1, body2 = model.names((holder, number))
+    body, alone = bodies[body2], len(model.tree.bodies[number].joints) == 1
     if armature < 0:
         joint.read.refuse("armature must not be negative")
     elif model.has_rod(number):
@@ -188,28 +188,28 @@ def _add_armature(
             joint.read.refuse(
                 "the armature of a slide is taken over on the ground and across gravity, of a body without other joints"
             )
-        bodies[two] = replace(body, mass=body.mass + armature)
+        bodies[body2] = replace(body, mass=body.mass + armature)
     elif not holder:
-        bodies[two] = replace(body, inertia=body.inertia + armature)
+        bodies[body2] = replace(body, inertia=body.inertia + armature)
     else:
-        carrier, ratio = bodies[one], float(1 + 2 * armature / body.inertia)
+        carrier, ratio = bodies[body1], float(1 + 2 * armature / body.inertia)
         spin = carrier.angular_velocity + ratio * (body.angular_velocity - carrier.angular_velocity)
         rotor, axle = unique_name(f"{joint.name} rotor", bodies), unique_name(f"{joint.name} axle", joints)
         mass = ROTOR_MASS * carrier.mass
         inertia = body.inertia / (2 * ratio)  # A / (N (N - 1))
         bodies[rotor] = Body(mass, inertia, carrier.position, carrier.angle, carrier.velocity, spin)
-        bodies[one] = replace(carrier, mass=carrier.mass - mass, inertia=carrier.inertia + armature / ratio)
-        bodies[two] = replace(body, inertia=body.inertia / 2)
-        joints[axle] = Revolute((one, rotor), [(0.0, 0.0), (0.0, 0.0)])
-        joints[unique_name(f"{joint.name} gear", joints)] = Gear((rotor, two), (1.0, ratio), internal=True, carrier=one)
+        bodies[body1] = replace(carrier, mass=carrier.mass - mass, inertia=carrier.inertia + armature / ratio)
+        bodies[body2] = replace(body, inertia=body.inertia / 2)
+        joints[axle] = Revolute((body1, rotor), [(0.0, 0.0), (0.0, 0.0)])
+        joints[unique_name(f"{joint.name} gear", joints)] = Gear((rotor, body2), (1.0, ratio), internal=True, carrier=body1)
 
 
 def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str, float]]:
     """Return the joints of loops that are open in the initial guess, and their gaps (m, rad)."""
-    found = []
+    gaps = []
     for name in loops:
         joint = mechanism.joints[name]
         frames = [GROUND_FRAME if body == GROUND else mechanism.bodies[body].frame() for body in joint.frame_names]
         gap = float(np.max(np.abs(np.asarray(joint.residual(0.0, *frames)))))
-        found += [(name, gap)] if gap > OPEN_LOOP * max(size, 1.0) else []
-    return found
+        gaps += [(name, gap)] if gap > OPEN_LOOP * max(size, 1.0) else []
+    return gaps

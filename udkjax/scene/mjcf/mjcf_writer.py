@@ -74,11 +74,11 @@ class _Writer:
         self.taken: set[str] = set()  # names of sites and tendons
         preferred = [name for kinds in IN_TREE for name, joint in mechanism.joints.items() if isinstance(joint, kinds)]
         self.tree = {edge.body: edge for edge in spanning_tree(mechanism, {name: k for k, name in enumerate(preferred)})}
-        held = {edge.joint for edge in self.tree.values()}
+        tree_joints = {edge.joint for edge in self.tree.values()}
         self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of each body
         self.joints = {name: self._joints(name) for name in self.tree}
         for name, joint in mechanism.joints.items():
-            if name not in held:
+            if name not in tree_joints:
                 self._add_loop(name, joint)
         for name, force in mechanism.forces.items():
             self._add_force(name, force)
@@ -121,63 +121,76 @@ class _Writer:
 
     def _joints(self, name: str) -> list[_TreeJoint]:
         """Return the hinges and slides between a body and its parent."""
-        _, parent, held = self.tree[name]
-        one, two = self.frames[parent], self.frames[name]
+        _, parent, joint_name = self.tree[name]
+        parent_frame, body_frame = self.frames[parent], self.frames[name]
         self.turns[name] = dict(self.turns[parent])
-        found: list[_TreeJoint] = []
+        hinges_and_slides: list[_TreeJoint] = []
 
         def hinge(title: str, pin: Point, rate: Number) -> None:
             self.turns[name][title] = 1.0
-            found.append(_TreeJoint(title, {"axis": NORMAL, "pos": _in_space(two.local((pin.x - two.x, pin.y - two.y)))}, rate))
+            hinges_and_slides.append(
+                _TreeJoint(
+                    title,
+                    {"axis": NORMAL, "pos": _in_space(body_frame.local((pin.x - body_frame.x, pin.y - body_frame.y)))},
+                    rate,
+                )
+            )
 
         def slide(title: str, direction: Point, pin: Point) -> None:
-            velocities = [frame.velocity(frame.local((pin.x - frame.x, pin.y - frame.y))) for frame in (one, two)]
+            velocities = [frame.velocity(frame.local((pin.x - frame.x, pin.y - frame.y))) for frame in (parent_frame, body_frame)]
             rate = direction.dot(Point(velocities[1].x - velocities[0].x, velocities[1].y - velocities[0].y))
-            found.append(_TreeJoint(title, {"type": "slide", "axis": _in_space(two.local(direction))}, rate))
+            hinges_and_slides.append(_TreeJoint(title, {"type": "slide", "axis": _in_space(body_frame.local(direction))}, rate))
 
-        turning = two.omega - one.omega
-        if not held:
-            slide(f"{name}.x", Point(1.0, 0.0), Point(two.x, two.y))
-            slide(f"{name}.y", Point(0.0, 1.0), Point(two.x, two.y))
-            hinge(f"{name}.angle", Point(two.x, two.y), turning)
-            return found
-        joint = self.mechanism.joints[held]
+        turning = body_frame.omega - parent_frame.omega
+        if not joint_name:
+            slide(f"{name}.x", Point(1.0, 0.0), Point(body_frame.x, body_frame.y))
+            slide(f"{name}.y", Point(0.0, 1.0), Point(body_frame.x, body_frame.y))
+            hinge(f"{name}.angle", Point(body_frame.x, body_frame.y), turning)
+            return hinges_and_slides
+        joint = self.mechanism.joints[joint_name]
         gap = float(np.max(np.abs(joint.residual(0.0, *(self.frames[body] for body in joint.bodies)))))
         if gap > OPEN_LOOP * max(self.size, 1.0):
             cure = "MJCF takes bodies where they stand: start them from `udk.assemble`"
-            self.problems.append(f"joint {quote(held)}: is open by {gap:.3g} (m, rad), and {cure}")
+            self.problems.append(f"joint {quote(joint_name)}: is open by {gap:.3g} (m, rad), and {cure}")
         first, second = (self.frames[body] for body in joint.bodies)
         if isinstance(joint, Revolute):
-            hinge(held, two.point(joint.points[joint.bodies.index(name)]), turning)
+            hinge(joint_name, body_frame.point(joint.points[joint.bodies.index(name)]), turning)
         elif isinstance(joint, Prismatic | Slot):
-            pin, along = second.point(joint.points[1]), first.vector((float(np.cos(joint.axis)), float(np.sin(joint.axis))))
-            slide(held if isinstance(joint, Prismatic) else f"{held}.slide", along, pin)
+            pin, slide_axis = second.point(joint.points[1]), first.vector((float(np.cos(joint.axis)), float(np.sin(joint.axis))))
+            slide(joint_name if isinstance(joint, Prismatic) else f"{joint_name}.slide", slide_axis, pin)
             if isinstance(joint, Slot):
-                hinge(held, pin, turning)
-                found = found if name == joint.bodies[1] else found[::-1]
+                hinge(joint_name, pin, turning)
+                hinges_and_slides = hinges_and_slides if name == joint.bodies[1] else hinges_and_slides[::-1]
         elif isinstance(joint, Distance):
-            ends = [two.point(joint.points[joint.bodies.index(name)]), one.point(joint.points[joint.bodies.index(parent)])]
+            ends = [
+                body_frame.point(joint.points[joint.bodies.index(name)]),
+                parent_frame.point(joint.points[joint.bodies.index(parent)]),
+            ]
             rod = Point(ends[0].x - ends[1].x, ends[0].y - ends[1].y)
-            rates = [frame.velocity(joint.points[joint.bodies.index(body)]) for frame, body in ((two, name), (one, parent))]
+            rates = [
+                frame.velocity(joint.points[joint.bodies.index(body)])
+                for frame, body in ((body_frame, name), (parent_frame, parent))
+            ]
             spin = (rod.x * (rates[0].y - rates[1].y) - rod.y * (rates[0].x - rates[1].x)) / rod.dot(rod)
-            hinge(f"{held}.rod", ends[1], spin - one.omega)
-            hinge(held, ends[0], two.omega - spin)
+            hinge(f"{joint_name}.rod", ends[1], spin - parent_frame.omega)
+            hinge(joint_name, ends[0], body_frame.omega - spin)
         elif isinstance(joint, Angle):
-            slide(f"{held}.x", Point(1.0, 0.0), Point(two.x, two.y))
-            slide(f"{held}.y", Point(0.0, 1.0), Point(two.x, two.y))
-        return found
+            slide(f"{joint_name}.x", Point(1.0, 0.0), Point(body_frame.x, body_frame.y))
+            slide(f"{joint_name}.y", Point(0.0, 1.0), Point(body_frame.x, body_frame.y))
+        return hinges_and_slides
 
     def _body_lines(self, name: str) -> list[str]:
         """Return the lines of a body, without its children and its end tag."""
-        body, one, two = self.mechanism.bodies[name], self.frames[self.tree[name].holder], self.frames[name]
-        place = _in_space(one.local((two.x - one.x, two.y - one.y)))
+        body, parent_frame, body_frame = self.mechanism.bodies[name], self.frames[self.tree[name].holder], self.frames[name]
+        angle = body_frame.angle - parent_frame.angle
+        position = _in_space(parent_frame.local((body_frame.x - parent_frame.x, body_frame.y - parent_frame.y)))
         inertia = _numbers(body.inertia, body.inertia, body.inertia)
         radius = 0.5 * THICKNESS * self.size
         points = [Point(*np.asarray(point).tolist()) for _, point in attachments(self.mechanism, name)]
         ends = {_in_space(point) for point in points if point.norm() > radius}
         look = {"mass": "0", "contype": "0", "conaffinity": "0", "size": _numbers(radius)}
         return [
-            f"<body{_attributes(name=name, pos=place, axisangle=f'{NORMAL} {_numbers(two.angle - one.angle)}')}>",
+            f"<body{_attributes(name=name, pos=position, axisangle=f'{NORMAL} {_numbers(angle)}')}>",
             *(f"  <joint{_attributes(name=j.name, **j.attributes, **self.springs.get(j.name, {}))}/>" for j in self.joints[name]),
             f"  <inertial{_attributes(pos='0 0 0', mass=_numbers(body.mass), diaginertia=inertia)}/>",
             *(f"  <geom{_attributes(type='capsule', fromto=f'0 0 0 {end}', **look)}/>" for end in sorted(ends)),
@@ -192,21 +205,21 @@ class _Writer:
         if isinstance(joint, Revolute | Weld):
             kind = "connect" if isinstance(joint, Revolute) else "weld"
             angle = float(joint.angle) if isinstance(joint, Weld) else 0.0  # of body 2 relative to body 1
-            one, two = self._add_sites(name, joint.bodies, joint.points, angle)
-            section.append(f"<{kind}{_attributes(name=name, site1=one, site2=two)}/>")
+            first_name, second_name = self._add_sites(name, joint.bodies, joint.points, angle)
+            section.append(f"<{kind}{_attributes(name=name, site1=first_name, site2=second_name)}/>")
         elif isinstance(joint, Distance):
             tendon = self._add_spatial(name, joint.bodies, joint.points)
             offset = float(joint.length) - between(joint.points, *(self.frames[body] for body in joint.bodies)).norm()
             section.append(f"<tendon{_attributes(name=name, tendon1=tendon, polycoef=_numbers(offset, 0.0))}/>")
         elif isinstance(joint, Gear | Angle):
-            one, two = joint.bodies
+            first_name, second_name = joint.bodies
             if isinstance(joint, Gear):
                 first, second = float(joint.radii[0]), float(joint.radii[1]) * (-1 if joint.internal else 1)
-                parts, offset = {one: first, two: second, joint.carrier: -first - second}, 0.0
+                factors, offset = {first_name: first, second_name: second, joint.carrier: -first - second}, 0.0
             else:
-                parts = {two: 1.0, one: -1.0}
-                offset = float(joint.angle - self.frames[two].angle + self.frames[one].angle)
-            if tendon := self._add_fixed(name, self._hinges(parts), "joint"):
+                factors = {second_name: 1.0, first_name: -1.0}
+                offset = float(joint.angle - self.frames[second_name].angle + self.frames[first_name].angle)
+            if tendon := self._add_fixed(name, self._hinges(factors), "joint"):
                 section.append(f"<tendon{_attributes(name=name, tendon1=tendon, polycoef=_numbers(offset, 0.0))}/>")
         else:
             closes = " that closes a loop" if isinstance(joint, Slot | Prismatic) else ""
@@ -216,8 +229,8 @@ class _Writer:
         if any(isinstance(value, Held) for value in vars(force).values()):
             self.problems.append(f"force {quote(name)}: MJCF has no samples; give a number, and MuJoCo the samples as controls")
         elif isinstance(force, Spring):
-            rest = {"springlength": _numbers(force.length), "stiffness": _numbers(force.stiffness)}
-            self._add_spatial(name, force.bodies, force.points, **rest, **_damping(force.damping))
+            attributes = {"springlength": _numbers(force.length), "stiffness": _numbers(force.stiffness)}
+            self._add_spatial(name, force.bodies, force.points, **attributes, **_damping(force.damping))
         elif isinstance(force, TorsionSpring | Torque):
             self._add_turning(name, force)
         else:
@@ -225,45 +238,45 @@ class _Writer:
 
     def _add_turning(self, name: str, force: Any) -> None:
         """Add a torsion spring, or a torque, to the hinge between its bodies, or to a tendon over several hinges."""
-        one, two = force.bodies
-        hinges = self._hinges({two: 1.0, one: -1.0})
-        (hinge, sign), *others = [*hinges.items(), ("", 0.0)]
-        alone = len(others) == 1 and abs(sign) == 1
+        body1, body2 = force.bodies
+        hinges = self._hinges({body2: 1.0, body1: -1.0})
+        (hinge, sign), *further = [*hinges.items(), ("", 0.0)]
+        is_single = len(further) == 1 and abs(sign) == 1
         if (value := getattr(force, "value", None)) is not None:  # a torque
-            tendon = "" if alone else self._add_fixed(name, hinges, "force")
-            target = {"joint": hinge, "gear": _numbers(sign)} if alone else {"tendon": tendon}
-            if alone or tendon:
+            tendon = "" if is_single else self._add_fixed(name, hinges, "force")
+            target = {"joint": hinge, "gear": _numbers(sign)} if is_single else {"tendon": tendon}
+            if is_single or tendon:
                 self.sections["actuator"].append(f"<motor{_attributes(name=name, **target)}/>")
                 self.controls.append(float(value))
             return
-        rest = float(force.angle - self.frames[two].angle + self.frames[one].angle)
+        free_angle = float(force.angle - self.frames[body2].angle + self.frames[body1].angle)
         spring = {"stiffness": _numbers(force.stiffness)} | _damping(force.damping)
-        if alone and hinge not in self.springs:
-            self.springs[hinge] = {"springref": _numbers(sign * rest), **spring}
+        if is_single and hinge not in self.springs:
+            self.springs[hinge] = {"springref": _numbers(sign * free_angle), **spring}
         else:
-            turned = -1.0 if rest < 0 else 1.0  # a springlength of -1 means the length in the position of the file
-            parts = {joint: turned * part for joint, part in hinges.items()}
-            self._add_fixed(name, parts, "force", springlength=_numbers(abs(rest)), **spring)
+            direction = -1.0 if free_angle < 0 else 1.0  # a springlength of -1 means the length in the position of the file
+            factors = {joint: direction * factor for joint, factor in hinges.items()}
+            self._add_fixed(name, factors, "force", springlength=_numbers(abs(free_angle)), **spring)
 
     def _hinges(self, parts: dict[str, float]) -> dict[str, float]:
         """Return a weighted sum of angles of bodies as a weighted sum of hinges."""
-        found: dict[str, float] = {}
+        hinges: dict[str, float] = {}
         for body, factor in parts.items():
-            for hinge, part in self.turns[body].items():
-                found[hinge] = found.get(hinge, 0.0) + factor * part
-        least = EVEN * max(map(abs, found.values()), default=0.0)
-        return {hinge: part for hinge, part in found.items() if abs(part) > least}
+            for hinge, weight in self.turns[body].items():
+                hinges[hinge] = hinges.get(hinge, 0.0) + factor * weight
+        threshold = EVEN * max(map(abs, hinges.values()), default=0.0)
+        return {hinge: weight for hinge, weight in hinges.items() if abs(weight) > threshold}
 
-    def _add_fixed(self, name: str, hinges: dict[str, float], what: str, **attributes: str) -> str:
+    def _add_fixed(self, name: str, hinges: dict[str, float], kind: str, **attributes: str) -> str:
         """Add a tendon that is a sum of hinges; return its name, or an empty text if the sum is empty."""
         if not hinges:
             self.problems.append(
-                f"{what} {quote(name)}: its bodies do not turn against each other, and MJCF knows angles of hinges alone"
+                f"{kind} {quote(name)}: its bodies do not turn against each other, and MJCF knows angles of hinges alone"
             )
             return ""
         title = self._unique(name)
-        parts = "".join(f"<joint{_attributes(joint=hinge, coef=_numbers(part))}/>" for hinge, part in hinges.items())
-        self.sections["tendon"].append(f"<fixed{_attributes(name=title, **attributes)}>{parts}</fixed>")
+        joint_tags = "".join(f"<joint{_attributes(joint=hinge, coef=_numbers(factor))}/>" for hinge, factor in hinges.items())
+        self.sections["tendon"].append(f"<fixed{_attributes(name=title, **attributes)}>{joint_tags}</fixed>")
         return title
 
     def _add_spatial(self, name: str, bodies: Sequence[str], points: Array | np.ndarray, **attributes: str) -> str:
@@ -282,9 +295,9 @@ class _Writer:
         return titles
 
     def _unique(self, name: str) -> str:
-        found = unique_name(name, self.taken)
-        self.taken.add(found)
-        return found
+        unique = unique_name(name, self.taken)
+        self.taken.add(unique)
+        return unique
 
 
 def _damping(value: object) -> Attributes:

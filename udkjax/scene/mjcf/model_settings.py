@@ -42,12 +42,14 @@ class ModelSettings:
             name = element.attributes.get("class", MAIN if at_top else "")
             if not name or (at_top and name != MAIN):
                 problems.append(f"{element.where}: class={quote(name)}: it is main at the top, and needs a name of its own below")
-            found = self._defaults.setdefault(name, {tag: dict(values) for tag, values in self._defaults[parent].items()})
+            class_defaults = self._defaults.setdefault(
+                name, {tag: dict(values) for tag, values in self._defaults[parent].items()}
+            )
             for child in element.children:
                 if child.tag == "default":
                     pending.append((child, name))
                 else:
-                    found.setdefault(child.tag, {}).update(child.attributes)
+                    class_defaults.setdefault(child.tag, {}).update(child.attributes)
 
     def read(self, element: XmlElement, childclass: str = MAIN, section: str = "") -> AttributeReader:
         """Return the attributes of an element with the defaults of its class, or of the class of the body that holds it.
@@ -79,10 +81,10 @@ class ModelSettings:
 
 def merge_parts(root: XmlElement, path: tuple[str, ...]) -> XmlElement:
     """Merge all elements at a path below the root into one: later attributes override earlier ones."""
-    found = [root]
+    elements = [root]
     for tag in path:
-        found = [child for element in found for child in element.children if child.tag == tag]
-    attributes = {name: value for element in found for name, value in element.attributes.items()}
-    whole = XmlElement(path[-1], attributes, found[0].line if found else root.line)
-    whole.children = [child for element in found for child in element.children]
-    return whole
+        elements = [child for element in elements for child in element.children if child.tag == tag]
+    attributes = {name: value for element in elements for name, value in element.attributes.items()}
+    merged = XmlElement(path[-1], attributes, elements[0].line if elements else root.line)
+    merged.children = [child for element in elements for child in element.children]
+    return merged

@@ -46,8 +46,8 @@ def _axes(read: AttributeReader, kind: str, radians: float, sequence: str) -> np
     value = read.numbers(kind, np.full(size, np.nan))
     if np.isnan(value).any():
         return np.eye(3)
-    parts = {"quat": [value], "axisangle": [value[:3]], "xyaxes": [value[:3], value[3:]], "zaxis": [value], "euler": []}[kind]
-    if not all(np.linalg.norm(part) > 0 for part in parts):
+    vectors = {"quat": [value], "axisangle": [value[:3]], "xyaxes": [value[:3], value[3:]], "zaxis": [value], "euler": []}[kind]
+    if not all(np.linalg.norm(vector) > 0 for vector in vectors):
         read.refuse(f"{kind}={read.text(kind)!r} has no direction")
         return np.eye(3)
     if kind == "quat":
@@ -63,8 +63,8 @@ def _axes(read: AttributeReader, kind: str, radians: float, sequence: str) -> np
         return np.column_stack([x, y, np.cross(x, y)])
     axes = np.eye(3)
     for letter, angle in zip(sequence, value * radians, strict=True):
-        one = turn_about(np.eye(3)["xyz".index(letter.lower())], angle)
-        axes = axes @ one if letter.islower() else one @ axes  # lower-case axes turn with the frame
+        turn = turn_about(np.eye(3)["xyz".index(letter.lower())], angle)
+        axes = axes @ turn if letter.islower() else turn @ axes  # lower-case axes turn with the frame
     return axes
 
 

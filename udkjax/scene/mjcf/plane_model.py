@@ -45,14 +45,14 @@ class PlaneMotion(NamedTuple):
 
     def turn(self, anchor: complex, angle: float, rate: float) -> "PlaneMotion":
         """Return the motion after a turn about a point of the body (rad, rad/s)."""
-        place, turned = self.point(anchor), self.angle + angle
-        shift = place - np.exp(1j * turned) * anchor
-        return PlaneMotion(turned, shift, self.omega + rate, self.rate - 1j * rate * place)
+        position, turned = self.point(anchor), self.angle + angle
+        shift = position - np.exp(1j * turned) * anchor
+        return PlaneMotion(turned, shift, self.omega + rate, self.rate - 1j * rate * position)
 
-    def slide(self, direction: complex, way: float, rate: float) -> "PlaneMotion":
+    def slide(self, direction: complex, distance: float, rate: float) -> "PlaneMotion":
         """Return the motion after a slide along a direction of the body (m, m/s)."""
         now = np.exp(1j * self.angle) * direction
-        return self._replace(shift=self.shift + way * now, rate=self.rate + rate * now)
+        return self._replace(shift=self.shift + distance * now, rate=self.rate + rate * now)
 
 
 def plane_of(joints: Sequence[TreeJoint], gravity: np.ndarray) -> MotionPlane:
@@ -62,7 +62,7 @@ def plane_of(joints: Sequence[TreeJoint], gravity: np.ndarray) -> MotionPlane:
     """
     hinges, slides = ([joint.axis for joint in joints if joint.kind == kind] for kind in ("hinge", "slide"))
     across = (
-        [np.cross(slides[0], other) for other in (*slides[1:], gravity, np.array([0.0, 0.0, 1.0]), np.eye(3)[0])]
+        [np.cross(slides[0], vector) for vector in (*slides[1:], gravity, np.array([0.0, 0.0, 1.0]), np.eye(3)[0])]
         if slides
         else []
     )
@@ -161,9 +161,9 @@ class PlaneModel:
         """Return the names of two bodies, and the points in their frames (m)."""
         return self.names(ends.bodies), [self.local(body, point) for body, point in zip(*ends, strict=True)]
 
-    def relative_angle(self, one: int, two: int) -> float:
+    def relative_angle(self, body1: int, body2: int) -> float:
         """Return the angle (rad) of body two relative to body one."""
-        return self.bodies[two].angle - self.bodies[one].angle
+        return self.bodies[body2].angle - self.bodies[body1].angle
 
     def sign(self, joint: TreeJoint) -> float:
         """Return 1 if a hinge turns anticlockwise, else -1."""
@@ -175,18 +175,18 @@ class PlaneModel:
 
     def motions(self, values: Mapping[str, float], rates: Mapping[str, float]) -> dict[int, PlaneMotion]:
         """Return the motions of bodies for values and rates of joints, by default those of the file."""
-        found = {0: PlaneMotion()}
+        by_body = {0: PlaneMotion()}
         for k, body in self.tree.moving():
-            motion = found[self.holder(k)]
+            motion = by_body[self.holder(k)]
             for joint in body.joints:
-                way = values.get(joint.name, self.reference(joint)) - self.reference(joint)
+                displacement = values.get(joint.name, self.reference(joint)) - self.reference(joint)
                 rate = rates.get(joint.name, 0.0)
                 if joint.kind == "hinge":
-                    motion = motion.turn(self.plane.flat(joint.anchor), self.sign(joint) * way, self.sign(joint) * rate)
+                    motion = motion.turn(self.plane.flat(joint.anchor), self.sign(joint) * displacement, self.sign(joint) * rate)
                 else:
-                    motion = motion.slide(self.plane.flat(joint.axis), way, rate)
-            found[k] = motion
-        return found
+                    motion = motion.slide(self.plane.flat(joint.axis), displacement, rate)
+            by_body[k] = motion
+        return by_body
 
     def named_joints(self) -> Iterator[tuple[str, int, list[TreeJoint]]]:
         """Iterate over moving bodies: the name of the joint (its last hinge, if it has one), the body's index, its joints."""
@@ -197,8 +197,8 @@ class PlaneModel:
 
 def gap_of(ends: Ends, motions: Mapping[int, PlaneMotion]) -> float:
     """Return the distance between two points (m) after motions of their bodies."""
-    one, two = (motions[body].point(point) for body, point in zip(*ends, strict=True))
-    return abs(two - one)
+    point1, point2 = (motions[body].point(point) for body, point in zip(*ends, strict=True))
+    return abs(point2 - point1)
 
 
 def contact_pairs(root: XmlElement, tree: BodyTree, plane: MotionPlane) -> list[str]:
@@ -207,18 +207,22 @@ def contact_pairs(root: XmlElement, tree: BodyTree, plane: MotionPlane) -> list[
     Pairs are left out if they belong to one body or to a body and its holder, are excluded, cannot move relative to each other,
     or have bounding spheres that are separate along the normal of the plane.
     """
-    parts = merge_parts(root, ("contact",)).children
-    excluded = [{part.attributes.get("body1", ""), part.attributes.get("body2", "")} for part in parts if part.tag == "exclude"]
-    found = [f"{p.attributes.get('geom1')} and {p.attributes.get('geom2')}" for p in parts if p.tag == "pair"]
-    for one, two in combinations(tree.geoms, 2):
-        a, b = tree.hosts[one.body], tree.hosts[two.body]
+    elements = merge_parts(root, ("contact",)).children
+    excluded = [
+        {element.attributes.get("body1", ""), element.attributes.get("body2", "")}
+        for element in elements
+        if element.tag == "exclude"
+    ]
+    pairs = [f"{p.attributes.get('geom1')} and {p.attributes.get('geom2')}" for p in elements if p.tag == "pair"]
+    for geom1, geom2 in combinations(tree.geoms, 2):
+        a, b = tree.hosts[geom1.body], tree.hosts[geom2.body]
         hangs = b and a == tree.hosts[tree.bodies[b].parent], a and b == tree.hosts[tree.bodies[a].parent]
-        beside = abs((one.centre - two.centre) @ plane.normal) > one.reach + two.reach
-        names = {tree.bodies[one.body].name, tree.bodies[two.body].name}
-        if a != b and not (a and b and any(hangs)) and _match(one, two) and not beside and names not in excluded:
-            found.append(f"{one.name} and {two.name}")
-    return found
+        is_apart = abs((geom1.centre - geom2.centre) @ plane.normal) > geom1.reach + geom2.reach
+        names = {tree.bodies[geom1.body].name, tree.bodies[geom2.body].name}
+        if a != b and not (a and b and any(hangs)) and _match(geom1, geom2) and not is_apart and names not in excluded:
+            pairs.append(f"{geom1.name} and {geom2.name}")
+    return pairs
 
 
-def _match(one: TreeGeom, two: TreeGeom) -> bool:
-    return bool(one.types[0] & two.types[1] or two.types[0] & one.types[1])
+def _match(geom1: TreeGeom, geom2: TreeGeom) -> bool:
+    return bool(geom1.types[0] & geom2.types[1] or geom2.types[0] & geom1.types[1])

@@ -107,7 +107,7 @@ _CURES = {
 
 def unknown_parts(root: XmlElement) -> list[str]:
     """Return the unsupported parts of a model that could change its motion, elements and attributes, by line."""
-    found: list[str] = []
+    problems: list[str] = []
     if root.tag != "mujoco":
         return [f"{root.where}: an MJCF model begins with <mujoco>"]
     skipped: set[int] = set()
@@ -119,14 +119,14 @@ def unknown_parts(root: XmlElement) -> list[str]:
         key = path if parent.tag in TOLD_BY_PARENT and element.tag in ("joint", "tendon", "site", "geom") else element.tag
         if key not in _KNOWN:
             skipped.add(id(element))
-            found.append(f"{element.where}: not taken over{_cure(element.tag)}")
+            problems.append(f"{element.where}: not taken over{_cure(element.tag)}")
             continue
         known = _KNOWN[key]
         words = {*known.used.split(), *known.idle.split()}
         for name, value in element.attributes.items():
             if name not in words and not _says_nothing(value, known.nothing.get(name)):
-                found.append(f"{element.where}: {name}={quote(value)} is not taken over{_cure(name)}")
-    return found
+                problems.append(f"{element.where}: {name}={quote(value)} is not taken over{_cure(name)}")
+    return problems
 
 
 def _cure(name: str) -> str:

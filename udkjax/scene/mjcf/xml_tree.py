@@ -44,11 +44,11 @@ def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = 
     Raises:
         SceneError: The text is not XML, or a file cannot be included.
     """
-    parser, found, opened = expat.ParserCreate(), [], []
+    parser, roots, opened = expat.ParserCreate(), [], []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         element = XmlElement(tag, attributes, parser.CurrentLineNumber, file)
-        (opened[-1].children if opened else found).append(element)
+        (opened[-1].children if opened else roots).append(element)
         opened.append(element)
 
     parser.StartElementHandler, parser.EndElementHandler = start, lambda tag: opened.pop()
@@ -56,11 +56,11 @@ def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = 
         parser.Parse(text.removeprefix("\ufeff"), True)
     except expat.ExpatError as error:
         raise SceneError([f"{f'{file}: ' if file else ''}not valid XML: {error}"], source) from None
-    for parent in [found[0], *(element for element, _ in found[0].walk())]:
+    for parent in [roots[0], *(element for element, _ in roots[0].walk())]:
         if any(child.tag == "include" for child in parent.children):
-            parts = [_included(c, source, within) if c.tag == "include" else [c] for c in parent.children]
-            parent.children = [child for part in parts for child in part]
-    return found[0]
+            replacements = [_included(c, source, within) if c.tag == "include" else [c] for c in parent.children]
+            parent.children = [child for elements in replacements for child in elements]
+    return roots[0]
 
 
 def _included(element: XmlElement, source: str, within: tuple[str, ...]) -> list[XmlElement]:
@@ -107,14 +107,14 @@ class AttributeReader:
             return np.array(default, float)
         words = self.values[name].split()
         try:
-            found = np.array([float(word) for word in words])
+            values = np.array([float(word) for word in words])
         except ValueError:
-            found = np.array([np.nan])
-        most, least = len(default), len(default) if fewest is None else fewest
-        if np.all(np.isfinite(found)) and least <= len(found) <= most:
-            return np.concatenate([found, np.array(default[len(found) :], float)])
-        wanted = f"{least} to {most}" if least < most else f"{most}"
-        self.refuse(f"{name}={abbreviate(self.values[name])} must be {wanted} finite number{'s' * (most > 1)}")
+            values = np.array([np.nan])
+        most_allowed, fewest_allowed = len(default), len(default) if fewest is None else fewest
+        if np.all(np.isfinite(values)) and fewest_allowed <= len(values) <= most_allowed:
+            return np.concatenate([values, np.array(default[len(values) :], float)])
+        wanted = f"{fewest_allowed} to {most_allowed}" if fewest_allowed < most_allowed else f"{most_allowed}"
+        self.refuse(f"{name}={abbreviate(self.values[name])} must be {wanted} finite number{'s' * (most_allowed > 1)}")
         return np.array(default, float)
 
     def number(self, name: str, default: float = 0.0) -> float:
