@@ -1,8 +1,8 @@
-"""Design by gradient: mechanisms of which a point, a link or an output moves as wanted.
+"""Design by gradient: mechanisms with a point, link or output that moves as required.
 
-`design` is the door and `DesignSearch` what it compiles. `goals` say what is wanted, `limits` what must hold; `design_problem`
-evaluates trials in lanes; `starts` are where searches begin, `search` and `polish` improve them, and `found` is what comes out,
-moved by `kinematics`. `goal_file` reads designs from files.
+`design` is the public function; it compiles and runs a `DesignSearch`. `goals` defines targets, `limits` constraints.
+`design_problem` evaluates batches of trials; `starts` generates the first ones, `search` and `polish` improve them, and
+`selection` returns the best as `designs`, verified by `kinematics`. `goal_file` reads designs from files.
 """
 
 from udkjax.lazy_names import lazy_names

@@ -22,10 +22,10 @@ from udkjax.synthesis.search import SearchState, begin, improve, raise_weights
 from udkjax.synthesis.selection import POLISH_STEPS, select
 from udkjax.synthesis.starts import find_starts
 
-SAMPLES = 8  # random mechanisms per start, of which the best is taken
-# Steps of each stage, and the fraction of trials that continue afterwards: the rest are hopeless by then.
+SAMPLES = 8  # number of random mechanisms per start; the best one is used
+# Steps of each stage, and the fraction of trials that continue afterwards; the others are unlikely to succeed.
 STAGES = ((15, 0.4), (30, 0.4), (100, 0.3))
-FEWEST = 16  # trials that continue, at least; also the number of polished ones
+FEWEST = 16  # smallest number of trials that continue; also the number of polished trials
 
 
 class DesignSearch:
@@ -71,9 +71,9 @@ class DesignSearch:
         limits = LengthLimits(numbers, lengths or {}, areas)
         boxes = {f"pin.{pin}": box_of(np.asarray(area, float)) for pin, area in (areas or {}).items()}
         boxes = {name: box for name, box in boxes.items() if name in numbers.names}
-        found = read_bounds(numbers, {**boxes, **(bounds or {})}, _places(mechanism, goal), mechanism.name)
+        ranges = read_bounds(numbers, {**boxes, **(bounds or {})}, _places(mechanism, goal), mechanism.name)
         self.problem = DesignProblem(
-            mechanism, goal, numbers, driver, found, limits, float(np.sin(transmission)), rotation, terms
+            mechanism, goal, numbers, driver, ranges, limits, float(np.sin(transmission)), rotation, terms
         )
 
     def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
@@ -95,8 +95,8 @@ class DesignSearch:
             reason = f"no random mechanism within the bounds {what}: change the bounds or the structure"
             return Designs((), np.zeros(0), starts, reason)
         state = search(problem, improve(problem, begin(problem, trials, threads), STAGES[0][0], threads), threads)
-        found = select(problem, state, results, threads)
-        return Designs(tuple(found.found), found.losses, starts, found.reason)
+        selection = select(problem, state, results, threads)
+        return Designs(tuple(selection.found), selection.losses, starts, selection.reason)
 
 
 def search(problem: DesignProblem, state: SearchState, threads: int | None) -> SearchState:
@@ -129,25 +129,25 @@ def design(
 ) -> Designs:
     """Find mechanisms with the structure of a drawing that meet a goal, by least squares from many starts.
 
-    Random mechanisms within the bounds are turned once. The best of them, moved and scaled to the goal as a whole if their pins
-    are free, are improved by the Levenberg-Marquardt method, all in lanes of machine code, with exact derivatives by all free
+    Random mechanisms within the bounds are turned once. The best, moved and scaled to the goal as a whole if their pins are
+    free, are improved by the Levenberg-Marquardt method, in batches of compiled machine code, with exact derivatives by all free
     numbers. Designs stay on one branch, pass positions in order, respect the limits, and are verified by `kinematics`.
 
     Args:
-        drawing: the structure: a drawing, or a mechanism with one degree of freedom once its drivers hold. Free pins only tell
-            which links they join.
+        drawing: the structure: a drawing, or a mechanism with one degree of freedom when its drivers are removed. Free pins
+            only define which links they join.
         goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`; or a list of one of these and motion goals: `TorqueGoal`, `LoadGoal`,
             `EnergyGoal`, `FrequencyGoal`, `ToleranceGoal` and `MotionGoal`.
         free: names of the free numbers, such as `pin.A` or `pin.C[0]`; by default all pins.
-        bounds: (low, high) by the names of free numbers; each end a number, or an array of the number's shape (m).
+        bounds: (low, high) by the names of free numbers; low and high are numbers, or arrays of the free number's shape (m).
         lengths: (least, most) distances (m) by pairs of pins.
         areas: the area of a pin by its name: a circle (x, y, radius) or the corners (k, 2) of a convex polygon (m).
-        transmission: the least distance (rad) of the transmission angle of a four-bar from 0 and pi, over the whole turn if there
-            is one; for other linkages its equivalent.
+        transmission: the least distance (rad) of the transmission angle of a four-bar from 0 and pi, over the whole turn if the
+            driver makes one; for other linkages, of the equivalent angle.
         rotation: whether the driver has to make a whole turn; by default True if it is an angle.
         driver: a driver or coordinate, as for `kinematics`; by default the only driver.
         starts: number of mechanisms to start from.
-        seed: seed of these; the same seed gives the same result.
+        seed: seed of the random mechanisms; the same seed gives the same result.
         results: largest number of designs to return.
 
     Returns:
@@ -156,17 +156,17 @@ def design(
     Raises:
         SceneError: names, bounds or lengths are wrong, positions do not follow from the driver, or machine code cannot evaluate
             an element of the mechanism.
-        ValueError: another argument cannot be used.
+        ValueError: another argument is invalid.
     """
-    found = DesignSearch(drawing, goal, free, bounds, lengths, areas, transmission, rotation, driver)
-    return found(starts, seed, results)
+    search = DesignSearch(drawing, goal, free, bounds, lengths, areas, transmission, rotation, driver)
+    return search(starts, seed, results)
 
 
 def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[MotionTerm]]:
     """Return the positional goal and the motion goals."""
-    found = [goals] if isinstance(goals, Goal) else list(goals)
-    firsts, terms = [g for g in found if isinstance(g, Goal)], [g for g in found if isinstance(g, MotionTerm)]
-    if len(firsts) != 1 or len(terms) != len(found) - 1:
+    goals_in_order = [goals] if isinstance(goals, Goal) else list(goals)
+    firsts, terms = [g for g in goals_in_order if isinstance(g, Goal)], [g for g in goals_in_order if isinstance(g, MotionTerm)]
+    if len(firsts) != 1 or len(terms) != len(goals_in_order) - 1:
         raise ValueError("goal must be a PathGoal, PoseGoal or FunctionGoal; in a list, one of them and any motion goals")
     return firsts[0], terms
 

@@ -1,4 +1,4 @@
-"""A design as a least-squares problem, evaluated for batches of trials by machine code in lanes."""
+"""A design as a least-squares problem, evaluated for batches of trials by machine code."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -23,17 +23,17 @@ from udkjax.synthesis.motion_terms import CompiledTerm
 from udkjax.synthesis.trials import TrialResiduals, Trials, Turn
 from udkjax.wording import quote
 
-TURN_VALUES = 72  # per turn, to start searches
-FINE_VALUES = 720  # per turn, to verify a required turn
-MARGIN_WEIGHT = 10.0  # weight of limits of transmission relative to lengths: beyond them there is no mechanism
-CHECK_VALUES = 24  # per turn, for the transmission during a search; its minimum between them is interpolated
+TURN_VALUES = 72  # number of values per turn for the start of searches
+FINE_VALUES = 720  # number of values per turn to verify a required turn
+MARGIN_WEIGHT = 10.0  # weight of transmission limits relative to length limits: beyond the former the mechanism cannot be closed
+CHECK_VALUES = 24  # number of values per turn for the transmission during a search; its minimum is interpolated
 
 
 class DesignProblem:
     """A goal for a mechanism: its unknowns, and programs that evaluate trials.
 
-    The unknowns x are the free numbers; the start of the driver's values, if it is free; and further ones of the goal. Limits are
-    on lengths and on the transmission, at all positions or over the whole turn if there is one.
+    The unknowns x are the free numbers, the start of the driver's values if it is free, and further unknowns of the goal. Lengths
+    and the transmission are limited; the transmission at all positions, or over the whole turn if it is required.
     """
 
     def __init__(
@@ -64,8 +64,8 @@ class DesignProblem:
         self.low, self.high = np.append(bounds.low, -wide), np.append(bounds.high, wide)
         self.first, self.last = bounds.first, bounds.last
         self.data, self.reach = goal.targets, float(np.max(bounds.last - bounds.first, initial=self.scale)) / 4
-        self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # of the free numbers
-        self.local = goal.values is None  # values are unknowns, too
+        self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # scales of the free numbers
+        self.local = goal.values is None  # the driver's values are unknowns
         self.terms = self._compile_terms(terms)
         self._compile()
         self._require_effects()
@@ -110,12 +110,12 @@ class DesignProblem:
 
     @cached_property
     def _margin(self):
-        """The programs of the transmission and its derivatives."""
+        """Programs of the transmission and its derivatives."""
         return self._made(slice(0, 0), True)
 
     def _require_effects(self):
         """Raise `SceneError` if a free number, such as a mass, does not affect any measure."""
-        rows = [self._fit.measure.outputs[place.by_parameters] for place in self._fit.places[:-1]]
+        rows = [self._fit.measure.outputs[position.by_parameters] for position in self._fit.places[:-1]]
         rows += [term.entries for term in self.terms]
         idle = [name for k, name in enumerate(self.free.entries()) if all(row[k].is_zero for row in rows)]
         if idle:
@@ -150,36 +150,36 @@ class DesignProblem:
 
     @property
     def has_outlines(self) -> bool:
-        """True if a link has an outline or centre in world coordinates, which does not follow its pins."""
+        """True if a link has an outline or centre in world coordinates, which does not move with its pins."""
         drawing = self.mechanism.drawing
         links = {} if drawing is None else drawing.groups["link"]
         return any(link.outline is not None or link.centre is not None for link in links.values())  # pyright: ignore
 
     def signature(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return the points of links in a position: equal for trials that are the same mechanism, however drawn."""
+        """Return the points of links in a position; they are equal for trials of the same mechanism, however drawn."""
         return self._at(x, q[None])[0, self._measured :]
 
     def residuals(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the residuals (J, G) of positions (J, n) of a motion."""
-        found, extras = self._at(x, q)[:, : self._measured], x[self.free.count + self.shifted :]
-        return np.stack(self.goal.residual(found, self.data, np.broadcast_to(extras, (len(q), len(extras))), np), 1)
+        measured, extras = self._at(x, q)[:, : self._measured], x[self.free.count + self.shifted :]
+        return np.stack(self.goal.residual(measured, self.data, np.broadcast_to(extras, (len(q), len(extras))), np), 1)
 
     @property
     def _measured(self) -> int:
         return len(self._turn.places) - 1
 
     def _at(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
-        given = [np.full(len(q), v) for v in x] + list(q.T)
-        return np.stack(self._points.by_numpy(given), 1)
+        inputs = [np.full(len(q), v) for v in x] + list(q.T)
+        return np.stack(self._points.by_numpy(inputs), 1)
 
     def turns(self, x: np.ndarray) -> bool:
-        """Return True if the driver of a trial makes a whole turn, in fine steps."""
+        """Return True if the driver of a trial makes a whole turn, tested in fine steps."""
         return self.driven.is_angle and bool(self.turn(x[None], FINE_VALUES).reached.all())
 
     def transmission_at(self, x: np.ndarray, s: np.ndarray, q: np.ndarray) -> float:
         """Return the least transmission over the positions of a trial."""
-        found = self._turn_code(x[None], s[None], self._unit, None, q[None])
-        return float(np.min(np.abs(found.out[0, :, -1])))
+        solved = self._turn_code(x[None], s[None], self._unit, None, q[None])
+        return float(np.min(np.abs(solved.out[0, :, -1])))
 
     # --- values of the driver
 
@@ -190,8 +190,8 @@ class DesignProblem:
     def turn(self, x: np.ndarray, values: int = TURN_VALUES, threads: int | None = None) -> Turn:
         """Turn the driver once from the drawn position."""
         s = self.value_drawn(x)[:, None] + self.period * np.linspace(0.0, 1.0, values + 1)
-        found = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
-        return Turn(s, found.out[..., :-1], found.q, found.out[..., -1], np.isfinite(found.end))
+        solved = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
+        return Turn(s, solved.out[..., :-1], solved.q, solved.out[..., -1], np.isfinite(solved.end))
 
     @property
     def is_closed(self) -> bool:
@@ -200,7 +200,7 @@ class DesignProblem:
 
     @property
     def period(self) -> float:
-        """The range of values of a search: a turn, or the scale of a length."""
+        """The range of driver values in a search: a turn, or the scale of lengths."""
         return FULL_TURN if self.driven.is_angle else self.scale
 
     @property
@@ -210,8 +210,8 @@ class DesignProblem:
 
     def march(self, x: np.ndarray, s: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions (M, J, n) at values (M, J), in order from the drawn position, and whether all exist (M,)."""
-        found = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
-        return found.q, np.isfinite(found.end).all(1)
+        solved = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
+        return solved.q, np.isfinite(solved.end).all(1)
 
     # --- the whole mechanism moved
 
@@ -226,7 +226,7 @@ class DesignProblem:
         return "no turn" if counted_from_world or not self.driven.is_angle else "anything"
 
     def moved(self, x: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return trials with pins a p + b in place of p, as complex numbers, clipped to the bounds."""
+        """Return trials with each pin p moved to a p + b, as complex numbers, clipped to the bounds."""
         x = x.copy()
         if self.can_move != "nothing":
             for name, start in zip(self.free.names, self.free.starts, strict=False):
@@ -236,7 +236,7 @@ class DesignProblem:
         return np.clip(x, self.low, self.high)
 
     def turned_by(self, a: np.ndarray) -> np.ndarray:
-        """Return the changes of the driver's values as the mechanism turns: those of angles relative to the ground."""
+        """Return the changes of the driver's values if the mechanism is multiplied by `a`: nonzero for angles to the ground."""
         of_ground = self.driven.is_angle and "ground" in self.driven.mechanism.drivers[self.driven.name].bodies
         return np.angle(a) if of_ground and not self.goal.line and self.can_move == "anything" else np.zeros(len(a))
 
@@ -249,20 +249,21 @@ class DesignProblem:
         threads: int | None = None,
         worth: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     ) -> TrialResiduals:
-        """Evaluate residuals and limits of trials, each position closed from that of the trial.
+        """Evaluate residuals and limits of trials; positions are closed from those of the trial.
 
-        `worth` selects trials by residuals and limits of lengths before their turns are computed; the others do not exist.
+        `worth` selects trials by residuals and limits of lengths before their turns are computed; the others are marked as not
+        existing.
 
-        The rows of limits are those of lengths, then margin (M,) - tau^2 with the transmission tau: at a meeting of branches its
-        square varies linearly with the lengths.
+        The rows of limits are those of lengths, then margin (M,) - tau^2 with the transmission tau. The square is used because it
+        varies linearly with the lengths where branches meet.
         """
         x, (members, J) = trials.x, trials.s.shape
-        found = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
+        solved = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
         G = len(self._fit.places) - 1
-        table = found.out.reshape(members, J, G + 1, 2 + self.unknowns)
+        table = solved.out.reshape(members, J, G + 1, 2 + self.unknowns)
         r, by_value, by_unknowns = table[:, :, :G, 0], table[:, :, :G, 1], table[:, :, :G, 2:]
         limits, slopes = self.lengths(x)
-        exists, tau = np.isfinite(found.end).all(1), table[:, :, G, 0]
+        exists, tau = np.isfinite(solved.end).all(1), table[:, :, G, 0]
         if self.rotation:
             which = exists if worth is None else exists & worth(r, limits)
             turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknowns))
@@ -272,47 +273,47 @@ class DesignProblem:
         else:
             unit = MARGIN_WEIGHT * self.scale
             limits = np.concatenate([limits, unit * (margin[:, None] - tau**2)], 1)
-            by_x = table[:, :, G, 2:]  # unknown values are held: other residuals determine them
+            by_x = table[:, :, G, 2:]  # derivatives at constant driver values: other residuals determine unknown ones
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
         terms, by_terms = self._terms_of(x, exists, threads)
-        return TrialResiduals(found.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, exists)
+        return TrialResiduals(solved.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, exists)
 
     def _terms_of(self, x: np.ndarray, exists: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals of motion goals and their derivatives; trials without a motion no longer exist."""
+        """Return the residuals of motion goals and their derivatives; trials without a motion are marked in `exists`."""
         count = sum(term.goal.samples for term in self.terms)
-        r, by_unknowns, place = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
+        r, by_unknowns, start = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
         for term in self.terms:
-            which, columns = np.flatnonzero(exists), slice(place, place + term.goal.samples)
+            which, columns = np.flatnonzero(exists), slice(start, start + term.goal.samples)
             r[which, columns], by_unknowns[which, columns], exists[which] = term(x[which], threads)
-            place = columns.stop
+            start = columns.stop
         return r, by_unknowns
 
     def residuals_at(self, trials: Trials, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return residuals (M, J, G), rows of lengths, and whether all positions exist (M,), without derivatives."""
-        found = self._residual_code(trials.x, trials.s, self._unit, self.data, trials.q, threads=threads)
-        return found.out[..., :-1], self.lengths(trials.x)[0], np.isfinite(found.end).all(1)
+        """Return residuals (M, J, G), limits of lengths, and whether all positions exist (M,), without derivatives."""
+        solved = self._residual_code(trials.x, trials.s, self._unit, self.data, trials.q, threads=threads)
+        return solved.out[..., :-1], self.lengths(trials.x)[0], np.isfinite(solved.end).all(1)
 
     def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the limit row of the least transmission of a turn, its derivative, and whether the turn is complete.
 
-        Near its minimum tau^2 is a parabola: through three values of the turn, then corrected by its slope.
+        The minimum of tau^2 is that of a parabola through three values of the turn, corrected once by the slope there.
         """
         turn = self.turn(x, CHECK_VALUES, threads)
         turns, all_of_them = turn.reached.all(1), np.arange(len(x))
         square = np.where(turns[:, None], turn.transmission**2, 1.0)[:, :-1]
         worst, step = square.argmin(1), self.period / CHECK_VALUES
-        before, at, after = (square[all_of_them, (worst + k) % CHECK_VALUES] for k in (-1, 0, 1))
-        bend = np.maximum(before - 2.0 * at + after, np.finfo(float).tiny)
+        before, lowest, after = (square[all_of_them, (worst + k) % CHECK_VALUES] for k in (-1, 0, 1))
+        bend = np.maximum(before - 2.0 * lowest + after, np.finfo(float).tiny)
         (programs, code), centre = self._margin, turn.s[all_of_them, worst]
         s = centre + step * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
-        guess, place = np.where(turns[:, None], turn.q[all_of_them, worst], 0.0)[:, None], programs.places[-1]
+        guess, columns = np.where(turns[:, None], turn.q[all_of_them, worst], 0.0)[:, None], programs.places[-1]
         for last in (False, True):
-            found = code(x, s[:, None], self._unit, None, guess, threads=threads)
-            value, slope = found.out[:, 0, place.value], found.out[:, 0, place.by_value]
+            solved = code(x, s[:, None], self._unit, None, guess, threads=threads)
+            value, slope = solved.out[:, 0, columns.value], solved.out[:, 0, columns.by_value]
             if not last:
                 moved = s - np.where(np.isfinite(slope), value * slope, 0.0) * step**2 / bend
-                s, guess = np.clip(moved, centre - step, centre + step), np.where(np.isfinite(found.q), found.q, guess)
-        turns &= np.isfinite(found.end[:, 0])
-        unit, by_x = MARGIN_WEIGHT * self.scale, found.out[:, 0, place.by_parameters]
+                s, guess = np.clip(moved, centre - step, centre + step), np.where(np.isfinite(solved.q), solved.q, guess)
+        turns &= np.isfinite(solved.end[:, 0])
+        unit, by_x = MARGIN_WEIGHT * self.scale, solved.out[:, 0, columns.by_parameters]
         limit, slopes = unit * (margin - value**2)[:, None], -2.0 * unit * (value[:, None] * by_x)[:, None]
         return np.where(turns[:, None], limit, 0.0), np.where(turns[:, None, None], slopes, 0.0), turns

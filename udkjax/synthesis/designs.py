@@ -15,19 +15,19 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 from udkjax.synthesis.design_problem import DesignProblem
 
-AGREEMENT = 1e-6  # of the loss of a search with that of the motion, relative to the loss and to the squared scale
+AGREEMENT = 1e-6  # tolerance between the losses of search and motion, relative to the loss and to the squared scale
 
 
 class FoundDesign(PrintsTable):
     """A design that meets the goal, drawn at the first position of the goal if its pins are free.
 
     Attributes:
-        loss: the sum of the squares of the residuals of its motion (m^2; for a function rad^2 or m^2).
+        loss: the sum of the squared residuals of its motion (m^2; for a function rad^2 or m^2).
         mechanism: the mechanism, to be run, animated or saved.
         values: values of the driver at the positions of the goal (J,) (rad, m).
         residuals: residuals (J, G) of the motion that `kinematics` follows over these values.
         measures: measures of each motion goal at its samples.
-        transmission: the least over the positions, from 0 to 1; for a four-bar the sine of the transmission angle.
+        transmission: the smallest value over the positions, from 0 to 1; for a four-bar the sine of the transmission angle.
         turns: whether the driver makes a whole turn.
         parameters: the free numbers by name.
         driver: the driver.
@@ -76,9 +76,10 @@ class Designs(PrintsTable):
 
     Attributes:
         found: the designs.
-        losses: losses of all trials within the limits, sorted; the more often the best occurs, the less likely is a better one.
+        losses: losses of all trials within the limits, sorted; the more often the best one occurs, the less likely a better one
+            is.
         starts: number of mechanisms that the search started from.
-        reason: why nothing was found, and the cure; empty if something was found.
+        reason: why no design was found, and the cure; empty if there are designs.
     """
 
     found: tuple[FoundDesign, ...]
@@ -98,9 +99,9 @@ class Designs(PrintsTable):
     def _table(self) -> PrintedTable:
         rows = [("starts", str(self.starts)), ("within the limits", str(len(self.losses)))]
         rows += [("nothing was found", self.reason)] if self.reason else []
-        for k, one in enumerate(self.found):
-            turns = ", turns" if one.turns else ""
-            rows.append((str(k + 1), f"loss {one.loss:.6g}, transmission {one.transmission:.3g}{turns}"))
+        for k, design in enumerate(self.found):
+            turns = ", turns" if design.turns else ""
+            rows.append((str(k + 1), f"loss {design.loss:.6g}, transmission {design.transmission:.3g}{turns}"))
         return PrintedTable(f"{len(self.found)} designs", rows)
 
 
@@ -124,16 +125,16 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
         return None
     residuals = problem.residuals(unknowns, moved.reshape(len(s), -1))
     of_terms = [term.residual(m) for term, m in zip(problem.terms, measures, strict=True)]
-    found = float(sum(np.sum(r**2) for r in (residuals, *of_terms)))
-    if not abs(found - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
+    loss_of_motion = float(sum(np.sum(r**2) for r in (residuals, *of_terms)))
+    if not abs(loss_of_motion - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
         return None
     tau = problem.transmission_at(x, s, q)
     parameters = dict(zip(numbers.names, numbers.values, strict=True))
-    return FoundDesign(found, mechanism, values, residuals, tuple(measures), tau, turns, parameters, problem.driver)
+    return FoundDesign(loss_of_motion, mechanism, values, residuals, tuple(measures), tau, turns, parameters, problem.driver)
 
 
 def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:
-    """Return positions (J, bodies, 3) of a motion from the drawn position over values; None if it does not reach them."""
+    """Return positions (J, bodies, 3) of a motion from the drawn position at values; None if some are not reached."""
     motion = kinematics(mechanism, driver, values)
     return np.asarray(motion.q) if np.all(motion.reached) else None
 

@@ -32,7 +32,7 @@ TOP = (
     "transmission",
     "rotation",
 )
-SEARCHED = ("free", "motion")  # settings of a search only
+SEARCHED = ("free", "motion")  # settings that a search for all solutions does not have
 LENGTH = ("pins", "least", "most")
 # The keys of each kind of goal, and their SI units; "value" is the unit of the driver.
 GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
@@ -46,7 +46,7 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
         {"output": "", "values": "value", "targets": "output", "start": "", "output_start": "", "line": ""},
     ),
 }
-# The kinds of motion goals, each with the unit of its measure; "effort" is that of the driver. Then their further keys.
+# The kinds of motion goals, each with the unit of its measure; "effort" is the unit of the driver's effort. Below: further keys.
 MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "torque": (TorqueGoal, "effort"),
     "load": (LoadGoal, "N"),
@@ -59,7 +59,7 @@ OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances")}
 
 
 def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
-    """Return the search that a file describes; with `complete = true` the search for all solutions.
+    """Return the search that a file describes; with `complete = true`, the search for all solutions.
 
     Args:
         path: the file; the mechanism's file is named relative to it.
@@ -87,7 +87,7 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     goal = _read_goal(mechanism, table["goal"], units, problems)
     bounds = _read_bounds(mechanism, table.get("bounds", {}), units, problems)
     lengths = _read_lengths(table.get("length", []), units, problems)
-    terms = [_read_motion(k, mechanism, one, units, problems) for k, one in enumerate(table.get("motion", []))]
+    terms = [_read_motion(k, mechanism, entry, units, problems) for k, entry in enumerate(table.get("motion", []))]
     areas = {pin: units.convert(f"areas.{pin}", area, "m", problems) for pin, area in dict(table.get("areas", {})).items()}
     transmission = units.convert("transmission", table.get("transmission", 0.0), "rad", problems)
     if problems:

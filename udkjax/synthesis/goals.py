@@ -1,6 +1,6 @@
 """Goals of a design: targets of the motion at some positions along it.
 
-A goal measures a position by a few numbers (`measure`, in JAX), and compares these with the target (`residual`). The loss of a
+A goal measures each position (`measure`, in JAX) and compares the measures with the target (`residual`). The loss of a
 design is the sum of the squares of all residuals.
 """
 
@@ -28,12 +28,12 @@ from udkjax.wording import quote, suggestion
 def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
     def convert(value: Numbers) -> np.ndarray:
         require_finite(name, value)
-        found = np.asarray(value, float)
-        found = found[:, None] if columns == 1 and found.ndim == 1 else found
-        if found.ndim != 2 or found.shape[1] != columns or not len(found):
+        array = np.asarray(value, float)
+        array = array[:, None] if columns == 1 and array.ndim == 1 else array
+        if array.ndim != 2 or array.shape[1] != columns or not len(array):
             shape = "(J,)" if columns == 1 else f"(J, {columns})"
             raise ValueError(f"{name} must have the shape {shape}, one row for each position, not {np.shape(value)}")
-        return found
+        return array
 
     return convert
 
@@ -42,21 +42,21 @@ def _values(value: Numbers | None) -> np.ndarray | None:
     if value is None:
         return None
     require_finite("values", value)
-    found = np.asarray(value, float)
-    if found.ndim != 1:
-        raise ValueError(f"values must be one value of the driver for each position, shape (J,), not {found.shape}")
-    return found
+    array = np.asarray(value, float)
+    if array.ndim != 1:
+        raise ValueError(f"values must be one value of the driver for each position, shape (J,), not {array.shape}")
+    return array
 
 
 class Goal(PrintsTable):
-    """A goal for a motion; `targets` has a row for each position.
+    """Targets for a motion; `targets` has a row for each position.
 
-    With `values`, each position has its value of the driver (rad, m); otherwise positions are passed in order, at values found by
-    the search. With `start` "free" the search finds the value that `values` count from; with `line` they count from the direction
-    from one pin to another, such as the ground link.
+    With `values`, the driver's value at each position is given (rad, m); otherwise the search determines the values, and
+    positions are passed in order. If `start` is "free", the search determines the origin of `values`; with `line` they are
+    measured from the direction from one pin to another, such as along the ground link.
     """
 
-    if TYPE_CHECKING:  # fields of each goal, in an order of its own
+    if TYPE_CHECKING:  # each goal has these fields, in a different order
 
         @property
         def targets(self) -> np.ndarray: ...
@@ -86,7 +86,7 @@ class Goal(PrintsTable):
 
     @property
     def has_place(self) -> bool:
-        """True if the first two measures are a place, x and y, which moves and scales with the mechanism."""
+        """True if the first two measures are x and y of a place that moves and scales with the mechanism."""
         return False
 
     @abstractmethod
@@ -99,15 +99,15 @@ class Goal(PrintsTable):
 
     @abstractmethod
     def residual(self, measured: NumericArray, target: NumericArray, extras: NumericArray, xp: ModuleType) -> list[NumericArray]:
-        """Return the differences of measures (..., G) from a target, as a list of G arrays."""
+        """Return the differences between measures (..., G) and a target, as a list of G arrays."""
 
     def origin(self, mechanism: Mechanism) -> Array:
         """Return the value of the driver that `values` count from."""
         if not self.line:
             return jnp.zeros(())
         pins = mechanism.drawing.pins  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
-        way = pins[self.line[1]] - pins[self.line[0]]
-        return jnp.arctan2(way[1], way[0])
+        direction = pins[self.line[1]] - pins[self.line[0]]
+        return jnp.arctan2(direction[1], direction[0])
 
     def check_line(self, mechanism: Mechanism) -> None:
         """Raise `SceneError` if `line` names a missing pin."""
@@ -127,8 +127,8 @@ def place_of(mechanism: Mechanism, of: str, point: Numbers | None, q: Float[Arra
     if body == GROUND:
         return [jnp.asarray(local[0]), jnp.asarray(local[1])]
     x, y, angle = q[mechanism.body_names.index(body)]
-    found = Frame.at((x, y), angle).point(local)
-    return [jnp.asarray(found.x), jnp.asarray(found.y)]
+    result = Frame.at((x, y), angle).point(local)
+    return [jnp.asarray(result.x), jnp.asarray(result.y)]
 
 
 def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
@@ -140,14 +140,14 @@ def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
 
 
 class PathGoal(Goal):
-    """A point passes through places in their order.
+    """A point passes through places in order.
 
     Args:
         point: the name of a pin, or of a body together with `at`.
         targets: the places (J, 2) in m; on a closed curve the last may equal the first.
         values: values of the driver at each place (rad, m); by default found by the search.
         start: "given": values count from zero; "free": from a value found by the search.
-        line: two pins: values count from the direction of the line from one to the other.
+        line: two pins; values are measured from the direction from the first to the second pin.
         at: the point in the body's own frame (m).
     """
 
@@ -173,9 +173,9 @@ class PathGoal(Goal):
 
 
 class PoseGoal(Goal):
-    """A link passes through poses: one of its points through places, the link through angles.
+    """A link passes through poses: one of its points reaches places, and the link reaches angles.
 
-    Angles count from one found by the search; their residual is 2 `arm` sin(difference / 2), in m.
+    Angles are measured from one that the search determines; their residual is 2 `arm` sin(difference / 2), in m.
 
     Args:
         body: the link.
@@ -221,7 +221,7 @@ class PoseGoal(Goal):
 
 
 class FunctionGoal(Goal):
-    """A coordinate is a function of the driver: output values at input values, each counted from its own start.
+    """A coordinate is a function of the driver. Output and input values are each measured from their own start.
 
     Args:
         output: the coordinate, such as `body.rocker.angle`, named as for `kinematics`.

@@ -15,8 +15,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote, suggestion
 
 Range = tuple[float, float]
-# Least distance from a meeting of branches over a required turn, even if no transmission is required: for a four-bar, the sine of
-# the transmission angle. Closer to it, real parts with clearances may change their branch.
+# Smallest transmission over a required turn, even if none is requested; for a four-bar, the sine of the transmission angle.
+# Closer to a meeting of branches, real parts with clearances may change their branch.
 LEAST_TRANSMISSION = 3e-3
 DEFAULT_REACH = 2.0  # range of the search for unbounded pins, relative to the extent of targets and drawing
 DEFAULT_FACTOR = 4.0  # range of other numbers: value / factor to value * factor
@@ -35,7 +35,7 @@ class Bounds:
 def read_bounds(
     free: FreeNumbers, given: Mapping[str, object], places: np.ndarray, name: str, reach: float = DEFAULT_REACH
 ) -> Bounds:
-    """Return the bounds of all free numbers; raise `SceneError` if one is not a range.
+    """Return the bounds of all free numbers; raise `SceneError` if a range is invalid.
 
     Args:
         free: the numbers.
@@ -58,17 +58,17 @@ def read_bounds(
             first[a:b], last[a:b] = ends.min(0), ends.max(0)
         if key in given:
             try:
-                one, two = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in given[key])  # pyright: ignore
+                lower, upper = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in given[key])  # pyright: ignore
             except (TypeError, ValueError):
                 problems.append(f"bounds.{key}: must be a pair (low, high), each a number or of the shape {shape}")
                 continue
-            if not np.all(one <= two):  # also for NaN
+            if not np.all(lower <= upper):  # also for NaN
                 problems.append(f"bounds.{key}: low must not exceed high")
-            low[a:b], high[a:b] = one, two
-            apart = (one > last[a:b]) | (two < first[a:b])  # outside of the default range
+            low[a:b], high[a:b] = lower, upper
+            apart = (lower > last[a:b]) | (upper < first[a:b])  # outside the default range
             first[a:b], last[a:b] = (
-                np.where(apart, np.maximum(one, two - extent), np.maximum(one, first[a:b])),
-                np.where(apart, np.minimum(two, one + extent), np.minimum(two, last[a:b])),
+                np.where(apart, np.maximum(lower, upper - extent), np.maximum(lower, first[a:b])),
+                np.where(apart, np.minimum(upper, lower + extent), np.minimum(upper, last[a:b])),
             )
     if problems:
         raise SceneError(problems, name)
@@ -76,7 +76,7 @@ def read_bounds(
 
 
 class LengthLimits:
-    """Limits on distances between pins and areas of pins: rows c(x) <= 0 (K,) in m, with derivatives.
+    """Limits on distances between pins and on areas of pins: rows c(x) <= 0 (K,) in m, with derivatives.
 
     Args:
         free: the free numbers x.
@@ -97,7 +97,7 @@ class LengthLimits:
         rows = [(pins, way, end) for pins, low, high, _ in ranges for way, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf]
         rows += [((None, pin), 1.0, area[2]) for pin, area in found.items() if area.ndim == 1]
         centres = np.array([area[:2] for area in found.values() if area.ndim == 1]).reshape(-1, 2)
-        # Outward normal and distance from the origin of each side.
+        # Outward normals of the sides, and distances of the sides from the origin.
         polygons = {pin: ConvexHull(area).equations for pin, area in found.items() if area.ndim == 2}
         sides = [(pin, side[:2], -side[2]) for pin, equations in polygons.items() for side in equations]
         self.count, self._free = len(rows) + len(sides), free.count
@@ -132,24 +132,24 @@ class LengthLimits:
 
 
 def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str]) -> np.ndarray:
-    """Return an area of a pin: a circle (3,) or the corners (k, 2) of a convex polygon; note anything else as a problem."""
+    """Return an area of a pin: a circle (3,) or the corners (k, 2) of a convex polygon; add anything else to the problems."""
     known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
     try:
-        found = np.asarray(area, float)
+        array = np.asarray(area, float)
     except (TypeError, ValueError):
-        found = np.zeros(0)
-    is_circle = found.shape == (3,) and found[2] > 0
-    is_polygon = found.ndim == 2 and found.shape[-1] == 2 and len(found) > 2 and _is_convex(found)
+        array = np.zeros(0)
+    is_circle = array.shape == (3,) and array[2] > 0
+    is_polygon = array.ndim == 2 and array.shape[-1] == 2 and len(array) > 2 and _is_convex(array)
     if pin not in known:
         problems.append(f"areas: no pin named {quote(pin)}{suggestion(pin, known)}")
-    if not np.all(np.isfinite(found)) or not (is_circle or is_polygon):
+    if not np.all(np.isfinite(array)) or not (is_circle or is_polygon):
         problems.append(f"areas.{pin}: must be a circle (x, y, radius), or the corners of a convex polygon in order (m)")
         return np.zeros(3)
-    return found
+    return array
 
 
 def box_of(area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest x and y of an area."""
+    """Return the smallest and the largest x and y of an area."""
     return (area[:2] - area[2], area[:2] + area[2]) if area.ndim == 1 else (area.min(0), area.max(0))
 
 

@@ -1,9 +1,9 @@
 """Motion goals: limits on torques, loads of joints, energies, frequencies and tolerances, in addition to a positional goal.
 
-Each measures positions of a motion with a constant rate of the driver: over the whole turn if there is one, otherwise over the
-range of the values of the positional goal. A measure m above its `most` adds the residual weight scale (m / most - 1), one below
-its `least` weight scale (1 - m / least), with the scale of the positional goal over the root of the number of samples; one in
-between adds nothing.
+Each goal measures positions of a motion with a constant rate of the driver, over the whole turn if there is one, otherwise over
+the range of the positional goal's values. A measure m above `most` adds the residual weight scale (m / most - 1), a measure below
+`least` adds weight scale (1 - m / least), and a measure in between adds nothing. Here, scale is the scale of the positional goal
+divided by the square root of the number of samples.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,11 +34,11 @@ class MotionPoint(NamedTuple):
         q: positions (bodies, 3) (m, rad).
         v: velocities (bodies, 3) (m/s, rad/s).
         a: accelerations (bodies, 3).
-        rate: dq/ds by the value of the driver (bodies, 3).
+        rate: dq/ds, the derivative by the driver's value (bodies, 3).
         bend: d^2q/ds^2 (bodies, 3).
         loads: the loads (k, m) requested by `MotionTerm.loads`.
         numbers: the free numbers.
-        x: their values in the trial (P,).
+        x: values of the free numbers in the trial (P,).
         psi: the function x (P,) -> Psi (m,) at this position.
     """
 
@@ -55,7 +55,7 @@ class MotionPoint(NamedTuple):
 
     @property
     def missing(self) -> Float[Array, "n"]:
-        """M a - F: the loads of joints and drivers (N, N m)."""
+        """M a - F: the generalized forces that joints and drivers have to exert (N, N m)."""
         force = loads.force(self.mechanism, 0.0, self.q, self.v)
         return loads.mass(self.mechanism) * self.a.ravel() - force
 
@@ -71,7 +71,7 @@ class MotionTerm(PrintsTable):
         most: upper limit of the measure, positive.
         least: lower limit of the measure, positive.
         speed: the rate of the driver (rad/s, m/s); by default that of its motion at time 0.
-        weight: twice the limit costs as much as missing a place by `weight` scales of the positional goal.
+        weight: exceeding the limit by 100 % costs as much as missing a place by `weight` scales of the positional goal.
         samples: number of measured positions.
     """
 
@@ -103,7 +103,7 @@ class MotionTerm(PrintsTable):
         raise NotImplementedError
 
     def residual(self, measure: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals of measures, and their derivatives by them."""
+        """Return residuals of measures, and the derivatives of the residuals by the measures."""
         unit, r, slope = self.weight * scale, np.zeros_like(measure), np.zeros_like(measure)
         if self.most is not None:
             above = measure > self.most
@@ -134,7 +134,7 @@ class MotionGoal(MotionTerm):
 class TorqueGoal(MotionTerm):
     """The size of the driver's effort, its torque (N m) or force (N), stays below `most`.
 
-    The effort is the power of inertia, weight, springs and friction over the speed. Arguments: those of a `MotionTerm`.
+    The effort is the power of inertia, weight, springs and friction, divided by the speed. Arguments: see `MotionTerm`.
     """
 
     def measure(self, at):
@@ -145,7 +145,7 @@ class LoadGoal(MotionTerm):
     """The force (N) in a joint stays below `most`; the mechanism must have no redundant joints.
 
     Args:
-        joint: the name of the joint, in a drawing that of its pin. Further arguments: those of a `MotionTerm`.
+        joint: the name of the joint; in a drawing, the name of the pin. Further arguments: see `MotionTerm`.
     """
 
     joint: str = eqx.field(static=True)
@@ -168,16 +168,16 @@ class LoadGoal(MotionTerm):
 
 
 class EnergyGoal(MotionTerm):
-    """The kinetic energy (J) stays below `most`, or above `least`. Arguments: those of a `MotionTerm`."""
+    """The kinetic energy (J) stays below `most`, or above `least`. Arguments: see `MotionTerm`."""
 
     def measure(self, at):
         return loads.kinetic_energy(at.mechanism, at.v)
 
 
 class FrequencyGoal(MotionTerm):
-    """The frequency (Hz) of the mechanism without its driver stays above `least`, below `most`; negative: unstable.
+    """The frequency (Hz) of the mechanism without its driver stays above `least` and below `most`; negative if unstable.
 
-    With u = dq/ds, the mass is u^T M u and the stiffness -d(u^T F)/ds. Arguments: those of a `MotionTerm`.
+    With u = dq/ds, the mass is u^T M u and the stiffness -d(u^T F)/ds. Arguments: see `MotionTerm`.
     """
 
     def measure(self, at):
@@ -192,12 +192,12 @@ class FrequencyGoal(MotionTerm):
 
 
 class ToleranceGoal(MotionTerm):
-    """The error of a point by errors t_k of numbers, sqrt(sum_k (t_k dp/dx_k)^2) (m), stays below `most`.
+    """The error of a point due to errors t_k of numbers, sqrt(sum_k (t_k dp/dx_k)^2) (m), stays below `most`.
 
     Args:
         point: point, as for a `PathGoal`.
-        tolerances: tolerances of free numbers by name, in their units, for each entry of a pin independently. Further arguments:
-            those of a `MotionTerm`.
+        tolerances: tolerances of free numbers by name, in their units; the coordinates of a pin vary independently. Further
+            arguments: see `MotionTerm`.
     """
 
     point: str = eqx.field(static=True)

@@ -39,12 +39,12 @@ class CompiledTerm:
         free: the free numbers.
         driver: the driver.
         driven: the mechanism driven by it.
-        unit: units of the coordinates (n,).
+        unit: scales of the coordinates (n,).
         scale: scale of the residuals.
         span: first and last value of the driver, as in the positional goal; None: a whole turn.
         unknowns: number of unknowns.
-        origin: the value that values count from.
-        shifted: whether the unknown after the free numbers is added to that value.
+        origin: the driver's value from which the goal's values are measured.
+        shifted: whether the unknown after the free numbers is added to the origin.
     """
 
     def __init__(
@@ -101,16 +101,16 @@ class CompiledTerm:
     def measures(self, x: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return measures (M, K), their derivatives by the unknowns (M, K, P), and whether all positions exist (M,)."""
         s = self._values(x)
-        found = self._code(x, s, self._unit, longest=self._longest, threads=threads)
-        finite = np.isfinite(found.end).all(1)
-        out = np.where(finite[:, None, None], found.out, 0.0)
+        solved = self._code(x, s, self._unit, longest=self._longest, threads=threads)
+        finite = np.isfinite(solved.end).all(1)
+        out = np.where(finite[:, None, None], solved.out, 0.0)
         return out[..., self._places.value], out[..., self._places.by_parameters], finite
 
     def __call__(self, x: np.ndarray, threads: int | None = None) -> TermResiduals:
         """Return the residuals of trials x (M, P)."""
-        m, by_unknowns, there = self.measures(x, threads)
+        m, by_unknowns, exists = self.measures(x, threads)
         r, slope = self.goal.residual(m, self._unit_of_residuals)
-        return TermResiduals(r, slope[..., None] * by_unknowns, there)
+        return TermResiduals(r, slope[..., None] * by_unknowns, exists)
 
     def residual(self, measures: np.ndarray) -> np.ndarray:
         """Return the residuals of measures (K,)."""
@@ -120,7 +120,7 @@ class CompiledTerm:
         count = self.goal.samples
         if self._span is not None:
             return np.tile(np.linspace(*self._span, count), (len(x), 1))
-        # Values of a fixed grid, independent of the drawing; the first is the next one after the drawn value.
+        # Values on a grid that does not depend on the drawing, from the first one after the drawn value.
         step, drawn = FULL_TURN / count, np.asarray(self._drawn.by_numpy(list(x.T))[0])
         return step * (np.ceil(drawn / step)[:, None] + np.arange(count))
 
@@ -130,7 +130,7 @@ class CompiledTerm:
         Args:
             mechanism: the mechanism.
             x: its free numbers and further unknowns (P,).
-            origin: the value of the driver that values of the span count from.
+            origin: the driver's value from which the span is measured.
         """
         s = self._values(x[None])[0]
         motion = kinematics(mechanism, self._driver, s if self._span is None else s + origin)

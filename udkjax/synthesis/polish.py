@@ -1,7 +1,7 @@
-"""Newton's method for the best trials of a search: Gauss-Newton steps converge slowly if residuals remain.
+"""Newton's method for the best trials of a search, since Gauss-Newton steps converge slowly if residuals remain.
 
-The merit is that of search.py, over all unknowns z = (x, s) in units of their scales. Its gradient is exact; its Hessian is taken
-by differences of gradients, evaluated in one batch. Steps go downhill along every eigenvector,
+The merit is that of search.py, over all unknowns z = (x, s) in units of their scales. Its gradient is exact; its Hessian is
+computed by differences of gradients, evaluated in one batch. Steps go downhill along every eigenvector,
 
     dz = -V (|Lambda| + mu)^(-1) V^T g.
 """
@@ -13,7 +13,9 @@ from udkjax.synthesis.search import ROUNDING, SearchState, harden, merit_of, mus
 from udkjax.synthesis.steps import ACTIVE_SETS
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
-DIFFERENCE = 1e-7  # relative to the scales: small enough for mechanisms that barely turn; rounding leaves 1e-8 of a Hessian
+DIFFERENCE = (
+    1e-7  # relative to the scales; small enough for mechanisms that barely turn. Rounding errors of the Hessian are about 1e-8.
+)
 FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, relative to the largest eigenvalue
 CONVERGED = 1e-13  # predicted relative decrease of the merit
 
@@ -55,7 +57,7 @@ def _newton_step(
         now = found.limits + u + np.einsum("mkp,mp->mk", slopes, dz) > 0
         if np.array_equal(now, pressed):
             break
-        # The limit contributes curvature and slope only while it is active.
+        # A limit contributes curvature and slope only while it is active.
         change = 2.0 * weight[:, None] ** 2 * (now.astype(float) - pressed)
         H = H + slopes.transpose(0, 2, 1) @ (change[..., None] * slopes)
         g = g + np.einsum("mkp,mk->mp", slopes, change * (found.limits + u))
@@ -68,12 +70,12 @@ def _newton_step(
     exists = usable & ordered & trial.exists & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
     merit = np.where(exists, merit_of(trial, u, weight), np.inf)
     better = merit < state.merit[active]
-    taken, kept = active[better], active[~better]
-    state.accept(problem, taken, new.take(better), trial.take(better), merit[better])
+    accepted, rejected = active[better], active[~better]
+    state.accept(problem, accepted, new.take(better), trial.take(better), merit[better])
     promised = np.abs(np.einsum("mk,mk->m", g, dz))
     small = promised <= CONVERGED * state.merit[active] + ROUNDING * problem.scale**2
-    shift[taken] = np.maximum(0.1 * shift[taken], LEAST_SHIFT)
-    shift[kept] = shift[kept] * 10.0
+    shift[accepted] = np.maximum(0.1 * shift[accepted], LEAST_SHIFT)
+    shift[rejected] = shift[rejected] * 10.0
     ended = active[small | (shift[active] > MOST_SHIFT)]
     wrong = must_continue(problem, state, ended)
     harden(problem, state, ended[wrong])
@@ -82,14 +84,14 @@ def _newton_step(
 
 
 def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Return the step of each trial; unknowns that would leave their bounds are held."""
-    held = np.zeros(g.shape, bool)
+    """Return the step of each trial; unknowns that would leave their bounds are fixed."""
+    fixed = np.zeros(g.shape, bool)
     of_x = g[:, : problem.unknowns]
-    held[:, : problem.unknowns] = ((trials.x <= problem.low) & (of_x > 0)) | ((trials.x >= problem.high) & (of_x < 0))
-    values, V = np.linalg.eigh(np.where(held[:, :, None] | held[:, None, :], 0.0, H))
+    fixed[:, : problem.unknowns] = ((trials.x <= problem.low) & (of_x > 0)) | ((trials.x >= problem.high) & (of_x < 0))
+    values, V = np.linalg.eigh(np.where(fixed[:, :, None] | fixed[:, None, :], 0.0, H))
     size = np.maximum(np.abs(values).max(1), 1e-300)
-    along = np.einsum("mki,mk->mi", V, np.where(held, 0.0, g)) / (np.abs(values) + (shift * size)[:, None])
-    return np.where(held, 0.0, -np.einsum("mki,mi->mk", V, along))
+    components = np.einsum("mki,mk->mi", V, np.where(fixed, 0.0, g)) / (np.abs(values) + (shift * size)[:, None])
+    return np.where(fixed, 0.0, -np.einsum("mki,mi->mk", V, components))
 
 
 def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
@@ -131,8 +133,8 @@ def _hessian(
     repeated = Trials(*(np.repeat(a, 2 * N, 0) for a in trials))
     split = Trials(moved[:, : problem.unknowns], moved[:, problem.unknowns :] if problem.local else repeated.s, repeated.q)
     u, weight, margin, pressed = (np.repeat(a, 2 * N, 0) for a in limits)
-    found = problem.evaluate(split, margin, threads)
-    g = _gradient(problem, found, u, weight, pressed) * units
-    g = np.where(found.exists[:, None], g, np.nan).reshape(members, 2, N, N)
+    moved_trials = problem.evaluate(split, margin, threads)
+    g = _gradient(problem, moved_trials, u, weight, pressed) * units
+    g = np.where(moved_trials.exists[:, None], g, np.nan).reshape(members, 2, N, N)
     H = (g[:, 0] - g[:, 1]) / (2.0 * DIFFERENCE)
     return 0.5 * (H + H.transpose(0, 2, 1))

@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt searches of many trials in lanes, with limits of increasing weight.
+"""Levenberg-Marquardt searches of many trials in one batch, with limits of increasing weight.
 
 Limits c(x) <= 0 are enforced by an augmented Lagrangian: residuals w max(0, c + u), whose multipliers u become max(0, c + u)
-whenever a trial has converged. In narrow curved valleys steps follow the geodesic: its acceleration comes from the second
-derivative of the residuals along a step v, by one more evaluation (Transtrum and Sethna 2012, arXiv:1201.5885).
+whenever a trial has converged. In narrow curved valleys, steps follow the geodesic: its acceleration is computed from the
+second derivative of the residuals along a step v, by one more evaluation (Transtrum and Sethna 2012, arXiv:1201.5885).
 """
 
 from dataclasses import dataclass, fields
@@ -16,16 +16,16 @@ from udkjax.synthesis.trials import TrialResiduals, Trials
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
 RELAX, TIGHTEN = 0.2, 4.0  # factors of the damping after an accepted and a rejected step
-# Weights w of limits relative to residuals. A search begins with a small weight and raises it each time it has converged: the
-# violation falls with the square of the weight.
+# Weights w of limits relative to residuals. A search begins with a small weight and raises it each time it has converged;
+# the violation decreases with the square of the weight.
 FIRST_WEIGHT, HARDEN, MOST_WEIGHT = 0.5, 6.0, 100.0
-HIGH = 20.0  # weights per root of the loss, relative to the scale: limits with smaller weights have no effect
+HIGH = 20.0  # unit of weights, relative to the root of the loss over the scale; limits with smaller weights have no effect
 # Squared transmissions: the first margin, and the factor by which it shrinks to the requested one whenever a trial has converged.
 FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
-LIMIT_TOL = 1e-8  # scales: accepted excess over a limit, before the last polish
+LIMIT_TOL = 1e-8  # accepted excess over a limit before the last polish, in scales
 SETTLED = 1e-9  # relative decrease of the loss below which a trial has converged
 PRESSED = 1e-5  # relative decrease of the loss below which exceeded limits get a larger weight
-ROUNDING = 1e-26  # relative to the squared scale: a smaller loss is rounding
+ROUNDING = 1e-26  # losses below this, relative to the squared scale, are rounding errors
 AHEAD = 0.1  # fraction of a step at which residuals are evaluated for their second derivative along it
 MOST_BEND = 0.75  # largest 2 |acceleration| / |step|
 
@@ -48,12 +48,12 @@ class SearchState:
 
     def take(self, which: np.ndarray) -> "SearchState":
         """Return some of the trials."""
-        every = ((field.name, getattr(self, field.name)) for field in fields(self))
-        taken: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in every}
-        return SearchState(**taken)
+        arrays = ((field.name, getattr(self, field.name)) for field in fields(self))
+        selected: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in arrays}
+        return SearchState(**selected)
 
     def accept(self, problem: DesignProblem, which: np.ndarray, trials: Trials, found: TrialResiduals, merit: np.ndarray):
-        """Replace some trials by accepted ones, and store the best of each within all limits."""
+        """Replace some trials by accepted ones, and store the best version of each trial within all limits."""
         for a, b in zip((*self.trials, *self.found), (*trials[:2], found.q, *found), strict=True):
             a[which] = b
         self.merit[which] = merit
@@ -92,16 +92,16 @@ def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int
 
 
 def begin(problem: DesignProblem, trials: Trials, threads: int | None, least: float = 0.0) -> SearchState:
-    """Return the first state of the search from some trials, for a transmission of at least `least`."""
+    """Return the first state of a search from trials, for a transmission of at least `least`."""
     members = len(trials.x)
     leasts = np.full(members, max(problem.least, least))
     margin = np.maximum(leasts**2, FIRST_MARGIN)
     found = problem.evaluate(trials, margin, threads)
     multipliers = np.zeros_like(found.limits)
     weight, damping, merit = np.full(members, FIRST_WEIGHT), np.full(members, FIRST_DAMPING), np.full(members, np.inf)
-    kept = Trials(*(a.copy() for a in trials))
-    rest = (multipliers, weight, margin, leasts, damping, merit, ~found.exists, kept, np.full(members, np.inf))
-    state = SearchState(trials, found, *rest)
+    stored = Trials(*(a.copy() for a in trials))
+    further = (multipliers, weight, margin, leasts, damping, merit, ~found.exists, stored, np.full(members, np.inf))
+    state = SearchState(trials, found, *further)
     state.keep(problem, np.arange(members))
     state.merit[found.exists] = merit_of(found, multipliers, weight)[found.exists]
     return state
@@ -121,24 +121,24 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     trials, found = state.trials.take(active), state.found.take(active)
     equations = StepEquations(problem, trials, found, state.multipliers[active], state.weight[active], state.damping[active])
     new = _stepped(problem, trials, *_bent_step(problem, equations, threads))
-    before, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
+    old_merit, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
 
     def worth(r: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < before
+        return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < old_merit
 
     trial = problem.evaluate(new, state.margin[active], threads, worth)
     exists = trial.exists & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
     merits = np.where(exists, merit_of(trial, u, weight), np.inf)
-    better, fall = merits < before, before - merits
-    taken, kept = active[better], active[~better]
-    state.accept(problem, taken, new.take(better), trial.take(better), merits[better])
-    slow = fall[better] < PRESSED * before[better]
-    settled = fall[better] < SETTLED * before[better]
-    settled[slow] |= must_continue(problem, state, taken[slow])
-    state.damping[taken] = np.maximum(RELAX * state.damping[taken], LEAST_DAMPING)
-    state.damping[kept] *= TIGHTEN
+    better, fall = merits < old_merit, old_merit - merits
+    accepted, rejected = active[better], active[~better]
+    state.accept(problem, accepted, new.take(better), trial.take(better), merits[better])
+    slow = fall[better] < PRESSED * old_merit[better]
+    settled = fall[better] < SETTLED * old_merit[better]
+    settled[slow] |= must_continue(problem, state, accepted[slow])
+    state.damping[accepted] = np.maximum(RELAX * state.damping[accepted], LEAST_DAMPING)
+    state.damping[rejected] *= TIGHTEN
     done = np.concatenate(
-        [taken[settled | (merits[better] < ROUNDING * problem.scale**2)], kept[state.damping[kept] > MOST_DAMPING]]
+        [accepted[settled | (merits[better] < ROUNDING * problem.scale**2)], rejected[state.damping[rejected] > MOST_DAMPING]]
     )
     _settle(problem, state, done)
 
@@ -148,20 +148,20 @@ def _stepped(problem: DesignProblem, trials: Trials, dx: np.ndarray, ds: np.ndar
 
 
 def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps plus half of their acceleration, unless that is long relative to the step."""
+    """Return steps plus half of their acceleration, unless it is long relative to the step."""
     dx, ds = equations.find()
     ds = in_order(problem, ds, equations.trials.s)
     trials, found = equations.trials, equations.found
-    r, limits, there = problem.residuals_at(Trials(trials.x + AHEAD * dx, trials.s + AHEAD * ds, trials.q), threads)
-    along = np.einsum("mjgp,mp->mjg", found.by_unknowns, dx) + found.by_value * ds[..., None]
-    bend_of_r = ((r - found.r) / AHEAD - along) / AHEAD
+    r, limits, exists = problem.residuals_at(Trials(trials.x + AHEAD * dx, trials.s + AHEAD * ds, trials.q), threads)
+    first_order = np.einsum("mjgp,mp->mjg", found.by_unknowns, dx) + found.by_value * ds[..., None]
+    bend_of_r = ((r - found.r) / AHEAD - first_order) / AHEAD
     bend_of_limits, count = np.zeros_like(found.limits), limits.shape[1]
     slopes = found.limits_by_unknowns[:, :count]
     bend_of_limits[:, :count] = ((limits - found.limits[:, :count]) / AHEAD - (slopes @ dx[..., None])[..., 0]) / AHEAD
-    bend_of_r[~there] = 0.0
+    bend_of_r[~exists] = 0.0
     ddx, dds = equations.correct(bend_of_r, bend_of_limits)
     ratio = 2.0 * equations.length(ddx) / np.maximum(equations.length(dx), 1e-300)
-    share = np.where(there & (ratio <= MOST_BEND), 1.0, 0.0)[:, None]
+    share = np.where(exists & (ratio <= MOST_BEND), 1.0, 0.0)[:, None]
     return dx + share * ddx, ds + share * dds
 
 
@@ -177,35 +177,35 @@ def must_continue(problem: DesignProblem, state: SearchState, which: np.ndarray)
     """Return a mask of the converged trials that must continue, with changed limits."""
     limits, u = state.found.limits[which], state.multipliers[which]
     wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > LIMIT_TOL * problem.scale
-    rows = slice(problem.lengths.count, None)  # of transmission
+    rows = slice(problem.lengths.count, None)  # limits of transmission
     return wrong | (state.margin[which] > state.least[which] ** 2) & np.any(limits[:, rows] + u[:, rows] > 0, axis=1)
 
 
 def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
     """Update the multipliers of some trials, raise their weights, and shrink their margins to the requested ones."""
-    most = MOST_WEIGHT * _height(problem, state, which)
+    largest = MOST_WEIGHT * _height(problem, state, which)
     limits, u, weight = state.found.limits[which], state.multipliers[which], state.weight[which]
     state.multipliers[which], state.settled[which] = np.maximum(0.0, limits + u), False
     margin = np.maximum(SHRINK_MARGIN * state.margin[which], state.least[which] ** 2)
     unit = MARGIN_WEIGHT * problem.scale
     state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
     state.margin[which] = margin
-    _reweigh(problem, state, which, np.maximum(weight, np.minimum(HARDEN * weight, most)))
+    _reweigh(problem, state, which, np.maximum(weight, np.minimum(HARDEN * weight, largest)))
 
 
 def raise_weights(problem: DesignProblem, state: SearchState):
     """Raise the weights of limits to match the remaining losses."""
-    every = np.arange(len(state.merit))
-    _reweigh(problem, state, every, np.maximum(state.weight, FIRST_WEIGHT * _height(problem, state, every)))
+    all_trials = np.arange(len(state.merit))
+    _reweigh(problem, state, all_trials, np.maximum(state.weight, FIRST_WEIGHT * _height(problem, state, all_trials)))
 
 
 def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
-    """Return the unit of the weights of some trials, by their losses."""
+    """Return the unit of the weights of some trials, which depends on their losses."""
     return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(state.found.take(which))))
 
 
 def _reweigh(problem: DesignProblem, state: SearchState, which: np.ndarray, weight: np.ndarray):
-    """Change the weights of some trials, with the same forces of their limits as before."""
+    """Change the weights of some trials, and the multipliers such that the forces of the limits remain the same."""
     state.multipliers[which] *= (state.weight[which] / weight)[:, None] ** 2
     state.weight[which] = weight
     merit = merit_of(state.found.take(which), state.multipliers[which], weight)

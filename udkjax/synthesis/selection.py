@@ -1,7 +1,7 @@
 """The end of a search: the best different trials within all limits, verified by their motion.
 
-`kinematics` may refuse to follow a mechanism close to a meeting of its branches. Such trials are improved further with more
-transmission, step by step, as long as they promise less loss than the best verified design.
+`kinematics` may not be able to follow a mechanism close to a meeting of its branches. Such trials are refused, and improved
+further with higher and higher limits of transmission while their loss is less than that of the best verified design.
 """
 
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from udkjax.synthesis.polish import polish
 from udkjax.synthesis.search import LIMIT_TOL, SearchState, begin, improve, loss_of
 from udkjax.synthesis.trials import Trials
 
-POLISH_STEPS = 40  # Newton steps; about five are usual at each weight of the limits
-ALIKE = 1e-3  # scales: mechanisms whose pins differ by less are the same
-STRICTER_MARGINS = (0.01, 0.03, 0.1)  # least transmissions (sines) with which refused trials are improved again, in turn
-MARGIN_STEPS = 40  # steps with each of them
-REFUSALS = 3  # before all are improved again: verifying a motion takes longer than improving sixteen trials
+POLISH_STEPS = 40  # largest number of Newton steps; about five are usual at each weight of the limits
+ALIKE = 1e-3  # mechanisms whose pins differ by less, in scales, are the same
+STRICTER_MARGINS = (0.01, 0.03, 0.1)  # limits of transmission (sines) with which refused trials are improved again, in turn
+MARGIN_STEPS = 40  # steps with each of these limits
+REFUSALS = 3  # refusals before all are improved again; to verify a motion takes longer than to improve sixteen trials
 
 
 class _Candidates(NamedTuple):
@@ -51,20 +51,20 @@ def select(problem: DesignProblem, state: SearchState, results: int, threads: in
         candidates = _within_limits(
             problem, polish(problem, improve(problem, state, MARGIN_STEPS, threads), POLISH_STEPS, threads)
         )
-    if found and len(found) < results:  # in addition to the best one
-        rest = np.flatnonzero(losses > found[0][0].loss)
-        _verify(problem, _Candidates(first.trials.take(rest), losses[rest]), results, found, REFUSALS)
+    if found and len(found) < results:  # add worse designs
+        worse = np.flatnonzero(losses > found[0][0].loss)
+        _verify(problem, _Candidates(first.trials.take(worse), losses[worse]), results, found, REFUSALS)
     reason = "the motions of all trials within the limits leave their branches or reach dead points"
     return Selection([design for design, _ in found], losses, "" if found else f"{reason}: ask for more transmission")
 
 
 def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:
-    every, loss = np.arange(len(state.merit)), loss_of(state.found)
-    good = state.found.exists & (state.excess(problem, every) <= 100 * LIMIT_TOL * problem.scale)
+    all_trials, loss = np.arange(len(state.merit)), loss_of(state.found)
+    good = state.found.exists & (state.excess(problem, all_trials) <= 100 * LIMIT_TOL * problem.scale)
     # A trial that ends beyond a limit may have been within it earlier.
-    kept = np.isfinite(state.kept_loss) & (~good | (state.kept_loss < loss))
-    trials = Trials(*(np.concatenate([a[good], b[kept]]) for a, b in zip(state.trials, state.kept, strict=True)))
-    losses = np.concatenate([loss[good], state.kept_loss[kept]])
+    from_stored = np.isfinite(state.kept_loss) & (~good | (state.kept_loss < loss))
+    trials = Trials(*(np.concatenate([a[good], b[from_stored]]) for a, b in zip(state.trials, state.kept, strict=True)))
+    losses = np.concatenate([loss[good], state.kept_loss[from_stored]])
     order = np.argsort(losses, kind="stable")
     return _Candidates(trials.take(order), losses[order])
 
@@ -72,9 +72,9 @@ def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:
 def _verify(
     problem: DesignProblem, candidates: _Candidates, results: int, found: list[tuple[FoundDesign, np.ndarray]], most: int
 ) -> np.ndarray:
-    """Add verified different designs to those found, sorted; return the candidates with less loss than the best of them.
+    """Add verified different designs to `found`, sorted; return the candidates with less loss than the best design.
 
-    The search stops after `most` refusals.
+    Verification stops after `most` refusals.
     """
     refused: list[np.ndarray] = []
     for k, loss in enumerate(candidates.loss):
@@ -82,14 +82,14 @@ def _verify(
             break
         x, s, q = (a[k] for a in candidates.trials)
         signature = np.append(problem.signature(x, q[0]), 0.0)
-        known = [*refused, *(other for _, other in found)]
-        if any(np.max(np.abs(signature - other)) < ALIKE * problem.scale for other in known):
+        known = [*refused, *(earlier for _, earlier in found)]
+        if any(np.max(np.abs(signature - earlier)) < ALIKE * problem.scale for earlier in known):
             continue
-        one = verified(problem, x, s, q, float(loss))
-        if one is None:
+        design = verified(problem, x, s, q, float(loss))
+        if design is None:
             refused.append(signature)
         else:
-            found.append((one, signature))
+            found.append((design, signature))
             found.sort(key=lambda pair: pair[0].loss)
     del found[results:]
     best = found[0][0].loss if found else np.inf

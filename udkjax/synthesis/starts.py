@@ -1,8 +1,8 @@
-"""Starts of searches: random mechanisms, turned once, moved and scaled to their targets, with values assigned in order.
+"""Starts of searches: random mechanisms, turned once, moved and scaled to their targets, with driver values assigned in order.
 
-The curve of a whole turn gives that of the moved, turned and scaled mechanism: a place p becomes a p + b, in complex numbers. The
-best a and b for an assignment of values to targets solve a linear least-squares problem; the best assignment in order, for given
-a and b, follows by dynamic programming.
+The curve of the moved, rotated and scaled mechanism follows from the curve of one turn: a place p becomes a p + b, in complex
+numbers. The best a and b for an assignment of values to targets solve a linear least-squares problem; the best assignment in
+order, for given a and b, is computed by dynamic programming.
 """
 
 from typing import NamedTuple
@@ -12,22 +12,22 @@ import numpy as np
 from udkjax.synthesis.design_problem import TURN_VALUES, DesignProblem
 from udkjax.synthesis.trials import Trials, Turn
 
-PHASES = 12  # first values tried around a turn
+PHASES = 12  # number of first values tried, evenly over a turn
 SPANS = (1.0, 0.6, 0.3)  # fractions of a turn from the first value to the last, tried for open curves
-LEAST_SCALE = 0.03  # of the curve relative to its targets: a curve that fits best as a point does not fit at all
-ROUNDS = 2  # of moving to the targets and assigning values
-CLEAR = 0.02  # least transmission over the whole turn: mechanisms closer to a meeting of branches soon reach it
+LEAST_SCALE = 0.03  # smallest factor of scaling, since a curve that fits best as a point does not fit at all
+ROUNDS = 2  # number of times that curves are moved to the targets and values assigned
+CLEAR = 0.02  # smallest transmission over the turn; mechanisms closer to a meeting of branches soon reach it
 
 
 class _Fitted(NamedTuple):
-    """Assignments: indices of values of a turn (M, J), possibly beyond it, and remaining sums of squares (M,)."""
+    """Assignments: indices of values in a turn (M, J), possibly beyond its ends, and remaining sums of squares (M,)."""
 
     places: np.ndarray
     cost: np.ndarray
 
 
 def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random.Generator, threads: int | None = None) -> Trials:
-    """Return the `count` best of some random mechanisms as trials, or fewer if fewer have all positions."""
+    """Return the `count` best of `samples` random mechanisms as trials; fewer if fewer have all positions."""
     x = np.zeros((samples, problem.unknowns))
     x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
     turn = problem.turn(x, TURN_VALUES, threads)
@@ -38,10 +38,10 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
         return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
     trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
     s, moved = trials
-    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # of lengths exceeded by scaling
-    q, there = problem.march(moved, s, threads)
-    best = np.argsort(np.where(there & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
-    best = best[there[best]]
+    cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # scaling may violate limits of lengths
+    q, exists = problem.march(moved, s, threads)
+    best = np.argsort(np.where(exists & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
+    best = best[exists[best]]
     return Trials(moved[best], s[best], q[best])
 
 
@@ -67,8 +67,8 @@ def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool)
     spans = (1.0,) if closed else SPANS
     best = _Fitted(np.zeros((len(curve), J), int), np.full(len(curve), np.inf))
     for span in spans:
-        for way in (1, -1):
-            even = way * np.round(span * K * np.arange(J) / max(J - 1, 1)).astype(int)
+        for direction in (1, -1):
+            even = direction * np.round(span * K * np.arange(J) / max(J - 1, 1)).astype(int)
             for phase in range(0, K, K // PHASES):
                 places = np.broadcast_to(phase + even, (len(curve), J))
                 cost = _move(curve[:, (phase + even) % K], target, moves)[2]
@@ -86,7 +86,7 @@ def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np
     dz, dt = z - middle[:, None], target - centre
     size = np.maximum(np.sum(np.abs(dz) ** 2, 1), 1e-300)
     a = np.sum(np.conj(dz) * dt, 1) / size
-    a = np.where(np.abs(a) ** 2 * size > LEAST_SCALE**2 * np.sum(np.abs(dt) ** 2), a, 1.0)  # not shrunk to a point
+    a = np.where(np.abs(a) ** 2 * size > LEAST_SCALE**2 * np.sum(np.abs(dt) ** 2), a, 1.0)  # do not shrink the curve to a point
     if moves == "no turn":
         a = np.maximum(np.real(a), 1e-3) + 0j
     return a, centre - a * middle, np.sum(np.abs(a[:, None] * dz - dt) ** 2, 1)
@@ -96,23 +96,23 @@ def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fit
     """Return the best assignment in order, with the same direction and first value as before."""
     M, K = curve.shape
     J, rows = len(target), np.arange(M)
-    way = np.where(before[:, -1] >= before[:, 0], 1, -1)
-    along = (before[:, :1] + way[:, None] * np.arange(-(K // 8), K + K // 8 + 1)) % K
-    cost = np.abs(np.take_along_axis(curve, along, 1)[..., None] - target) ** 2  # (M, L, J)
+    direction = np.where(before[:, -1] >= before[:, 0], 1, -1)
+    indices = (before[:, :1] + direction[:, None] * np.arange(-(K // 8), K + K // 8 + 1)) % K
+    cost = np.abs(np.take_along_axis(curve, indices, 1)[..., None] - target) ** 2  # (M, L, J)
     L = cost.shape[1]
     total, back = cost[..., 0].copy(), np.zeros((M, J, L), int)
-    total[:, K // 4 + 1 :] = np.inf  # the first one stays nearby
+    total[:, K // 4 + 1 :] = np.inf  # the first value changes by a quarter turn at most
     for j in range(1, J):
-        least = np.minimum.accumulate(total, 1)
-        where = np.maximum.accumulate(np.where(total == least, np.arange(L), 0), 1)
+        cheapest = np.minimum.accumulate(total, 1)
+        where = np.maximum.accumulate(np.where(total == cheapest, np.arange(L), 0), 1)
         total = np.full((M, L), np.inf)
-        total[:, 1:] = least[:, :-1] + cost[:, 1:, j]
+        total[:, 1:] = cheapest[:, :-1] + cost[:, 1:, j]
         back[:, j, 1:] = where[:, :-1]
     places = np.zeros((M, J), int)
     places[:, -1] = total.argmin(1)
     for j in range(J - 1, 0, -1):
         places[:, j - 1] = back[rows, j, places[:, j]]
-    return _Fitted(before[:, :1] + way[:, None] * (places - K // 8), total.min(1))
+    return _Fitted(before[:, :1] + direction[:, None] * (places - K // 8), total.min(1))
 
 
 # --- given values
@@ -122,14 +122,14 @@ def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.
     goal, moves = problem.goal, problem.can_move
     values = np.asarray(goal.values)
     x, start = x.copy(), turn.s[:, 0]
-    whole = problem.period / TURN_VALUES
+    step = problem.period / TURN_VALUES
     phases = range(0, TURN_VALUES, max(TURN_VALUES // 36, 1)) if problem.shifted else [None]
     best, chosen = np.full(len(x), np.inf), [np.ones(len(x), complex), np.zeros(len(x), complex), np.zeros(len(x))]
     for phase in phases:
         first = start if phase is not None else start * 0.0
-        shift = first + (0.0 if phase is None else phase * whole)
-        place = (shift[:, None] + values - start[:, None]) / whole % TURN_VALUES
-        measured = _interpolate(turn.measures, place)
+        shift = first + (0.0 if phase is None else phase * step)
+        index = (shift[:, None] + values - start[:, None]) / step % TURN_VALUES
+        measured = _interpolate(turn.measures, index)
         a, b = np.ones(len(x), complex), np.zeros(len(x), complex)
         if goal.has_place:
             target = problem.data[:, 0] + 1j * problem.data[:, 1]
@@ -145,7 +145,7 @@ def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.
     moved = problem.moved(x, a, b)
     if problem.shifted:
         moved[:, problem.free.count] = shift + problem.turned_by(a)
-    # At most half a period between the drawn position and the first value.
+    # The first value is at most half a period from the drawn position.
     s = np.broadcast_to(values, (len(x), len(values))).copy()
     if not problem.shifted:
         drawn = problem.value_drawn(moved)
@@ -154,8 +154,8 @@ def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.
     return (s, moved), best
 
 
-def _interpolate(table: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return rows (M, J, G) of a table (M, K + 1, G) at places (M, J) between them."""
-    low = np.clip(np.floor(place).astype(int), 0, table.shape[1] - 2)
-    one, two = (np.take_along_axis(table, k[..., None], 1) for k in (low, low + 1))
-    return one + (place - low)[..., None] * (two - one)
+def _interpolate(table: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Interpolate rows (M, J, G) of a table (M, K + 1, G) at fractional indices (M, J)."""
+    low = np.clip(np.floor(index).astype(int), 0, table.shape[1] - 2)
+    lower, upper = (np.take_along_axis(table, k[..., None], 1) for k in (low, low + 1))
+    return lower + (index - low)[..., None] * (upper - lower)

@@ -6,7 +6,7 @@ The value s_j of a position affects only its own residuals r_j(x, s_j). It is th
     A = sum_j J_j^T J_j,  w_j = a_j^T J_j,  g_j = a_j^T r_j,  h_j = a_j^T a_j,
 
 with a damping added to each diagonal. Limits add rows w max(0, c + u). Bounds are enforced by active sets: unknowns that would
-leave them are held.
+leave their bounds are fixed.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ import numpy as np
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
-LONGEST_MOVE = 0.5  # largest change of an unknown in one step, in scales
-ACTIVE_SETS = 5  # iterations of a step for its active limits
-GAP_SHARE = 0.45  # largest move of a value in one step, relative to the gap to the next value: keeps their order
+LONGEST_MOVE = 0.5  # largest change of an unknown in one step, relative to its scale
+ACTIVE_SETS = 5  # largest number of iterations to determine the active limits of a step
+GAP_SHARE = 0.45  # largest change of a value in one step, relative to the gap to its neighbours; keeps values in order
 REGULAR = float(np.finfo(float).eps)  # regularization, relative to the largest diagonal entry
 
 
 class StepEquations:
-    """The linear least-squares problem of a step of some trials: `find` solves it, `correct` solves it for other residuals."""
+    """The linear least-squares problem of a step of some trials; `find` solves it, `correct` solves it for other residuals."""
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class StepEquations:
 
 
 def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return matrices with the rows and columns of held unknowns replaced by those of the unit matrix."""
+    """Return matrices with the rows and columns of fixed unknowns replaced by those of the unit matrix."""
     if not held.any():
         return matrix
     matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, matrix)
@@ -114,12 +114,12 @@ def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def in_order(problem: DesignProblem, ds: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Shorten changes of values to keep their cyclic order over the period; the ends of a closed curve may meet."""
+    """Shorten changes of values to preserve their cyclic order over the period; the ends of a closed curve may coincide."""
     if not problem.local:
         return ds
     gap = np.abs(np.diff(s, axis=1))
     period = np.inf if problem.is_closed else problem.period
     last = np.maximum(period - np.abs(s[:, -1:] - s[:, :1]), 0.0)
     gap = np.concatenate([gap, last], 1)
-    most = GAP_SHARE * np.minimum(gap, np.roll(gap, 1, axis=1))
-    return np.clip(ds, -most, most)
+    longest = GAP_SHARE * np.minimum(gap, np.roll(gap, 1, axis=1))
+    return np.clip(ds, -longest, longest)

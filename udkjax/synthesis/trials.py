@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Trials(NamedTuple):
-    """M trials: unknowns x (M, P), and at each position of the goal the driver's value s (M, J) and the position q (M, J, n)."""
+    """M trials: unknowns x (M, P), and at each position of the goal the driver's value s (M, J) and coordinates q (M, J, n)."""
 
     x: np.ndarray
     s: np.ndarray
@@ -23,13 +23,13 @@ class TrialResiduals(NamedTuple):
     Attributes:
         q: positions (M, J, n).
         r: residuals (M, J, G).
-        by_value: their derivatives by s (M, J, G).
-        by_unknowns: their derivatives by x (M, J, G, P).
+        by_value: derivatives of r by s (M, J, G).
+        by_unknowns: derivatives of r by x (M, J, G, P).
         terms: residuals of motion goals (M, T).
-        terms_by_unknowns: their derivatives by x (M, T, P).
-        transmission: (M, J), with the sign of the branch.
+        terms_by_unknowns: derivatives of terms by x (M, T, P).
+        transmission: transmission at each position (M, J), with the sign of the branch.
         limits: rows (M, K) that must not exceed zero, in the unit of residuals.
-        limits_by_unknowns: their derivatives by x (M, K, P).
+        limits_by_unknowns: derivatives of limits by x (M, K, P).
         exists: whether all positions of a trial exist (M,).
     """
 
@@ -50,7 +50,7 @@ class TrialResiduals(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and which were reached."""
+    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and whether reached."""
 
     s: np.ndarray
     measures: np.ndarray

@@ -1,8 +1,8 @@
 """Ball arithmetic: arrays of real numbers with radii that enclose all rounding errors.
 
-A ball has a middle and a radius. Middles have the longest floating-point type of the processor, or are exact fractions; each
-operation adds a bound of its rounding error to the radius. Radii, in float64, are rounded up by INFLATE, which exceeds the loss
-of all operations of a certificate.
+A ball has a midpoint and a radius. Midpoints have the longest floating-point type of the processor, or are exact fractions; each
+operation adds a bound of its rounding error to the radius. Radii, in float64, are rounded up by INFLATE, which exceeds the
+rounding errors of all operations of a certificate.
 """
 
 from fractions import Fraction
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 LONG = np.longdouble
-ROUNDING = float(np.finfo(LONG).eps)  # twice the largest relative error of one operation on middles
-INFLATE = 1.0 + 1e-10  # factor of a radius in each operation: some 1e6 roundings of float64
-SMALLEST = float(np.finfo(float).tiny)  # bound of the loss by underflow
+ROUNDING = float(np.finfo(LONG).eps)  # twice the largest relative error of one operation on midpoints
+INFLATE = 1.0 + 1e-10  # factor of a radius in each operation; covers about 1e6 roundings of float64
+SMALLEST = float(np.finfo(float).tiny)  # bound of the error by underflow
 
 
 class Ball(NamedTuple):
@@ -32,7 +32,7 @@ class Ball(NamedTuple):
 
     @classmethod
     def fractions(cls, x: Any) -> "Ball":
-        """Return numbers as exact balls, whose middles are fractions."""
+        """Return numbers as exact balls, whose midpoints are fractions."""
         x = np.asarray(x, LONG)
         high = x.astype(float)
         low = (x - high).astype(float)
@@ -59,8 +59,8 @@ class Ball(NamedTuple):
 
     def __mul__(self, other: Any) -> "Ball":  # pyright: ignore[reportIncompatibleMethodOverride]
         b = self._like(other)
-        mid, one, two = self.mid * b.mid, _size(self.mid), _size(b.mid)
-        return Ball(mid, _up(one * b.rad + two * self.rad + self.rad * b.rad + _rounding(mid)))
+        mid, size, b_size = self.mid * b.mid, _size(self.mid), _size(b.mid)
+        return Ball(mid, _up(size * b.rad + b_size * self.rad + self.rad * b.rad + _rounding(mid)))
 
     __rmul__ = __mul__  # pyright: ignore[reportAssignmentType]
 
@@ -74,7 +74,7 @@ class Ball(NamedTuple):
         return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
 
     def _like(self, x: Any) -> "Ball":
-        """Return numbers as balls of the same type as these."""
+        """Return numbers as balls of the type of `self`."""
         if isinstance(x, Ball):
             return x
         return Ball.fractions(x) if self.mid.dtype == object else Ball.of(x)
@@ -85,12 +85,12 @@ class Ball(NamedTuple):
 
     @property
     def largest(self) -> np.ndarray:
-        """The largest modulus of any number of the ball, in float64."""
+        """The largest modulus of the numbers in each ball, in float64."""
         return _up(_size(self.mid) + self.rad)
 
     @property
     def least(self) -> np.ndarray:
-        """The least modulus of any number of the ball, in float64; zero or less if the ball contains zero."""
+        """The smallest modulus of the numbers in each ball, in float64; zero or less if the ball contains zero."""
         return (_size(self.mid) / INFLATE - self.rad) / INFLATE
 
     def overlaps(self, other: "Ball") -> np.ndarray:
@@ -115,8 +115,8 @@ class ComplexBall(NamedTuple):
 
     def __truediv__(self, other: "ComplexBall") -> "ComplexBall":
         size = other.re * other.re + other.im * other.im
-        found = self * ComplexBall(other.re, -other.im)
-        return ComplexBall(found.re / size, found.im / size)
+        product = self * ComplexBall(other.re, -other.im)
+        return ComplexBall(product.re / size, product.im / size)
 
     def part(self, index: Any) -> "ComplexBall":
         """Return some of the numbers."""
@@ -127,7 +127,7 @@ class ComplexBall(NamedTuple):
         return self.re.overlaps(other.re) & self.im.overlaps(other.im)
 
     def distance(self, z: np.ndarray) -> np.ndarray:
-        """Return the largest distance of any number of these from complex numbers."""
+        """Return the largest distance between the numbers of each ball and complex numbers."""
         return np.hypot((self.re - np.real(z)).largest, (self.im - np.imag(z)).largest) * INFLATE
 
 

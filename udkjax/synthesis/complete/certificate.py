@@ -1,4 +1,4 @@
-"""Certificates of real solutions: proofs, in floating-point numbers, that a system has one near an approximate one.
+"""Certificates of real solutions: proofs, in floating-point numbers, that a system has exactly one close to an approximation.
 
 Krawczyk's theorem: F has continuous derivatives, m is a point, U the box of all u with |u - m| <= r, Y any matrix. If
 
@@ -17,23 +17,23 @@ import numpy as np
 
 from udkjax.synthesis.complete.balls import INFLATE, LONG, ROUNDING, SMALLEST, Ball
 
-WIDTHS = (2.0, 16.0)  # of a box, relative to its Newton step
-LEAST_SHARE = 1e-3  # least width in a component, relative to the largest one
-NEWTON_STEPS, EXACT_STEPS = 10, 4  # at most; each doubles the digits
-FARTHEST = 1e8  # beyond it Newton's method has gone to infinity
-SURE = 1e-3  # largest relative Newton step, rounding included, for which more digits help
+WIDTHS = (2.0, 16.0)  # half-widths of the boxes tried in turn, relative to the Newton step
+LEAST_SHARE = 1e-3  # smallest width of a box in a component, relative to its largest width
+NEWTON_STEPS, EXACT_STEPS = 10, 4  # largest numbers of steps; each step doubles the number of correct digits
+FARTHEST = 1e8  # Newton's method has diverged beyond this size of the unknowns
+SURE = 1e-3  # largest relative Newton step, including rounding, for which exact arithmetic is tried
 EPS = float(np.finfo(float).eps)
 
 BallFunction = Callable[[Ball], tuple[Ball, Ball]]
 
 
 class Certificate(NamedTuple):
-    """Boxes of M approximate solutions of N equations.
+    """Boxes around M approximate solutions of N equations.
 
     Attributes:
         middle: centres (N, M), improved by Newton's method, in the longest floating-point type.
         radius: radii of the boxes (N, M).
-        is_proven: whether each box has exactly one solution (M,).
+        is_proven: whether each box is proven to contain exactly one solution (M,).
     """
 
     middle: np.ndarray
@@ -51,7 +51,7 @@ class Certificate(NamedTuple):
 
 
 def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = None) -> Certificate:
-    """Improve approximate solutions and prove them.
+    """Improve approximate solutions and prove that exact ones are close to them.
 
     Args:
         system: maps unknowns (N, M) to F (N, M) and F' (N, N, M), as balls.
@@ -59,22 +59,22 @@ def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = No
         exact: the same system for fractions, used for solutions that need more digits.
 
     Returns:
-        Their boxes; solutions at which F' is singular up to rounding remain unproven.
+        Boxes around the solutions; those at which F' is singular to within rounding remain unproven.
     """
     m, inverse = _improved(system, np.asarray(u, LONG))
     F, _ = system(Ball.of(m))
-    found = _prove(system, m, inverse, F)
+    result = _prove(system, m, inverse, F)
     step = np.max(_product(inverse, F) / np.maximum(np.abs(m).astype(float), 1.0), axis=0)
-    uncertain = np.flatnonzero(~found.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
+    uncertain = np.flatnonzero(~result.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
     if exact is None or not len(uncertain):
-        return found
+        return result
     m, inverse = m[:, uncertain], inverse[uncertain]
     for _ in range(EXACT_STEPS):
         m = m - np.einsum("mij,jm->im", inverse, _evaluate(exact, m).mid)
     second = _prove(system, m, inverse, _evaluate(exact, m))
-    for old, new in zip(found, second, strict=True):
+    for old, new in zip(result, second, strict=True):
         old[..., uncertain] = new
-    return found
+    return result
 
 
 def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
@@ -84,7 +84,7 @@ def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
 
 
 def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
-    """Return boxes around points, given F at these; boxes that satisfy Krawczyk's condition are proven."""
+    """Return boxes around points with values F; boxes that satisfy Krawczyk's condition are proven."""
     proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     step = _product(inverse, F)
     size = np.maximum(np.abs(m).astype(float), 1.0)
@@ -99,7 +99,7 @@ def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) ->
 
 
 def _improved(system: BallFunction, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points improved by Newton's method, F in long numbers, and inverses of F' (M, N, N) there."""
+    """Return points improved by Newton's method, with F in the longest type, and the inverses of F' (M, N, N)."""
     for k in range(NEWTON_STEPS + 1):
         F, slopes = system(Ball.of(m))
         inverse = _inverses(np.moveaxis(slopes.mid, -1, 0).astype(float))
@@ -120,8 +120,8 @@ def _inverses(A: np.ndarray) -> np.ndarray:
         A = A / columns
         singular = np.linalg.slogdet(A)[0] == 0
         A = np.where(singular[:, None, None], np.eye(A.shape[1]), A)
-        found = np.linalg.inv(A) / np.moveaxis(columns, 1, 2) / np.moveaxis(rows, 1, 2)
-    return np.where(singular[:, None, None], np.nan, found)
+        inverses = np.linalg.inv(A) / np.moveaxis(columns, 1, 2) / np.moveaxis(rows, 1, 2)
+    return np.where(singular[:, None, None], np.nan, inverses)
 
 
 def _product(Y: np.ndarray, F: Ball) -> np.ndarray:
@@ -138,6 +138,6 @@ def _contraction(Y: np.ndarray, slopes: Ball, r: np.ndarray) -> np.ndarray:
     n = len(r)
     A = np.moveaxis(slopes.mid, -1, 0).astype(float)
     rad = np.moveaxis(slopes.rad, -1, 0) + EPS * np.abs(A)  # for the rounding to float64 above
-    rest = np.abs(np.eye(n) - Y @ A) * (1.0 + EPS)
-    rest = rest + np.abs(Y) @ (rad + (n + 2) * EPS * np.abs(A)) * INFLATE + EPS
-    return (rest @ r.T[..., None])[..., 0].T * INFLATE
+    difference = np.abs(np.eye(n) - Y @ A) * (1.0 + EPS)
+    difference = difference + np.abs(Y) @ (rad + (n + 2) * EPS * np.abs(A)) * INFLATE + EPS
+    return (difference @ r.T[..., None])[..., 0].T * INFLATE

@@ -35,10 +35,10 @@ from udkjax.synthesis.limits import LengthLimits, Range, read_bounds
 
 
 class _Solutions(NamedTuple):
-    """Four-bars with their certificates: radius (m), class and cognate of each, and counts of all.
+    """Four-bars with the radius (m), class and cognate of each, and the counts of solutions.
 
-    `others` has the kind of each other solution, and its joints by letter relative to the first place of the goal, as x + i y and
-    x - i y.
+    `others` has the kind of each unusable solution and its joints by letter, relative to the first place of the goal, as
+    x + i y and x - i y.
     """
 
     bars: FourBars
@@ -63,19 +63,21 @@ def design_all(
 ) -> CompleteDesigns:
     """Find all four-bars whose coupler point passes through nine places, or whose coupler passes through five poses.
 
-    Nine places have 1,442 classes of complex solutions, all followed by a homotopy; five poses have four dyads, the eigenvectors
-    of a matrix. Each real solution is proven: by Krawczyk's theorem, with all rounding errors bounded, exactly one four-bar that
-    meets the goal exactly lies within `radius` of its pins. It is not proven that no others exist; `paths` counts the outcomes of
-    all solutions. Positions are then assigned to circuits and branches, and the motions are verified.
+    Nine places have 1,442 classes of complex solutions, all tracked by a homotopy; five poses have four dyads, computed as
+    eigenvectors of a matrix. Each real solution is proven: by Krawczyk's theorem, with all rounding errors bounded, exactly one
+    four-bar that meets the goal exactly lies within `radius` of its pins. There is no proof that further solutions do not
+    exist; `paths` counts the outcomes of all tracked solutions. Positions are then assigned to circuits and branches, and the
+    motions are verified.
 
     Args:
-        drawing: a four-bar: a crank and a rocker with two pins each, and a coupler with a third pin; their places do not matter.
-        goal: a `PathGoal` with nine targets for the coupler's pin, or a `PoseGoal` with five for the coupler and that pin
-            (`pin`); without values of the driver. Angles count from the first pose.
+        drawing: a four-bar: a crank and a rocker with two pins each, and a coupler with a third pin; the positions of the pins
+            do not matter.
+        goal: a `PathGoal` with nine targets for the coupler's pin, or a `PoseGoal` with five for the coupler and its third
+            pin (`pin`); without values of the driver. Angles count from the first pose.
         driver: a driver or coordinate that is the angle of a link on the ground; by default the only driver.
-        bounds: (low, high) by the names of pins, such as `pin.O` (m), in the first position. Designs beyond limits are left out.
+        bounds: (low, high) by the names of pins, such as `pin.O` (m), in the first position. Designs beyond them are left out.
         lengths: (least, most) distances (m) by pairs of pins.
-        areas: circles and polygons by pins, as for `design`, in the first position.
+        areas: circles and polygons by pin, as for `design`, in the first position.
         transmission: the least distance (rad) of the transmission angle from 0 and pi in all positions.
         rotation: whether the driver has to make a whole turn.
 
@@ -84,7 +86,7 @@ def design_all(
 
     Raises:
         SceneError: the drawing is not a four-bar, the driver does not turn a crank, or a limit is invalid.
-        ValueError: the goal has another number of positions, or its solutions are not isolated.
+        ValueError: the goal has the wrong number of positions, or its solutions are not isolated.
     """
     mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
     if goal.values is not None:
@@ -99,22 +101,22 @@ def design_all(
     solutions = _through_points(goal.targets) if isinstance(goal, PathGoal) else _through_poses(goal.targets)
     bars, both = solutions.bars, np.tile(np.arange(len(solutions.radius)), 2)
     bars = stack_four_bars([bars, bars.swapped()])
-    found = classify(bars)
-    confirmed = check_motions(bars, found)
+    classification = classify(bars)
+    confirmed = check_motions(bars, classification)
     least = np.min(np.abs(bars.transmission), axis=1)
-    doubtful = (found.defect == 0) & ~confirmed.all(axis=1)
+    doubtful = (classification.defect == 0) & ~confirmed.all(axis=1)
     places = drawn.places(bars, np.arange(len(bars.O)), np.zeros(len(bars.O), int))
-    best = np.lexsort((-least, ~found.turns, doubtful, found.defect))
-    best = best[keeps(places, least, found.turns)[best]]
+    best = np.lexsort((-least, ~classification.turns, doubtful, classification.defect))
+    best = best[keeps(places, least, classification.turns)[best]]
     return CompleteDesigns(
         {name: place[best] for name, place in places.items()},
-        drawn.values(bars, found.values)[best],
-        tuple(KINDS[k] for k in found.kind[best]),
-        found.turns[best],
-        tuple(DEFECTS[k] for k in found.defect[best]),
-        found.circuits[best],
-        found.branches[best],
-        found.order[best],
+        drawn.values(bars, classification.values)[best],
+        tuple(KINDS[k] for k in classification.kind[best]),
+        classification.turns[best],
+        tuple(DEFECTS[k] for k in classification.defect[best]),
+        classification.circuits[best],
+        classification.branches[best],
+        classification.order[best],
         least[best],
         confirmed[best],
         solutions.radius[both][best],
@@ -131,7 +133,7 @@ def design_all(
 
 
 class _Limits:
-    """Limits of complete designs: bounds, lengths and areas of pins, transmission and rotation."""
+    """Limits of complete designs: bounds and areas of pins, distances between them, transmission and rotation."""
 
     def __init__(
         self,
@@ -172,17 +174,17 @@ class CompleteSearch(NamedTuple):
 
 
 def _through_points(targets: np.ndarray) -> _Solutions:
-    found = find_real_classes(targets)
-    J, u, R = len(targets), found.boxes.middle.astype(float), found.boxes.middle.shape[1]
+    classes = find_real_classes(targets)
+    J, u, R = len(targets), classes.boxes.middle.astype(float), classes.boxes.middle.shape[1]
     P = targets[:, 0] + 1j * targets[:, 1]
-    x, r, y, s = found.scale * (u[0:8:2] + 1j * u[1:8:2])
+    x, r, y, s = classes.scale * (u[0:8:2] + 1j * u[1:8:2])
     turns = np.concatenate([np.ones((1, R)), 1.0 + u[8 : 7 + J] + 1j * u[7 + J :]]).T
     bars = FourBars(P[0] + x - r, P[0] + y - s, P + turns * x[:, None], P + turns * y[:, None], P)
     cognates = bars.cognates()
-    joints = cognate_joints(found.boxes)
-    radii = [radius_of(joint, bar, P[0], found.scale) for joint, bar in zip(joints, cognates, strict=True)]
-    counts = {k: v for k, v in found.paths._asdict().items() if v or k in ("tracked", "regular")}
-    numbers, z = np.tile(np.arange(R), 3), found.scale * found.ends.joints.reshape(4, 2, -1)
+    joints = cognate_joints(classes.boxes)
+    radii = [radius_of(joint, bar, P[0], classes.scale) for joint, bar in zip(joints, cognates, strict=True)]
+    counts = {k: v for k, v in classes.paths._asdict().items() if v or k in ("tracked", "regular")}
+    numbers, z = np.tile(np.arange(R), 3), classes.scale * classes.ends.joints.reshape(4, 2, -1)
     joints = {"O": z[0] - z[1], "C": z[2] - z[3], "A": z[0], "B": z[2]}
     return _Solutions(
         stack_four_bars(list(cognates)),
@@ -190,26 +192,26 @@ def _through_points(targets: np.ndarray) -> _Solutions:
         numbers,
         np.repeat(np.arange(3), R),
         R,
-        [(kind, {name: place[:, k] for name, place in joints.items()}) for k, kind in enumerate(found.ends.kinds)],
+        [(kind, {name: place[:, k] for name, place in joints.items()}) for k, kind in enumerate(classes.ends.kinds)],
         counts,
     )
 
 
 def _through_poses(targets: np.ndarray) -> _Solutions:
-    found = find_real_dyads(targets)
-    u, P = found.scale * found.boxes.middle.astype(float), targets[:, 0] + 1j * targets[:, 1]
+    dyads = find_real_dyads(targets)
+    u, P = dyads.scale * dyads.boxes.middle.astype(float), targets[:, 0] + 1j * targets[:, 1]
     pairs = np.array(list(combinations(range(u.shape[1]), 2)), int).reshape(-1, 2)
     joint, crank = u[0] + 1j * u[1], u[2] + 1j * u[3]
-    pivots, joints = P[0] + joint - crank, P + found.turns * joint[:, None]
-    one, two = pairs.T
-    bars = FourBars(pivots[one], pivots[two], joints[one], joints[two], P)
-    joint, crank = (ComplexBall(found.boxes.balls.part(k), found.boxes.balls.part(k + 1)) for k in (0, 2))
+    pivots, joints = P[0] + joint - crank, P + dyads.turns * joint[:, None]
+    first, second = pairs.T
+    bars = FourBars(pivots[first], pivots[second], joints[first], joints[second], P)
+    joint, crank = (ComplexBall(dyads.boxes.balls.part(k), dyads.boxes.balls.part(k + 1)) for k in (0, 2))
     pivot = joint - crank
-    boxes = FourBarBoxes(pivot.part(one), pivot.part(two), joint.part(one), joint.part(two))
-    radii = radius_of(boxes, bars, P[0], found.scale)
-    counts = {"dyads": DYADS, "infinite": found.infinite}
-    numbers, dyads = np.arange(len(pairs)), found.scale * found.unproven.T
-    others = [("unproven", {"A": _isotropic(*v[:2]), "O": _isotropic(*(v[:2] - v[2:]))}) for v in dyads]
+    boxes = FourBarBoxes(pivot.part(first), pivot.part(second), joint.part(first), joint.part(second))
+    radii = radius_of(boxes, bars, P[0], dyads.scale)
+    counts = {"dyads": DYADS, "infinite": dyads.infinite}
+    numbers, unproven = np.arange(len(pairs)), dyads.scale * dyads.unproven.T
+    others = [("unproven", {"A": _isotropic(*v[:2]), "O": _isotropic(*(v[:2] - v[2:]))}) for v in unproven]
     return _Solutions(bars, radii, numbers, np.zeros(len(pairs), int), u.shape[1], others, counts)
 
 

@@ -14,7 +14,7 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import AbstractDrawing, Mechanism
 
-NEARLY_REAL = 1e-4  # relative to the extent: singular ends are accurate to the root of rounding at best
+NEARLY_REAL = 1e-4  # relative to the extent; singular ends are at best accurate to the square root of the rounding error
 
 
 class CompleteDesign(PrintsTable):
@@ -26,14 +26,14 @@ class CompleteDesign(PrintsTable):
         kind: Grashof's kind: "crank-rocker", "double crank", "double rocker", "rocker-crank" or "triple rocker".
         turns: whether the driver makes a whole turn.
         defect: "none" if one motion of the driver passes all positions in order; "circuit" if the four-bar has to be taken apart
-            in between, "branch" if it passes a dead point of the driver, "order" if it passes them in another order.
+            in between, "branch" if it passes a dead point of the driver, "order" if it passes the positions in another order.
         circuits: the circuit of each position (J,), numbered from that of the first position, 0.
-        branches: the branch of each position (J,), numbered alike.
-        order: the positions in the order of a motion along the circuit of the first one.
-        transmission: the least over the positions, from 0 to 1: the sine of the transmission angle.
+        branches: the branch of each position (J,), numbered in the same way.
+        order: indices of the positions in the order of a motion along the circuit of the first one.
+        transmission: the smallest sine of the transmission angle over the positions, from 0 to 1.
         confirmed: mask of the positions (J,) reached by motions of the mechanism from the first position of their branch.
         radius: largest distance (m) of the pins from those of the exact four-bar.
-        number: the number of its class: four-bars of one class trace the same curve.
+        number: the number of its class; four-bars of one class trace the same curve.
         cognate: index within the class (0, 1, 2).
         driver: the driver.
     """
@@ -54,7 +54,7 @@ class CompleteDesign(PrintsTable):
     driver: Drive = eqx.field(static=True)
 
     def motion(self, count: int = 361) -> Kinematics:
-        """Return a motion from the first position by `kinematics`: a whole turn, or to the farthest position of its branch.
+        """Return a motion by `kinematics` from the first position: a whole turn, or to the farthest position of its branch.
 
         Args:
             count: number of values.
@@ -88,8 +88,8 @@ class OtherSolution(NamedTuple):
     """A solution that is not a design: the end of a path, or a real solution without a proof.
 
     Attributes:
-        kind: "singular" if solutions meet or are not isolated, "infinite" if a joint goes to infinity, "lost" if the path was not
-            followed to its end; "unproven" if a real solution is too close to singular for a proof.
+        kind: "singular" if solutions meet or are not isolated, "infinite" if a joint goes to infinity, "lost" if the path could
+            not be tracked to its end; "unproven" if a real solution is too close to singular for a proof.
         pins: the coordinates of the pins in the first position by name (2,) (m), complex unless the solution is real.
     """
 
@@ -106,26 +106,27 @@ class OtherSolution(NamedTuple):
 class CompleteDesigns(PrintsTable):
     """All four-bars that meet a goal: a sequence of `CompleteDesign`, created on access.
 
-    They are sorted by defect (without defects first, of these the confirmed ones), then by turning driver, then by transmission.
-    Each four-bar occurs twice, with its crank on either side; through nine points each class has three cognates.
+    They are sorted by defect (designs without a defect first, and among these the confirmed ones), then by whether the driver
+    turns fully, then by transmission.
+    Each four-bar occurs twice, driven from either side; each class of four-bars through nine points has three cognates.
 
     Attributes:
-        pins: the pins of each in the first position, by name (M, 2), in m.
+        pins: the places of the pins in the first position, by name (M, 2), in m.
         values: the driver's values in the positions (M, J) (rad).
-        kinds: the kind of each.
+        kinds: Grashof's kind of each design.
         turns: whether the driver makes a whole turn (M,).
-        defects: the defect of each.
+        defects: the defect of each design.
         circuits: the circuit of each position (M, J).
         branches: the branch of each position (M, J).
-        order: the positions in the order of a motion (M, J), then -1.
-        transmission: the least over the positions (M,).
-        confirmed: mask of the positions reached by motions (M, J).
+        order: indices of the positions in the order of a motion (M, J), padded with -1.
+        transmission: the smallest sine of the transmission angle over the positions (M,).
+        confirmed: mask of the positions that motions reach (M, J).
         radius: radii of the certificates (M,) (m).
         numbers: numbers of the classes (M,).
         cognates: indices within the classes (M,).
-        classes: number of different proven real classes (through poses: of dyads).
+        classes: number of different proven real classes; for poses, number of proven real dyads.
         others: the other solutions, including complex ones, that are singular, infinite, lost or unproven.
-        left_out: number of designs left out because they exceed a limit.
+        left_out: number of designs that exceed a limit.
         paths: counts of all solutions of the problem, including complex ones, by outcome.
         mechanism: the mechanism of the given drawing.
         coupler: the name of its coupler.

@@ -1,4 +1,4 @@
-"""Roles of the pins of a drawn four-bar, and batches of it in given positions."""
+"""Roles of the pins of a drawn four-bar, and its pins and driver's values in batches."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -23,8 +23,8 @@ class DrawnFourBar(NamedTuple):
         driver: the driver of the crank.
         pins: the pins by role: O, A, B, C, P.
         coupler: the link with the traced point.
-        sign: 1.0 if the driver is the crank's angle, -1.0 if it is minus that.
-        is_reversed: whether the crank's own axis points from A to O.
+        sign: 1.0 if the driver is the crank's angle, -1.0 if it is the negative angle.
+        is_reversed: whether the x axis of the crank's frame points from A to O.
     """
 
     mechanism: Mechanism
@@ -35,20 +35,20 @@ class DrawnFourBar(NamedTuple):
     is_reversed: bool
 
     def places(self, bars: FourBars, which: np.ndarray, position: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the pins (M, 2) of some four-bars (M,), each drawn in a position (M,)."""
+        """Return the places (M, 2) of the pins of M four-bars by name, each in the position of index (M,)."""
         joints = {"O": bars.O[which], "C": bars.C[which], "P": bars.P[position]}
         joints |= {"A": bars.A[which, position], "B": bars.B[which, position]}
         return {f"pin.{self.pins[key]}": np.stack([np.real(z), np.imag(z)], 1) for key, z in joints.items()}
 
     def coordinates(self, joints: Mapping[str, np.ndarray], start: np.ndarray) -> dict[str, np.ndarray]:
-        """Return complex x, y (2,) by the names of pins, of joints given by x + i y and x - i y relative to a place (2,)."""
+        """Return complex x, y (2,) by the names of pins, from x + i y and x - i y of joints relative to a place (2,)."""
         return {f"pin.{self.pins[key]}": start + np.array([z + w, (z - w) / 1j]) / 2 for key, (z, w) in joints.items()}
 
     def values(self, bars: FourBars, angles: np.ndarray) -> np.ndarray:
-        """Return the driver's values (M, J) (rad) at angles of the crank, counted as in the drawn mechanism."""
-        own = bars.crank_angles[:, :1] + np.pi * self.is_reversed
-        own = own - 2 * np.pi * np.ceil((own - np.pi) / (2 * np.pi))
-        return self.sign * (own + angles - angles[:, :1])
+        """Return the driver's values (M, J) (rad) at crank angles, with the origin of the drawn mechanism's driver."""
+        drawn = bars.crank_angles[:, :1] + np.pi * self.is_reversed
+        drawn = drawn - 2 * np.pi * np.ceil((drawn - np.pi) / (2 * np.pi))
+        return self.sign * (drawn + angles - angles[:, :1])
 
 
 def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourBar:
@@ -59,10 +59,14 @@ def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourB
     ground: tuple[str, ...] = getattr(mechanism.drawing, "ground")  # noqa: B009  # of a drawing, whose class is above
     links = {name: list(getattr(link, "pins")) for name, link in groups["link"].items()}  # noqa: B009
     point = point.removeprefix("pin.")
-    held = {name: pins for name, pins in links.items() if set(pins) & set(ground)}
-    free = [name for name in links if name not in held]
+    pivoting = {name: pins for name, pins in links.items() if set(pins) & set(ground)}
+    free = [name for name in links if name not in pivoting]
     problems = [f"a four-bar has no {section}s: delete them" for section in OTHERS if groups.get(section)]
-    if len(links) != 3 or len(free) != 1 or any(len(pins) != 2 or len(set(pins) & set(ground)) != 1 for pins in held.values()):
+    if (
+        len(links) != 3
+        or len(free) != 1
+        or any(len(pins) != 2 or len(set(pins) & set(ground)) != 1 for pins in pivoting.values())
+    ):
         problems.append(
             "a four-bar has three links: two with two pins each, one of them on the ground, and one that connects these links"
         )
@@ -70,22 +74,22 @@ def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourB
         raise SceneError([f"drawing: {p}" for p in problems], mechanism.name)
     (coupler,), pins = free, links[free[0]]
     element = element_of(mechanism, driver) if driver is not None else None
-    turned = [] if element is None else [body for body in element.bodies if body in held]
+    turned = [] if element is None else [body for body in element.bodies if body in pivoting]
     if element is None or element.coordinate != "angle" or GROUND not in element.bodies or not turned:
-        cure = f"drive the angle of {' or '.join(map(quote, held))} against the ground"
+        cure = f"drive the angle of {' or '.join(map(quote, pivoting))} against the ground"
         raise SceneError([f"driver: all solutions are classified for a crank: {cure}"], mechanism.name)
-    crank, (other,) = turned[0], [name for name in held if name != turned[0]]
-    found = {"P": point}
+    crank, (other,) = turned[0], [name for name in pivoting if name != turned[0]]
+    roles = {"P": point}
     for name, (fixed, moving) in ((crank, "OA"), (other, "CB")):
-        found[fixed] = next(p for p in held[name] if p in ground)
-        found[moving] = next(p for p in held[name] if p not in ground)
-    if {*pins} != {found["A"], found["B"], point} or len(pins) != 3:
+        roles[fixed] = next(p for p in pivoting[name] if p in ground)
+        roles[moving] = next(p for p in pivoting[name] if p not in ground)
+    if {*pins} != {roles["A"], roles["B"], point} or len(pins) != 3:
         raise SceneError(
             [
-                f"goal: the coupler {quote(coupler)} must have the pins {quote(found['A'])}, {quote(found['B'])} and the point "
+                f"goal: the coupler {quote(coupler)} must have the pins {quote(roles['A'])}, {quote(roles['B'])} and the point "
                 f"of the goal, {quote(point)}; it has {', '.join(map(quote, pins))}"
             ],
             mechanism.name,
         )
     sign = 1.0 if element.bodies[0] == GROUND else -1.0
-    return DrawnFourBar(mechanism, driver, found, coupler, sign, held[crank][0] != found["O"])
+    return DrawnFourBar(mechanism, driver, roles, coupler, sign, pivoting[crank][0] != roles["O"])

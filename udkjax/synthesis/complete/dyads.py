@@ -1,18 +1,18 @@
-"""Equations of dyads and four-bars: in real coordinates for numbers and balls; in isotropic ones as a program for path tracking.
+"""Equations of dyads and four-bars: in real coordinates for arrays and balls, in isotropic ones as a program for path tracking.
 
-x leads from the traced point of a dyad to its moving joint, and r along its crank from the fixed joint to the moving one, both in
-the first position. If the point moves by d and the link turns by the angle of cosine 1 + p and sine s, the joint moves by e, and
-the crank keeps its length:
+x points from the traced point of a dyad to its moving joint, and r from its fixed joint to the moving one, both in the first
+position. If the point moves by d and the link turns by the angle with cosine 1 + p and sine s, the joint moves by e, and the
+length of the crank is constant:
 
     g(x, r) = e . e / 2 + e . r = 0,      e = d + [[p, -s], [s, p]] x.
 
 In isotropic coordinates a point p = (px, py) is the pair of complex numbers z = px + i py and Z = px - i py; they are
-independent unknowns, so that complex solutions are included. With a turn by the angle of 1 + f, |1 + f| = 1,
+independent unknowns, so that complex solutions are included. With a turn by the angle of the complex number 1 + f, |1 + f| = 1,
 
     g(x, X, r, R, f; d, D) = e E + e R + E r = 0,      e = d + f x,      E = D + F X,      F = 1 / (1 + f) - 1.
 
 The two dyads (x, r) and (y, s) of a four-bar share f. Nine points give eight displacements: sixteen equations for x, X, r, R, y,
-Y, s, S and f_1 to f_8. Each f_j occurs in two of them, and is eliminated first. This form loses no accuracy if links are long:
+Y, s, S and f_1 to f_8. Each f_j occurs in two of them, and is eliminated first. This form remains accurate if links are long:
 their turns f are small, and no large terms cancel.
 """
 
@@ -29,7 +29,7 @@ ArrayOrBall = Any  # arrays or balls
 
 
 class Displacements(NamedTuple):
-    """Displacements of the traced point from its first position (J, 1), and if given, cosines minus one and sines of turns."""
+    """Displacements of the traced point from its first position (J, 1); optionally cosines minus one and sines of the turns."""
 
     x: ArrayOrBall
     y: ArrayOrBall
@@ -54,14 +54,14 @@ def dyad_equations(x: ArrayOrBall, y: ArrayOrBall, a: ArrayOrBall, b: ArrayOrBal
 
 
 def dyad_system(d: Displacements):
-    """Return the system of one dyad with given angles of its link: four equations for the joint and the crank."""
+    """Return the system of one dyad with given turns of its link: four equations for the joint and the crank."""
 
     def system(u: Ball) -> tuple[Ball, Ball]:
         x, y, a, b = (u.part(k) for k in range(4))
-        found = dyad_equations(x, y, a, b, d)
-        slopes = found.slopes[:4]
-        mid, rad = (np.stack([_full(getattr(s, part), found.g.mid.shape) for s in slopes], 1) for part in Ball._fields)
-        return found.g, Ball(mid, rad)
+        equations = dyad_equations(x, y, a, b, d)
+        slopes = equations.slopes[:4]
+        mid, rad = (np.stack([_full(getattr(s, part), equations.g.mid.shape) for s in slopes], 1) for part in Ball._fields)
+        return equations.g, Ball(mid, rad)
 
     return system
 
@@ -69,25 +69,25 @@ def dyad_system(d: Displacements):
 def four_bar_system(d: Displacements):
     """Return the system of a four-bar through points: two dyads and the J turns of their link.
 
-    The unknowns are joint and crank of the first dyad, those of the second, J cosines minus one, and J sines; the equations are g
-    for both dyads, and (p^2 + s^2) / 2 + p = 0.
+    The unknowns are joint and crank of the first dyad, joint and crank of the second, J cosines minus one, and J sines; the
+    equations are g = 0 for both dyads, and (p^2 + s^2) / 2 + p = 0.
     """
 
     def system(u: Ball) -> tuple[Ball, Ball]:
         J = len(d.x.mid)
         p, s = u.part(slice(8, 8 + J)), u.part(slice(8 + J, 8 + 2 * J))
         turned, places = d._replace(p=p, s=s), np.arange(J)
-        x, y, a, b, *others = [u.part(k) for k in range(8)]
-        parts = [dyad_equations(x, y, a, b, turned), dyad_equations(*others, d=turned)]
+        x, y, a, b, *second = [u.part(k) for k in range(8)]
+        dyads = [dyad_equations(x, y, a, b, turned), dyad_equations(*second, d=turned)]
         unit = (p * p + s * s) * 0.5 + p
-        values = [*(part.g for part in parts), unit]
+        values = [*(dyad.g for dyad in dyads), unit]
         F = Ball(*(np.concatenate([getattr(v, name) for v in values]) for name in Ball._fields))
         shape, M = (3 * J, 8 + 2 * J), u.mid.shape[1]
         mid, rad = np.zeros((*shape, M), LONG), np.zeros((*shape, M))
-        for k, part in enumerate(parts):
+        for k, dyad in enumerate(dyads):
             rows = k * J + places
             columns = [*range(4 * k, 4 * k + 4), 8 + places, 8 + J + places]
-            for column, slope in zip(columns, part.slopes, strict=True):
+            for column, slope in zip(columns, dyad.slopes, strict=True):
                 mid[rows, column], rad[rows, column] = slope.mid, slope.rad
         for column, slope in ((8, p + 1.0), (8 + J, s)):
             mid[2 * J + places, column + places], rad[2 * J + places, column + places] = slope.mid, slope.rad
@@ -105,14 +105,14 @@ def _full(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 JOINTS = 8  # unknowns x, X, r, R, y, Y, s, S
 POINTS = 8  # displacements from the first of nine points
 UNKNOWNS = JOINTS + POINTS
-LEAST = 1e-3  # least scale of a joint, for the choice of pivots
+LEAST = 1e-3  # smallest scale of a joint coordinate, for the choice of pivots
 
 
 def newton_and_tangent() -> ScalarProgram:
     """Return the program that maps unknowns, s, displacements at s = 0 and their rates to the Newton step and the rate dz/ds.
 
     Inputs: real parts, then imaginary parts, of the 16 unknowns, of s, of the displacements d_1 to d_8, D_1 to D_8 at s = 0, and
-    of their derivatives by s. Outputs: real and imaginary parts of the step and of the rate.
+    of the derivatives of these by s. Outputs: real and imaginary parts of the step and of the rate.
     """
     graph, inputs = Graph(), []
 
@@ -123,7 +123,7 @@ def newton_and_tangent() -> ScalarProgram:
 
     unknowns, (s,) = numbers("z", UNKNOWNS), numbers("s", 1)
     start, rates = numbers("p", 2 * POINTS), numbers("v", 2 * POINTS)
-    one = graph.constant(1.0)
+    unit = graph.constant(1.0)
     matrix, right, turns = [], [], []
     sizes = [absolute(z.re) + absolute(z.im) + LEAST for z in unknowns[:JOINTS]]
     for j, f in enumerate(unknowns[JOINTS:]):
@@ -131,27 +131,27 @@ def newton_and_tangent() -> ScalarProgram:
         moves = rates[j], rates[j + POINTS]
         dyads = [_dyad(unknowns[k : k + 4], f, d, D, moves) for k in (0, 4)]
         (u, row, r), (v, other, q) = dyads
-        size = one / (u.squared_modulus + v.squared_modulus)
+        size = unit / (u.squared_modulus + v.squared_modulus)
         scale = graph.sqrt(size)
         left, cross = v.scaled(scale), -u.scaled(scale)
         entries = [*(left * x for x in row), *(cross * x for x in other)]
         entries = [x.scaled(size) for x, size in zip(entries, sizes, strict=True)]
-        weight = one / sum((absolute(x.re) + absolute(x.im) for x in entries), graph.constant(0.0))
+        weight = unit / sum((absolute(x.re) + absolute(x.im) for x in entries), graph.constant(0.0))
         matrix.append([x.scaled(weight) for x in entries])
         right.append([(left * a + cross * b).scaled(weight) for a, b in zip(r, q, strict=True)])
         turns.append((u.conjugate.scaled(size), v.conjugate.scaled(size), dyads))
-    found = [[x.scaled(size) for x in row] for row, size in zip(solve_complex(matrix, right), sizes, strict=True)]
+    solution = [[x.scaled(size) for x in row] for row, size in zip(solve_complex(matrix, right), sizes, strict=True)]
     for u, v, ((_, row, r), (_, other, q)) in turns:
-        rest = [_minus(r, row, found[:4]), _minus(q, other, found[4:JOINTS])]
-        found.append([u * a + v * b for a, b in zip(*rest, strict=True)])
-    outputs = [getattr(row[k], part) for k in (0, 1) for part in ("re", "im") for row in found]
+        remainders = [_minus(r, row, solution[:4]), _minus(q, other, solution[4:JOINTS])]
+        solution.append([u * a + v * b for a, b in zip(*remainders, strict=True)])
+    outputs = [getattr(row[k], part) for k in (0, 1) for part in ("re", "im") for row in solution]
     return ScalarProgram(graph, inputs, outputs)
 
 
 def _dyad(
     joints: list[ComplexScalar], f: ComplexScalar, d: ComplexScalar, D: ComplexScalar, moves: tuple[ComplexScalar, ComplexScalar]
 ) -> tuple[ComplexScalar, list[ComplexScalar], list[ComplexScalar]]:
-    """Return the derivative of g by f, those by x, X, r, R, and minus g and minus its derivative by s."""
+    """Return dg/df, the derivatives by x, X, r, R, and -g and -dg/ds."""
     x, X, r, R = joints
     inverse = ComplexScalar(f.re + 1.0, f.im).inverse()
     F = -(f * inverse)

@@ -1,9 +1,9 @@
 """All dyads through five poses of a link (Burmester): up to four real ones, and thus up to six four-bars.
 
-For a joint (x, y) of the link the pivot (a, b) solves four linear equations, M(x, y, 1) (a, b, 1) = 0, with linear entries: M has
-rank two where its four cubic minors vanish. Such cubics have six common zeros (Hilbert and Burch), two of them the isotropic
+For a joint (x, y) of the link, the pivot (a, b) solves four equations, M(x, y, 1) (a, b, 1) = 0. The entries of M are linear; M
+has rank two where its four cubic minors vanish. Such cubics have six common zeros (Hilbert and Burch), two of them the isotropic
 points at infinity. In coordinates without a zero at infinity the monomials up to second order are a basis of all polynomials
-modulo the minors, and the zeros are eigenvectors of a 6 x 6 matrix.
+modulo the minors, and the values of these monomials at the zeros are eigenvectors of a 6 x 6 matrix.
 """
 
 from itertools import combinations, permutations
@@ -16,11 +16,11 @@ from udkjax.synthesis.complete.certificate import Certificate, certify
 from udkjax.synthesis.complete.dyads import dyad_system
 from udkjax.synthesis.complete.nine_points import SAME, displacements, power_of_two_near
 
-DYADS = 4  # of generic poses, including complex ones
+DYADS = 4  # number of dyads through generic poses, including complex dyads
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
-AT_INFINITY = 1e-7  # extent of the poses relative to the distance of a joint or pivot that counts as infinite
-ISOTROPIC = 1e-6  # from the isotropic points, of two homogeneous coordinates of length one
-SMALLEST_CUBIC = 1e-11  # least singular value of the minors' cubic terms, if zeros are isolated
+AT_INFINITY = 1e-7  # a joint or pivot at a distance of extent / AT_INFINITY counts as infinite
+ISOTROPIC = 1e-6  # distance from the isotropic points that counts as zero, in homogeneous coordinates of norm one
+SMALLEST_CUBIC = 1e-11  # smallest singular value of the minors' cubic terms for which zeros are isolated
 MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 CUBIC = ((3, 0), (2, 1), (1, 2), (0, 3))
 SINE_TOL = 8.0 * ROUNDING  # error of a sine in the longest floating-point type
@@ -31,7 +31,7 @@ class RealDyads(NamedTuple):
 
     Attributes:
         boxes: boxes that contain exactly one solution: the joint (two), the crank from the pivot to it (two).
-        turns: turns of the link in each pose, as complex numbers (5,).
+        turns: rotations of the link in each pose, as complex numbers (5,).
         infinite: number of dyads with a joint or pivot at infinity, including complex ones.
         unproven: dyads that appear to be real without a proof: joints and cranks (4, K).
         scale: unit (m), a power of two.
@@ -72,31 +72,33 @@ def find_real_dyads(poses: np.ndarray) -> RealDyads:
     u = np.concatenate([joints[:2] / joints[2], pivots[:2] / pivots[2]])[:, is_finite]
     reality = np.max(np.abs(np.imag(u)), axis=0) / (1.0 + np.max(np.abs(u), axis=0))
     near = reality < NEARLY_REAL
-    found = certify(dyad_system(d), np.real(u)[:, near])
-    proven = np.flatnonzero(found.is_proven & _first_of_each(found))
-    unproven = np.real(u)[:, near][:, ~found.is_proven & (reality[near] < SURELY_REAL)]
+    boxes = certify(dyad_system(d), np.real(u)[:, near])
+    proven = np.flatnonzero(boxes.is_proven & _first_of_each(boxes))
+    unproven = np.real(u)[:, near][:, ~boxes.is_proven & (reality[near] < SURELY_REAL)]
     turns = np.exp(1j * angle.astype(float))
-    return RealDyads(found.take(proven), turns, int(np.count_nonzero(~is_finite)), unproven, scale)
+    return RealDyads(boxes.take(proven), turns, int(np.count_nonzero(~is_finite)), unproven, scale)
 
 
-def _first_of_each(found: Certificate) -> np.ndarray:
+def _first_of_each(first: Certificate) -> np.ndarray:
     """Return a mask of the boxes that do not overlap an earlier one."""
-    keep = np.ones(len(found.is_proven), bool)
+    keep = np.ones(len(first.is_proven), bool)
     for j, i in combinations(range(len(keep)), 2):
-        keep[i] &= not (keep[j] and found.balls.part(np.s_[:, i]).overlaps(found.balls.part(np.s_[:, j])).all())
+        keep[i] &= not (keep[j] and first.balls.part(np.s_[:, i]).overlaps(first.balls.part(np.s_[:, j])).all())
     return keep
 
 
 def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return homogeneous joints (3, 4) and pivots (3, 4) of all dyads, complex."""
     half = 0.5 * (dx**2 + dy**2)
-    # Coefficients by (x, y, 1) of entry k of row j, L[j, k]. Joints are measured by `size`: far ones, of links that turn little.
-    by_x, by_y, rest = [-p, -s, dx * (1 + p) + dy * s], [s, -p, dy * (1 + p) - dx * s], [-dx, -dy, half]
-    ways, turned = np.linalg.norm(rest[:2]), np.linalg.norm([by_x[:2], by_y[:2]])
-    size = ways / turned if ways > 0 and turned > 0 else 1.0
+    # L[j, k]: coefficients by (x, y, 1) of entry k of row j. Joints are in units of `size`, which is large if the link turns
+    # little.
+    by_x, by_y, constant = [-p, -s, dx * (1 + p) + dy * s], [s, -p, dy * (1 + p) - dx * s], [-dx, -dy, half]
+    displacement, turned = np.linalg.norm(constant[:2]), np.linalg.norm([by_x[:2], by_y[:2]])
+    size = displacement / turned if displacement > 0 and turned > 0 else 1.0
     scales = np.array([size, size, 1.0])
-    L = np.transpose([by_x, by_y, rest], (2, 1, 0)) * scales / np.array([1.0, 1.0, size])[:, None]
-    Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]  # with probability one, it moves no zero to infinity
+    L = np.transpose([by_x, by_y, constant], (2, 1, 0)) * scales / np.array([1.0, 1.0, size])[:, None]
+    # A random rotation moves no zero to infinity, with probability one.
+    Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     L = L @ Q
     minors = [_determinant(L[list(rows)]) for rows in combinations(range(4), 3)]
     table = np.array([[minor.get(m, 0.0) for m in (*CUBIC, *MONOMIALS)] for minor in minors])
@@ -108,13 +110,13 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tupl
     for move in ((1, 0), (0, 1)):
         rows = []
         for m in MONOMIALS:
-            to = (m[0] + move[0], m[1] + move[1])
-            rows.append(np.eye(6)[MONOMIALS.index(to)] if to in MONOMIALS else reduced[CUBIC.index(to)])
+            product = (m[0] + move[0], m[1] + move[1])
+            rows.append(np.eye(6)[MONOMIALS.index(product)] if product in MONOMIALS else reduced[CUBIC.index(product)])
         steps.append(np.array(rows))
     _, vectors = np.linalg.eig(0.6 * steps[0] + 0.8 * steps[1])
     joints = Q @ np.stack([vectors[1], vectors[2], vectors[0]])
     joints = joints / np.linalg.norm(joints, axis=0)
-    off = [np.abs(joints[2]) + np.abs(joints[0] + way * 1j * joints[1]) for way in (1, -1)]
+    off = [np.abs(joints[2]) + np.abs(joints[0] + sign * 1j * joints[1]) for sign in (1, -1)]
     order = np.argsort(np.minimum(*off))
     joints = joints[:, np.sort(order[2:])]
     rows = np.einsum("jkx,xm->mjk", L @ Q.T, joints)
@@ -123,7 +125,7 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tupl
 
 
 def _determinant(A: np.ndarray) -> dict[tuple[int, int], float]:
-    """Return the determinant of a matrix (3, 3) of linear forms (3,) by monomials of two variables; the third one is one."""
+    """Return the determinant of a matrix (3, 3) of linear forms (3,), by monomials of two variables; the third one equals one."""
     found: dict[tuple[int, int], float] = {}
     for columns in permutations(range(3)):
         sign = np.linalg.det(np.eye(3)[list(columns)])

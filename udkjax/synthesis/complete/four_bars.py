@@ -1,7 +1,7 @@
 """Four-bars in their positions: joints as complex numbers, cognates, kinds by Grashof, circuits, branches and order.
 
-The positions of a four-bar form circuits: it moves on one of them without being taken apart. A driver moves it along a branch of
-a circuit, from one dead point to the next, or all the way round.
+The positions of a four-bar form circuits; to change its circuit, the four-bar has to be taken apart. A driver moves it along a
+branch of a circuit, from one dead point to the next, or all the way round.
 """
 
 from itertools import permutations
@@ -18,7 +18,7 @@ KINDS = (
     "double rocker",
     "rocker-crank",
     "triple rocker",
-)  # by the shortest link; the last without Grashof's condition
+)  # by the shortest link; the last if Grashof's condition is not met
 IN_ORDER, CIRCUIT, BRANCH, ORDER = 0, 1, 2, 3  # defects of a motion through all positions
 DEFECTS = ("none", "circuit", "branch", "order")
 
@@ -27,10 +27,10 @@ class FourBars(NamedTuple):
     """M four-bars in J positions.
 
     Attributes:
-        O: the fixed joint of the crank, which drives (M,).
-        C: ground pivot of the rocker (M,).
+        O: the fixed joint of the crank, the driven link (M,).
+        C: the fixed joint of the rocker (M,).
         A: the moving joint of the crank (M, J).
-        B: coupler joint of the rocker (M, J).
+        B: the moving joint of the rocker (M, J).
         P: the traced point (J,).
     """
 
@@ -49,11 +49,11 @@ class FourBars(NamedTuple):
         return FourBars(self.C, self.O, self.B, self.A, self.P)
 
     def cognates(self) -> "tuple[FourBars, FourBars, FourBars]":
-        """Return Roberts's three cognates of each four-bar: the point traces the same curve in all three."""
+        """Return Roberts's three cognates of each four-bar; the point traces the same curve in all three."""
         return self, self._other(), self.swapped()._other()
 
     def _other(self) -> "FourBars":
-        """Return the cognate on the crank's pivot and the third one: crank and coupler change places.
+        """Return the cognate on the crank's pivot and the third pivot; crank and coupler exchange their places.
 
         From c - a = k (b - a), k = AP / AB, and b - a = (A - a) + (B - A) + (b - B) follows
         c - a = (P - A) + k (A - a) + k (b - B): the links of the cognate, one after the other.
@@ -64,7 +64,7 @@ class FourBars(NamedTuple):
 
     @property
     def lengths(self) -> np.ndarray:
-        """Frame, crank, coupler, rocker (4, M)."""
+        """Lengths of frame, crank, coupler and rocker (4, M)."""
         ends = (self.O - self.C, self.A[:, 0] - self.O, self.B[:, 0] - self.A[:, 0], self.B[:, 0] - self.C)
         return np.abs(np.stack(ends))
 
@@ -80,10 +80,10 @@ class FourBars(NamedTuple):
         return np.imag(coupler.conj() * rocker) / (np.abs(coupler) * np.abs(rocker))
 
 
-def stack_four_bars(parts: list[FourBars]) -> FourBars:
+def stack_four_bars(batches: list[FourBars]) -> FourBars:
     """Return several batches concatenated."""
-    O, C, A, B = (np.concatenate([getattr(part, name) for part in parts]) for name in FourBars._fields[:-1])  # noqa: E741
-    return FourBars(O, C, A, B, parts[0].P)
+    O, C, A, B = (np.concatenate([getattr(batch, name) for batch in batches]) for name in FourBars._fields[:-1])  # noqa: E741
+    return FourBars(O, C, A, B, batches[0].P)
 
 
 class Classification(NamedTuple):
@@ -93,8 +93,8 @@ class Classification(NamedTuple):
         kind: indices of KINDS (M,).
         turns: whether the crank turns fully (M,).
         circuits: the circuit of each position (M, J), numbered from that of the first position, 0.
-        branches: the branch of each position (M, J), numbered alike.
-        order: the positions in the order of a motion along the circuit of the first one (M, J), then -1.
+        branches: the branch of each position (M, J), numbered in the same way.
+        order: indices of the positions in the order of a motion along the circuit of the first one (M, J), padded with -1.
         defect: indices of DEFECTS (M,).
         values: angles of the crank (rad), continuous if there is no defect (M, J).
     """
@@ -120,9 +120,9 @@ def classify(bars: FourBars) -> Classification:
     circuit = np.where(turns[:, None], side, np.where(is_grashof[:, None], np.sign(angle), 0.0))
     branch = np.where(turns[:, None], circuit, 4.0 * circuit + side)
     circuits, branches = _counted(circuit), _counted(branch)
-    # On a circuit with dead points the crank angle rises on one branch and falls on the other; a turn is a circle.
-    along = np.where(turns[:, None], np.mod(angle, 2 * np.pi), np.where(side > 0, angle, 4 * np.pi - angle))
-    order = _order(along, circuits == 0)
+    # Place along the circuit, as an angle: with dead points the crank angle rises on one branch and falls on the other.
+    circle = np.where(turns[:, None], np.mod(angle, 2 * np.pi), np.where(side > 0, angle, 4 * np.pi - angle))
+    order = _order(circle, circuits == 0)
     values = _values(angle, turns)
     defect = np.where(
         (circuits > 0).any(axis=1),
@@ -147,33 +147,33 @@ def _relative_angles(bars: FourBars, lengths: np.ndarray) -> np.ndarray:
 
 def _counted(labels: np.ndarray) -> np.ndarray:
     """Return labels (M, J) numbered from 0 in order of first occurrence."""
-    found = np.zeros(labels.shape, int)
+    counted = np.zeros(labels.shape, int)
     for j in range(1, labels.shape[1]):
         same = labels[:, :j] == labels[:, j : j + 1]
         earlier = np.argmax(same, axis=1)
-        found[:, j] = np.where(
-            same.any(axis=1), np.take_along_axis(found, earlier[:, None], 1)[:, 0], found[:, :j].max(axis=1) + 1
+        counted[:, j] = np.where(
+            same.any(axis=1), np.take_along_axis(counted, earlier[:, None], 1)[:, 0], counted[:, :j].max(axis=1) + 1
         )
-    return found
+    return counted
 
 
-def _order(along: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Return the indices of positions in their order along a circle from the first one (M, J), then -1."""
-    away = np.where(exists, along, np.inf)
-    away = np.where(away < along[:, :1], away + 1e3, away)
+def _order(circle: np.ndarray, exists: np.ndarray) -> np.ndarray:
+    """Return the indices of positions in their order along a circle from the first one (M, J), padded with -1."""
+    away = np.where(exists, circle, np.inf)
+    away = np.where(away < circle[:, :1], away + 1e3, away)
     order = np.argsort(away, axis=1, kind="stable")
     return np.where(np.take_along_axis(exists, order, 1), order, -1)
 
 
 def _goes_round(order: np.ndarray) -> np.ndarray:
-    """Return a mask (M,) of the four-bars whose positions are in cyclic order, in either direction."""
+    """Return a mask (M,) of the four-bars that pass the positions in cyclic order, in either direction."""
     J = order.shape[1]
     return (order == np.arange(J)).all(axis=1) | (order == -np.arange(J) % J).all(axis=1)
 
 
 def _values(angle: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Return angles (M, J) along a motion: for a crank that turns, in the shorter direction."""
-    ahead, back = (np.cumsum(np.mod(way * np.diff(angle, axis=1, prepend=angle[:, :1]), 2 * np.pi), axis=1) for way in (1, -1))
+    """Return angles (M, J) along a motion; a crank that turns fully moves in the shorter direction."""
+    ahead, back = (np.cumsum(np.mod(sign * np.diff(angle, axis=1, prepend=angle[:, :1]), 2 * np.pi), axis=1) for sign in (1, -1))
     shorter = np.where((ahead[:, -1] <= back[:, -1])[:, None], ahead, -back)
     return np.where(turns[:, None], angle[:, :1] + shorter, angle)
 
@@ -205,7 +205,7 @@ def _other(a: ComplexBall, b: ComplexBall, x: ComplexBall, y: ComplexBall) -> Fo
 
 
 def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float) -> np.ndarray:
-    """Return the largest distance (M,) (m) of four-bars' rounded pins from the exact ones."""
+    """Return the largest distance (M,) (m) between the rounded pins of four-bars and the exact ones."""
     start = ComplexBall(Ball.of(np.real(origin)), Ball.of(np.imag(origin)))
     size = ComplexBall(Ball.of(scale), Ball.of(0.0))
     pins = (bars.O, bars.C, bars.A[:, 0], bars.B[:, 0])
@@ -213,7 +213,7 @@ def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float
 
 
 def certainly_different(boxes: Certificate) -> np.ndarray:
-    """Return the indices of boxes proven to contain different classes: their three pivots differ in any order."""
+    """Return the indices of boxes that are proven to contain different classes: their three pivots differ in any order."""
     first, second, _ = cognate_joints(boxes)
     pivots, count = (first.O, first.C, second.C), boxes.middle.shape[1]
     rows, columns = np.arange(count)[:, None], np.arange(count)[None, :]

@@ -1,4 +1,4 @@
-"""Motions of the four-bars found: the positions that the driver reaches from another position of the same branch."""
+"""Verification by motions: the positions that the driver reaches from another position of the same branch."""
 
 from functools import cache
 from typing import NamedTuple
@@ -13,7 +13,7 @@ REACHED_TOL = 1e-6  # largest distance of the traced point from its place, relat
 
 
 class _BranchMotion(NamedTuple):
-    """One motion: the four-bar, the position in which it is drawn, and the positions to pass, at values of the driver."""
+    """A motion: the four-bar, the position in which it is drawn, and the positions to pass with values of the driver."""
 
     member: int
     first: int
@@ -22,10 +22,10 @@ class _BranchMotion(NamedTuple):
 
 
 def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
-    """Return a mask of the positions (M, J) that motions confirm; each branch is followed from its first position.
+    """Return a mask of the positions (M, J) that motions reach; each branch is followed from its first position.
 
-    A four-bar drawn in that position is driven by its crank and closed again at each value; the traced point of the coupler has
-    to reach its place at the value given by the classification, without leaving the branch.
+    A four-bar drawn in that position is driven by its crank and closed at each value; the traced point of the coupler has to
+    reach its place at the value that the classification computed, without leaving the branch.
     """
     M, J = found.values.shape
     confirmed = np.zeros((M, J), bool)
@@ -40,9 +40,9 @@ def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
     pins = {f"pin.{name}": np.stack([np.real(z), np.imag(z)], 1) for name, z in joints.items()}
     moved = skeleton()(pins, start[:, None] + ends - ends[:, :1])
     body = moved.bodies.index("coupler")
-    place = moved.q[:, :, body, 0] + 1j * moved.q[:, :, body, 1]
+    origin = moved.q[:, :, body, 0] + 1j * moved.q[:, :, body, 1]
     turn = np.exp(1j * (moved.q[:, :, body, 2] - moved.q[:, :1, body, 2]))
-    traced = place + turn * (bars.P[first] - place[:, 0])[:, None]
+    traced = origin + turn * (bars.P[first] - origin[:, 0])[:, None]
     tol = REACHED_TOL * np.max(np.abs(bars.P - bars.P.mean()))
     for k, motion in enumerate(motions):
         for n, j in enumerate(motion.positions):
@@ -52,7 +52,7 @@ def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
 
 @cache
 def skeleton() -> PositionBatch:
-    """Return the compiled positions of four-bars; the traced point and the masses do not matter."""
+    """Return a compiled solver for positions of four-bars; the traced point and the masses do not matter."""
     pins = {"O": (0.0, 0.0), "A": (3.0, 4.0), "B": (12.0, 9.0), "C": (10.0, 0.0)}
     links = {name: {"pins": list(ends), "mass": 1.0} for name, ends in (("crank", "OA"), ("coupler", "AB"), ("rocker", "CB"))}
     mechanism = Drawing(pins, links, ground=["O", "C"]).mechanism()
@@ -68,10 +68,10 @@ def _motions_of(m: int, found: Classification) -> list[_BranchMotion]:
         away = values[places] - values[first]
         if found.turns[m]:
             away = np.mod(away, 2 * np.pi)
-        for way in (1, -1):
-            of_way = places[(away * way >= 0)]
-            order = of_way[np.argsort(np.abs(away[away * way >= 0]), kind="stable")]
-            if way > 0 or len(order) > 1:
+        for sign in (1, -1):
+            of_way = places[(away * sign >= 0)]
+            order = of_way[np.argsort(np.abs(away[away * sign >= 0]), kind="stable")]
+            if sign > 0 or len(order) > 1:
                 steps = [float(away[np.flatnonzero(places == j)[0]]) for j in order]
                 motions.append(_BranchMotion(m, first, [int(j) for j in order], steps))
     return motions

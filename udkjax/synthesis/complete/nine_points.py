@@ -1,9 +1,8 @@
-"""All four-bars through nine points: a parameter homotopy from 1,442 stored classes of solutions, then certificates of the real
-ones.
+"""All four-bars through nine points: a parameter homotopy from 1,442 stored classes of solutions, then certificates.
 
 Nine generic points have 8,652 complex solutions, 1,442 classes of six: Roberts's three cognates, each with its dyads in either
-order. nine_points.npz has one of each class, at random complex displacements (made by experiments/nine_points.py); each is
-tracked to the requested displacements.
+order. nine_points.npz has one solution of each class, at random complex displacements (made by experiments/nine_points.py);
+each is tracked to the requested displacements.
 
 Source: C. W. Wampler, A. P. Morgan, A. J. Sommese, Complete solution of the nine-point path synthesis problem for four-bar
 linkages, J. Mech. Des. 114 (1992).
@@ -27,28 +26,28 @@ CLASSES = 1442
 STARTS = Path(__file__).with_name("nine_points.npz")
 FIRST = Precision(3e-3, 3e-2, 1e-5)
 CLOSE = Precision(3e-4, 3e-3, 1e-6)
-BENDS = (0.0, 0.6, -0.6)  # paths around parameters at which solutions meet, tried in turn while classes are missing
-ALIKE = 1e-7  # relative: classes whose pivots differ by less are the same; raised if there are too many classes
-# Relative to the largest unknown: coordinates with conjugates as close as this may be a real four-bar; the certificate decides.
+BENDS = (0.0, 0.6, -0.6)  # detours around parameters at which solutions meet, tried in turn while classes are missing
+ALIKE = 1e-7  # relative difference of pivots below which classes are the same; raised if there are too many classes
+# Largest imaginary parts, relative to the largest unknown: of candidates for a proof, and of unproven ends that count as real.
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
 REFINED = 1e-8  # largest Newton step at a regular solution, relative to the unknowns, with residuals in long precision
-REFINEMENTS = 8  # Newton steps at most; each doubles the digits
-SAME = 1e-12  # relative to the extent: closer places or poses are the same
-# A coupler curve has degree six and passes three times through both isotropic points at infinity: a line meets it in six
-# points, and a circle in 12 - 6 others, unless it is part of the curve.
+REFINEMENTS = 8  # largest number of Newton steps; each doubles the number of correct digits
+SAME = 1e-12  # relative to the extent: places or poses that differ by less are the same
+# A coupler curve has degree six and passes three times through both isotropic points at infinity. A line or circle that is
+# not part of the curve meets it in six further points at most.
 MOST_ON_A_LINE = 6
-ON_IT = 1e-10  # distance from a line or circle, relative to the extent
+ON_IT = 1e-10  # distance from a line or circle, relative to the extent, up to which a point lies on it
 
 
 class Paths(NamedTuple):
-    """Counts of the ends of a homotopy's paths.
+    """Numbers of a homotopy's paths by the kind of their ends.
 
     Attributes:
         tracked: number of paths: one for each class of generic data.
         regular: distinct classes found.
         infinite: paths to four-bars with a joint at infinity.
-        singular: paths to solutions that meet or are not isolated.
-        lost: paths that could not be followed to their end.
+        singular: paths to solutions that coincide or are not isolated.
+        lost: paths that could not be tracked to their end.
     """
 
     tracked: int
@@ -59,14 +58,14 @@ class Paths(NamedTuple):
 
 
 class OtherEnds(NamedTuple):
-    """Other ends of paths: joints x, X, r, R, y, Y, s, S (8, K), and the kind of each."""
+    """Ends of paths that are infinite, singular, lost or unproven: joints x, X, r, R, y, Y, s, S (8, K), and the kind of each."""
 
     joints: np.ndarray
     kinds: tuple[str, ...]
 
 
 class RealClasses(NamedTuple):
-    """Four-bars of real classes, one each, in units of `scale`, relative to the first place.
+    """A four-bar of each real class, in units of `scale`, relative to the first place.
 
     Attributes:
         boxes: boxes that contain exactly one solution: joint and crank of both dyads, then cosines minus one and sines of turns.
@@ -120,24 +119,28 @@ def find_real_classes(points: np.ndarray) -> RealClasses:
     z, paths, ends = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
     x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
     turn = 1.0 + z[JOINTS:]
-    unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex although joints are real
+    unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex even if joints are real
     reality = np.maximum(np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0)), unreal)
     near = reality < NEARLY_REAL
     joints, turns = 0.5 * (x + conjugates)[:, near], turn[:, near] / np.abs(turn[:, near]) - 1.0
     u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
     exact = Displacements(*(Ball.fractions(places[1:, k : k + 1]) - Ball.fractions(places[:1, k : k + 1]) for k in (0, 1)))
-    with np.errstate(over="ignore", invalid="ignore"):  # Newton's method may diverge: not proven then
-        found = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
-    keep = np.flatnonzero(found.is_proven)
-    keep = keep[distinct(isotropic(found.middle[:, keep]))]
-    proven = keep[certainly_different(found.take(keep))]
-    unproven = [*np.flatnonzero(~found.is_proven & (reality[near] < SURELY_REAL)), *np.setdiff1d(keep, proven)]
+    with np.errstate(over="ignore", invalid="ignore"):  # Newton's method may diverge; the solution is then not proven
+        boxes = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
+    keep = np.flatnonzero(boxes.is_proven)
+    keep = keep[distinct(isotropic(boxes.middle[:, keep]))]
+    proven = keep[certainly_different(boxes.take(keep))]
+    unproven = [*np.flatnonzero(~boxes.is_proven & (reality[near] < SURELY_REAL)), *np.setdiff1d(keep, proven)]
     ends = OtherEnds(np.concatenate([ends.joints, isotropic(u[:, unproven])], 1), (*ends.kinds, *["unproven"] * len(unproven)))
-    return RealClasses(found.take(proven), paths, ends, scale)
+    return RealClasses(boxes.take(proven), paths, ends, scale)
 
 
 def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
-    """Return distinct regular solutions (16, M), one of each class, for displacements d (8,) of order one, and the other ends."""
+    """Return distinct regular solutions (16, M), one of each class, counts of paths, and other ends.
+
+    Args:
+        d: displacements (8,) of order one, complex.
+    """
     target = np.concatenate([d, d.conj()])
     start, parameters = start_solutions()
     follow = tracker()
@@ -146,8 +149,8 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
         ends = follow(start[:, which], parameters, target, precision, bend)
         return _refined(ends.z, ends.status, target)
 
-    every = np.arange(start.shape[1])
-    z, status = take(every, FIRST, BENDS[0])
+    all_paths = np.arange(start.shape[1])
+    z, status = take(all_paths, FIRST, BENDS[0])
     unsettled = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
     if len(unsettled):
         z[:, unsettled], status[unsettled] = take(unsettled, CLOSE, BENDS[0])
@@ -155,9 +158,9 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
     for bend in BENDS[1:]:
         if classes.shape[1] == CLASSES or not len(unsettled):
             break
-        more, found = take(every, CLOSE, bend)
-        before, classes = classes.shape[1], _merged(classes, more[:, found == ACCEPTED])
-        if classes.shape[1] == before:
+        more, status_of_more = take(all_paths, CLOSE, bend)
+        known, classes = classes.shape[1], _merged(classes, more[:, status_of_more == ACCEPTED])
+        if classes.shape[1] == known:
             break
     missing, ends = CLASSES - classes.shape[1], {}
     for code, name in ((INFINITE, "infinite"), (SINGULAR, "singular"), (LOST, "lost")):
@@ -165,12 +168,12 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
     infinite, singular = len(ends["infinite"]), len(ends["singular"])
     paths = Paths(CLASSES, classes.shape[1], infinite, singular, missing - infinite - singular)
     which = np.concatenate(list(ends.values()))
-    return classes, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, of in ends.items() for _ in of))
+    return classes, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, indices in ends.items() for _ in indices))
 
 
 @cache
 def tracker() -> PathTracker:
-    """Return the tracker of four-bars through nine points, compiled."""
+    """Return the compiled path tracker of four-bars through nine points."""
     return PathTracker(newton_and_tangent(), UNKNOWNS)
 
 
@@ -188,7 +191,7 @@ def start_solutions() -> tuple[np.ndarray, np.ndarray]:
 
 
 def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Return the turns f (8, M) of four-bars with given joints: both dyads' equations are linear in 1 + f and 1 / (1 + f)."""
+    """Return the turns f (8, M) of four-bars with given joints; the dyads' equations are linear in 1 + f and 1 / (1 + f)."""
     d, D = parameters[:POINTS, None], parameters[POINTS:, None]
     rows = []
     for x, X, r, R in (joints[:4], joints[4:]):
@@ -199,13 +202,13 @@ def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
 
 
 def displacements(places: np.ndarray) -> Displacements:
-    """Return displacements from the first of some places (J + 1, 2), as balls: places are exact, their differences rounded."""
+    """Return displacements from the first of J + 1 places, as balls; the places are exact, their differences are rounded."""
     moved = Ball.of(places[1:]) - Ball.of(places[:1])
     return Displacements(moved.part(np.s_[:, :1]), moved.part(np.s_[:, 1:]))
 
 
 def power_of_two_near(points: np.ndarray) -> float:
-    """Return the power of two closest to the size of some points: division by it is exact."""
+    """Return the power of two closest to the size of a set of points; division by a power of two is exact."""
     spread = points - points.mean(axis=0)
     return 2.0 ** np.round(np.log2(np.sqrt(np.mean(np.sum(spread**2, axis=1)))))
 
@@ -228,11 +231,11 @@ def class_keys(z: np.ndarray) -> np.ndarray:
         return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
 
 
-def repeated(z: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Return a mask of the solutions (M,) that share their class with others."""
-    found, places = np.zeros(z.shape[1], bool), np.flatnonzero(of)
-    found[places[np.unique(_pairs(z[:, places]))]] = True
-    return found
+def repeated(z: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Return a mask of the solutions (M,) whose class occurs more than once."""
+    mask, places = np.zeros(z.shape[1], bool), np.flatnonzero(which)
+    mask[places[np.unique(_pairs(z[:, places]))]] = True
+    return mask
 
 
 def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
@@ -254,7 +257,7 @@ def _pairs(z: np.ndarray, alike: float = ALIKE) -> np.ndarray:
     keys = class_keys(z)
     with np.errstate(all="ignore"):
         size = np.maximum(np.abs(keys), 1e-300)
-        keys = keys / size * np.log1p(size)  # near differences become relative ones
+        keys = keys / size * np.log1p(size)  # absolute differences of large keys become relative ones
     table = np.concatenate([np.real(keys), np.imag(keys)]).T
     pairs = KDTree(np.where(np.isfinite(table), table, 0.0)).query_pairs(alike, output_type="ndarray")
     return pairs[np.lexsort(pairs.T[::-1])]
@@ -291,21 +294,21 @@ def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.
 
 def _residuals(z: np.ndarray, p: np.ndarray) -> np.ndarray:
     f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
-    F, found = -f / (1 + f), []
+    F, residuals = -f / (1 + f), []
     for x, X, r, R in (z[:4], z[4:JOINTS]):
         e, E = d + f * x, D + F * X
-        found.append(e * (E + R) + E * r)
-    return np.concatenate(found)
+        residuals.append(e * (E + R) + E * r)
+    return np.concatenate(residuals)
 
 
 def _jacobian(z: np.ndarray, p: np.ndarray) -> np.ndarray:
     f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
     F, places = -f / (1 + f), np.arange(POINTS)
-    found = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex)
+    jacobian = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex)
     for k, first in ((0, 0), (4, POINTS)):
         x, X, r, R = z[k : k + 4]
         e, E = d + f * x, D + F * X
         for column, slope in enumerate((f * (E + R), F * (e + r), E, e)):
-            found[:, first : first + POINTS, k + column] = slope.T
-        found[:, first + places, JOINTS + places] = (x * (E + R) - X * (e + r) / (1 + f) ** 2).T
-    return found
+            jacobian[:, first : first + POINTS, k + column] = slope.T
+        jacobian[:, first + places, JOINTS + places] = (x * (E + R) - X * (e + r) / (1 + f) ** 2).T
+    return jacobian
