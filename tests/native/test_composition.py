@@ -193,6 +193,84 @@ def test_a_limit_of_threads_holds_inside_and_outside_of_compiled_programs(monkey
     assert len(compared) == (limit is not None)
 
 
+WITHOUT_MEMORY = """
+import resource, sys
+import jax, numpy as np, udkjax as udk
+
+mech = udk.library.four_bar()
+def last(x, end):
+    varied = mech.with_parameters({"body.coupler.mass": x})
+    return udk.simulate(varied, jax.numpy.array([0.0, 1.0]) * end, max_steps=10**7).q[-1, 0, 2]
+run = {"eager": jax.grad(last), "jit": jax.jit(jax.grad(last))}[sys.argv[1]]
+before = run(1.3, 2.0)
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 2**24, resource.RLIM_INFINITY))
+try:
+    jax.block_until_ready(run(1.3, 1e5))
+except (MemoryError, jax.errors.JaxRuntimeError) as error:
+    print(error)
+print(run(1.3, 2.0) == before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the size of the process is read from /proc")
+@pytest.mark.parametrize(("way", "name"), [("eager", ""), ("jit", "RESOURCE_EXHAUSTED: ")])
+def test_a_record_without_memory_is_an_error(way, name):
+    """The record of a gradient grows with the number of steps; later calls are not affected."""
+    done = subprocess.run([sys.executable, "-c", WITHOUT_MEMORY, way], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.splitlines() == [f"{name}no memory for a computation by machine code", "True"]
+
+
+def closed_angle(x):
+    """Angle of a closed four-bar that was drawn with one pin at x; traced, as small scenes are closed without machine code."""
+    close = lambda x: udk.assemble(udk.library.four_bar().with_parameters({"pin.B": jnp.stack([x, 1.0])})).q[1, 2]  # noqa: E731
+    return jax.vmap(close)(jnp.stack([x, x + 0.1]))
+
+
+RUNS = {
+    "run": lambda: angle(0.3),
+    "batch": lambda: jax.vmap(angle)(INERTIAS),
+    "forward": lambda: jax.jvp(angle, (0.3,), (1.0,)),
+    "closing": lambda: closed_angle(0.5),
+    "closing forward": lambda: jax.jacfwd(closed_angle)(0.5),
+    "reverse": lambda: jax.grad(angle)(0.3),
+}
+
+
+@pytest.mark.parametrize(("refused", "run"), [*(("malloc", name) for name in RUNS), ("realloc", "reverse")])
+def test_every_allocation_is_checked(monkeypatch, refused, run):
+    """All allocations of one kind fail; the code is compiled with a call of malloc or realloc replaced by null."""
+    call, replaced, compiled = re.compile(rf"call ptr @{refused}\([^)]*\)"), [], machine.library
+
+    def library(text, *arguments):
+        replaced.extend(call.findall(text))
+        return compiled(call.sub("inttoptr i64 0 to ptr", text), *arguments)
+
+    monkeypatch.setattr(machine, "library", library)
+    monkeypatch.setattr(primitive, "_LOADED", {})
+    monkeypatch.setattr(record, "FIRST", 4)
+    caches = primitive.machine_code, primitive.generate
+    for each in caches:
+        each.cache_clear()
+    try:
+        with pytest.raises(MemoryError, match="no memory for a computation by machine code"):
+            RUNS[run]()
+    finally:
+        for each in caches:
+            each.cache_clear()
+    assert replaced
+
+
+def test_positions_without_memory_are_an_error(monkeypatch):
+    compiled = machine.library
+    replace = lambda text: re.sub(r"call ptr @malloc\([^)]*\)", "inttoptr i64 0 to ptr", text)  # noqa: E731
+    monkeypatch.setattr(machine, "library", lambda text, *arguments: compiled(replace(text), *arguments))
+    batch = udk.PositionBatch(udk.library.four_bar(), "body.crank.angle", ["pin.B"])
+    with pytest.raises(MemoryError, match="no memory for a batch of positions"):
+        batch({"pin.B": [[0.5, 1.0]]}, [0.1, 0.2])
+
+
 # --- object code on disk
 
 TEXT = "define void @answer(ptr %x) {\n  store double 4.2e1, ptr %x\n  ret void\n}\n"

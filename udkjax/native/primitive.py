@@ -128,7 +128,7 @@ class LoadedCode:
         # Each pass of reverse mode writes only a part of the outputs: zeros instead of NaN, which jax.debug_nans would report.
         found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
-        arrays, following = (*inputs, *found), ctypes.c_int64(0)
+        arrays, following = (*inputs, *found), (ctypes.c_int64 * 2)()
         record = (  # the fields in the order of `Memory.call_fields`
             *(members, times, knots, inputs[-1].shape[self._module.directions_in]),
             *(x.__array_interface__["data"][0] for x in inputs),
@@ -148,18 +148,20 @@ class PreparedCall(NamedTuple):
 
     run: Callable[[int], Any]
     record: ctypes.Array
-    next_member: ctypes.c_int64
+    shared: ctypes.Array  # the index of the next member, and whether memory was refused
     threads: int
     inputs: list[np.ndarray]  # float64, contiguous in memory
     outputs: list[np.ndarray]
 
     def __call__(self) -> list[np.ndarray]:
-        """Return the outputs, which the next call overwrites."""
-        self.next_member.value, address = 0, ctypes.addressof(self.record)
+        """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
+        self.shared[:], address = (0, 0), ctypes.addressof(self.record)
         others = [_pool().submit(self.run, address) for _ in range(self.threads - 1)]
         self.run(address)
         for other in others:
             other.result()
+        if self.shared[1]:
+            raise MemoryError("no memory for a computation by machine code")
         return self.outputs
 
 

@@ -10,6 +10,8 @@ handler only waits for threads that have started, so a pool whose threads are al
 
 from typing import Any
 
+import numpy as np
+
 from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.layout import INPUTS, SHARE
 from udkjax.native.base.memory import Memory
@@ -19,16 +21,19 @@ from udkjax.threads import thread_limit
 # size, extensions, count, types, buffers.
 EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
 # Functions of XLA_FFI_Api, each taking a struct of its arguments: size, extensions, then the argument words.
-DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 64, 136, 144
+CREATE_ERROR, DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 48, 64, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
 # In an extension that requests metadata: the pointer to the metadata; in the metadata: the version of the interface in use.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)  # major, minor
 # Words of the work that threads share: the number of threads that may still access the work, the number that have started (plus
-# CLOSED once no more may start), the number that have finished, the next member, and the call record of `run`.
-USERS, BEGUN, ENDED, NEXT, CALL = range(5)
+# CLOSED once no more may start), the number that have finished, the next member, whether memory was refused, and the call record
+# of `run`.
+USERS, BEGUN, ENDED, NEXT, REFUSED, CALL = range(6)
 CLOSED = 2**32
+RESOURCE_EXHAUSTED = 8  # XLA_FFI_Error_Code_RESOURCE_EXHAUSTED
+NO_MEMORY = b"no memory for a computation by machine code"
 
 
 def handler(trajectory: Memory, name: str) -> list[Function]:
@@ -48,8 +53,7 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         metadata = word(word(frame, EXTENSIONS, POINTER), METADATA, POINTER)
         for offset, number in ((MAJOR, VERSION[0]), (MINOR, VERSION[1])):
             f.line(f"store i32 {number}, ptr {f.at(metadata, offset, 'i8').name}, align 4")
-        f.line("ret ptr null")
-        f.line(f"{f._label('after')}:")
+        f.leave("ptr null")
     call = Value(f, f.reserve(INT, len(fields)), POINTER)
 
     def put(field: str, value: Any, base: str = INT):
@@ -76,8 +80,9 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         with f.each(word(found[field], RANK), 1) as k:
             length.value = length.value * f.load(word(found[field], DIMS, POINTER), k, base=INT)
         put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
-    following = Value(f, f.reserve(INT), POINTER)
-    f.store(0, following, base=INT)
+    following = Value(f, f.reserve(INT, 2), POINTER)
+    for k in range(2):
+        f.store(0, following, k, base=INT)
     put("next", following, POINTER)
     shares = f.arithmetic("div", dimension(outputs[0], 0), SHARE)
     threads = f.variable(1, INT, 1)
@@ -85,6 +90,8 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         threads.value = _thread_count(f, frame)
     helpers = f.select(threads.value < shares, threads.value, shares) - 1
     f.choose(helpers > 0, lambda: _run_shared(f, frame, call, len(fields), helpers), lambda: f.call("run", call))
+    with f.if_(f.load(following, 1, base=INT).is_not(0)):
+        f.leave(f"ptr {_no_memory(f, frame).name}")
     f.line("ret ptr null")
     return [_help(), f]
 
@@ -99,8 +106,13 @@ def _of_api(f: Function, frame: Value, function: int, *arguments: Value) -> Valu
     return f.op(f"call ptr {address.name}(ptr {given.name})", POINTER)
 
 
-def _is_null(f: Function, pointer: Value) -> Value:
-    return f.op(f"ptrtoint ptr {pointer.name} to i64", INT).is_(0)
+def _no_memory(f: Function, frame: Value) -> Value:
+    """Create XLA's error for a computation without memory."""
+    words = np.frombuffer(NO_MEMORY + bytes(8 - len(NO_MEMORY) % 8), np.int64)
+    text = Value(f, f.reserve(INT, len(words)), POINTER)
+    for k, word in enumerate(words):
+        f.store(int(word), text, k, base=INT)
+    return _of_api(f, frame, CREATE_ERROR, text, f.const(RESOURCE_EXHAUSTED, INT))
 
 
 def _thread_count(f: Function, frame: Value) -> Value:
@@ -112,7 +124,7 @@ def _thread_count(f: Function, frame: Value) -> Value:
     count = Value(f, f.reserve(INT), POINTER)
     f.store(1, count, base=INT)
     error = _of_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
-    with f.if_(~_is_null(f, error)):
+    with f.if_(~f.is_null(error)):
         _of_api(f, frame, DESTROY_ERROR, error)
     found, limit = f.load(count, base=INT), thread_limit()
     return found if limit is None else f.select(found < limit, found, f.const(limit, INT))
@@ -144,19 +156,26 @@ def _help() -> Function:
 def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Value):
     """Run the members together with `helpers` threads of the pool."""
     work = f.op(f"call ptr @malloc(i64 {8 * (CALL + count)})", POINTER)
-    for word, x in ((USERS, helpers + 1), (BEGUN, f.const(0, INT)), (ENDED, f.const(0, INT)), (NEXT, f.const(0, INT))):
-        f.store(x, work, word, base=INT)
+    f.choose(f.is_null(work), lambda: f.call("run", call), lambda: _share(f, frame, call, count, helpers, work))
+
+
+def _share(f: Function, frame: Value, call: Value, count: int, helpers: Value, work: Value):
+    """Run the members in shared work, as `_run_shared`."""
+    f.store(helpers + 1, work, USERS, base=INT)
+    for word in (BEGUN, ENDED, NEXT, REFUSED):
+        f.store(0, work, word, base=INT)
     with f.each(count - 1) as k:  # all but the last field, the address of the next member
         f.store(f.load(call, k, base=INT), work, k + CALL, base=INT)
     f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
     context, task = f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
     with f.each(helpers):
         error = _of_api(f, frame, SCHEDULE, context, task, work)
-        with f.if_(~_is_null(f, error)):
+        with f.if_(~f.is_null(error)):
             _of_api(f, frame, DESTROY_ERROR, error)
             _add(f, work, USERS, -1)
     f.call("run", f.at(work, CALL, "i64"))
     begun = _add(f, work, BEGUN, CLOSED)
     with f.while_(lambda: _add(f, work, ENDED, 0) < begun):
         pass
+    f.store(f.load(work, REFUSED, base=INT), f.load(call, count - 1, base=POINTER), 1, base=INT)
     _leave(f, work)

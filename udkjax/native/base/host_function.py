@@ -19,12 +19,25 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.native.base.ffi import API, ARGUMENTS, BUFFERS, DATA, DIMS, EXTENSIONS, MAJOR, METADATA, MINOR, RANK, RESULTS, VERSION
+from udkjax.native.base.ffi import (
+    API,
+    ARGUMENTS,
+    BUFFERS,
+    CREATE_ERROR,
+    DATA,
+    DIMS,
+    EXTENSIONS,
+    MAJOR,
+    METADATA,
+    MINOR,
+    RANK,
+    RESULTS,
+    VERSION,
+)
 from udkjax.programs.deferred import deferred_p, trace_once
 from udkjax.programs.numpy_program import Meter, evaluate_as, has_rules, numpy_program
 from udkjax.programs.varying_axes import result_type
 
-CREATE_ERROR = 48  # offset in XLA_FFI_Api of the function that creates an error from a message and a code
 INTERNAL = 13  # XLA_FFI_Error_Code_INTERNAL
 
 

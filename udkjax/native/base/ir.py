@@ -263,6 +263,14 @@ class Function:
         self._count += 1
         return f"{name}{self._count}"
 
+    def is_null(self, pointer: Value) -> Value:
+        return self.op(f"ptrtoint ptr {pointer.name} to i64", INT).is_(0)
+
+    def leave(self, result: str = "void"):
+        """Return from the function; text that follows is reached by other ways only."""
+        self.line(f"ret {result}")
+        self.line(f"{self._label('after')}:")
+
     @contextmanager
     def if_(self, condition: Value) -> Iterator[None]:
         """Run the block if a condition holds."""

@@ -14,7 +14,7 @@ class Memory:
 
     The record has 8-byte fields (`call_fields`): the numbers of members, output times, breakpoints and directions; the addresses
     of the inputs and their strides between members (in numbers); the addresses of the outputs; the lengths per member of some of
-    them; and the address of the index of the next member, which threads share.
+    them; and the address of two words that threads share, the index of the next member and whether memory was refused.
     """
 
     plan: Plan
@@ -179,10 +179,22 @@ class Memory:
             first = f.min(f.lane(s.lost, k), f.op(f"sitofp i64 {number.name} to double", DOUBLE))
             self.put_lane_entry(f, "lost", k, first)
 
-    def allocate(self, f: Function, count: Value) -> tuple[Value, Value]:
-        """Allocate `count` numbers; return the block to free and the address of the first number, aligned to a register."""
+    def allocate(self, f: Function, count: Value, held: Sequence[Value] = ()) -> tuple[Value, Value]:
+        """Allocate `count` numbers; return the block to free and the address of the first number, aligned to a register.
+
+        If there is no memory, the function frees the blocks that it `held`, and returns.
+        """
         size = count * 8 + 64
         block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
+        with f.if_(f.is_null(block)):
+            self.report_no_memory(f)
+            for other in held:
+                f.line(f"call void @free(ptr {other.name})")
+            f.leave()
         address = f.op(f"ptrtoint ptr {block.name} to i64", INT)
         aligned = f.logic("and", address + 63, -64)
         return block, f.op(f"inttoptr i64 {aligned.name} to ptr", POINTER)
+
+    def report_no_memory(self, f: Function):
+        """Tell the caller that memory was refused: all results of the call are invalid."""
+        f.store(1, self.field(f, "next", POINTER), 1, base=INT)

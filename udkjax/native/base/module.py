@@ -287,9 +287,11 @@ class Module(Memory):
         """Fill the lanes of completed members with the next members."""
         fill()
 
-    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
-        """Allocate further memory of a run and store its address in `work`; return the blocks to free."""
-        del f, call
+    def allocate_memory(self, f: Function, block: Value) -> list[Value]:
+        """Allocate further memory of a run and store its address in `work`; return the blocks to free.
+
+        Without memory, `block` is freed, and the function returns (`allocate`)."""
+        del f, block
         return []
 
     def accelerate_stage(self, f: Function, i: int):

@@ -127,13 +127,13 @@ class ClosingForward(ClosingDerivative):
                 with f.each(self.n) as i:
                     f.store(self.entry(f, f"state {x}", i, self.ways[-1]), to, i + k * self.n)
 
-    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+    def allocate_memory(self, f: Function, block: Value) -> list[Value]:
         size = self.field(f, "directions") * (len(self.ways) * self.tangents.size)
-        block, start = self.allocate(f, size)
+        own, start = self.allocate(f, size, [block])
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["tangents"], base=POINTER)
-        return [block]
+        return [own]
 
 
 class ClosingTwice(ClosingForward):

@@ -85,7 +85,7 @@ class PositionCode:
             "q": np.empty((members, count, sizes.coordinates)),
             "out": np.empty((members, count, self.programs.output_count)),
             "end": np.empty((members, count)),
-            "next": np.zeros(1, np.int64),
+            "next": np.zeros(2, np.int64),  # and whether memory was refused
         }
         fields = {name: a.ctypes.data for name, a in arrays.items()}
         fields |= {"members": members, "count": count, "marches": guess is None, "longest": np.float64(longest).view(np.int64)}
@@ -97,6 +97,8 @@ class PositionCode:
         elif threads:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(lambda _: self._run(ctypes.addressof(call)), range(threads)))
+        if arrays["next"][1]:
+            raise MemoryError("no memory for a batch of positions")
         return Positions(arrays["q"], arrays["out"], arrays["end"])
 
 
@@ -190,6 +192,9 @@ class _Text:
         f = Function("run", [(POINTER, "call")], self.width)
         n, width = self.programs.sizes.coordinates, self.width
         block = f.op(f"call ptr @malloc(i64 {(self.size * width + width) * 8 + 64})", POINTER)
+        with f.if_(f.is_null(block)):
+            f.store(1, self._field(f, "next", POINTER), 1, base=INT)
+            f.leave()
         number = f.op(f"ptrtoint ptr {block.name} to i64", INT)
         f.given["work"] = f.op(f"inttoptr i64 {f.logic('and', number + 63, -64).name} to ptr", POINTER)
         with f.each(self.size) as i:

@@ -101,33 +101,45 @@ class Recorded(Differentiated):
     # --- points
 
     def _new_record(self, f: Function, lane: Value):
+        """Begin the record of a lane; without memory the lane stays empty."""
         s = Lane(f, self.places)
         record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
-        self.put_lane_entry(f, "record", lane, record, base=POINTER)
-        self.put_lane_entry(f, "capacity", lane, float(FIRST))
-        self.put_lane_entry(f, "points", lane, 0.0)
-        self._store_point(f, s, lane)
+        missing = f.is_null(record)
+        with f.if_(missing):
+            self.report_no_memory(f)
+            self.put_lane_entry(f, "active", lane, 0.0)
+        with f.if_(~missing):
+            self.put_lane_entry(f, "record", lane, record, base=POINTER)
+            self.put_lane_entry(f, "capacity", lane, float(FIRST))
+            self.put_lane_entry(f, "points", lane, 0.0)
+            self._store_point(f, s, lane)
 
     def _record(self, f: Function, k: Value) -> Value:
         """Return the address of the record of lane k."""
         return self.lane_entry(f, "record", k, base=POINTER)
 
     def _store_point(self, f: Function, s: Lane, k: Value):
-        """Append point 3 to the record of lane k."""
+        """Append point 3 to the record of lane k; without memory the run ends at its next step."""
         points, capacity = self.lane_entry(f, "points", k), self.lane_entry(f, "capacity", k)
         with f.if_(points >= capacity):
-            self.put_lane_entry(f, "capacity", k, capacity * 2.0)
             size = self.to_int(f, capacity * 2.0) * (self.row * 8)
             old = self._record(f, k)
             new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
             f.declared.add("declare ptr @realloc(ptr, i64)")
-            self.put_lane_entry(f, "record", k, new, base=POINTER)
-        row = f.at(self._record(f, k), self.to_int(f, points) * self.row)
-        for j, name in enumerate(("point3_t", "written", "begin")):
-            f.store(self.lane_entry(f, name, k), row, j)
-        for j, x in enumerate("qva"):
-            self.copy_lane(f, row, HEAD + j * self.n, f"point3 {x}", k)
-        self.put_lane_entry(f, "points", k, points + 1.0)
+            missing = f.is_null(new)
+            with f.if_(missing):  # the old record stays
+                self.report_no_memory(f)
+                self.put_lane_entry(f, "max_steps", k, 0.0)
+            with f.if_(~missing):
+                self.put_lane_entry(f, "record", k, new, base=POINTER)
+                self.put_lane_entry(f, "capacity", k, capacity * 2.0)
+        with f.if_(points < self.lane_entry(f, "capacity", k)):
+            row = f.at(self._record(f, k), self.to_int(f, points) * self.row)
+            for j, name in enumerate(("point3_t", "written", "begin")):
+                f.store(self.lane_entry(f, name, k), row, j)
+            for j, x in enumerate("qva"):
+                self.copy_lane(f, row, HEAD + j * self.n, f"point3 {x}", k)
+            self.put_lane_entry(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
         """Load a point of lane k from its record; numbers before the first point mean the first."""

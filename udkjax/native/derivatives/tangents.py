@@ -259,14 +259,14 @@ class Forward(Differentiated):
             self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
             self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
 
-    def allocate_memory(self, f: Function, call: Value) -> list[Value]:
+    def allocate_memory(self, f: Function, block: Value) -> list[Value]:
         """Allocate memory for all directions; return the blocks to free."""
         size = self._groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
-        block, start = self.allocate(f, size)
+        own, start = self.allocate(f, size, [block])
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
-        return [block]
+        return [own]
 
 
 class ForwardTwice(Forward):

@@ -165,7 +165,7 @@ def write_run(module: Module):
         f.store(0.0, work, i)
     f.store(call, work, module.start("call", "work"), base=POINTER)
     module.begin_memory(f)
-    blocks = [block, *module.allocate_memory(f, call)]
+    blocks = [block, *module.allocate_memory(f, block)]
     for name in ("length", "omega", "rtol", "atol", "smallest"):  # for lanes that stay empty
         setattr(s, name, f.const(1.0, DOUBLE, width))
     with f.each(-(-module.n // max(module.plan.vector // width, 1)) * max(module.plan.vector // width, 1)) as i:
