@@ -62,11 +62,11 @@ class AbstractSystem(eqx.Module):
         """True if there are any constraints."""
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """Return the largest component of a change of coordinates, in the system's own units, by default one."""
+        """Return the largest component of a change of coordinates, relative to the system's units, which are 1 by default."""
         return jnp.max(jnp.abs(dq), initial=0.0)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
-        """Return the largest violation of any row of Psi, in the system's own units, by default one."""
+        """Return the largest violation of any row of Psi, relative to the system's units, which are 1 by default."""
         return jnp.max(jnp.abs(psi), initial=0.0)
 
     @abstractmethod
@@ -88,25 +88,25 @@ class AbstractSystem(eqx.Module):
         """Return q and v to the constraint manifold."""
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """Return the part of small changes of q and v that a projection at q leaves; by default all of it."""
+        """Return the parts of small changes of q and v that a projection at q preserves; by default the changes themselves."""
         return TangentPart(dq, dv)
 
     @abstractmethod
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
-        """Return Psi and the residuals of the velocities, of all rows."""
+        """Return Psi and the velocity residuals of all rows."""
 
     @abstractmethod
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Return whether all terms of the equations are finite."""
 
-    # For formulations that integrate only some of the coordinates. By default all are integrated.
+    # The methods below are for formulations that integrate only some of the coordinates. By default all are integrated.
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return the time derivatives of q and v that are integrated."""
         return v, self.accelerations(t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> Self:
-        """Return the same system with the partition of this state, fixed for one step."""
+        """Return the same system with the partition of coordinates at this state, which stays fixed for one step."""
         return self
 
     @property
@@ -121,11 +121,11 @@ class MechanismSystem(AbstractSystem):
     scales: eqx.AbstractVar[Scales]
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """Return the largest component of a change of coordinates: lengths over the characteristic length, angles in rad."""
+        """Return the largest component of a change of coordinates: lengths per characteristic length, angles in rad."""
         return self.scales.size(dq)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
-        """Return the largest violation of any row of Psi, each over the row's scale."""
+        """Return the largest violation of any row of Psi, each divided by the row's scale."""
         return self.scales.violation(psi)
 
     @property
@@ -136,7 +136,7 @@ class MechanismSystem(AbstractSystem):
     @property
     @abstractmethod
     def stabilized(self) -> bool:
-        """True if Baumgarte's terms are fed back."""
+        """True if Baumgarte's stabilization terms are included."""
 
     @abstractmethod
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:

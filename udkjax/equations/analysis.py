@@ -1,7 +1,7 @@
 """Analysis of a mechanism before it moves: rank, redundant rows, and characteristic length, time and mass.
 
-Every threshold of the package that compares lengths, times or rows of unlike units takes its unit from here, so that a mechanism
-of a micrometre and one of a kilometre behave alike.
+Every threshold of the package that compares lengths, times or rows in different units takes its unit from here, so that a
+mechanism of a micrometre and one of a kilometre behave alike.
 
 The length L is the longest lever arm of a constraint at the initial guess, |dPsi/dangle| / |dPsi/d(x, y)|, or the largest radius
 of gyration sqrt(I/m) if that is longer. It does not depend on the origin. T is the shortest time in which anything changes at the
@@ -40,13 +40,13 @@ class Analysis(PrintsTable):
     Attributes:
         scales: characteristic length, time and mass, to which thresholds are relative.
         coordinates: number of coordinates.
-        row_names: joint and number of each row of Psi.
+        row_names: for each row of Psi, its constraint and its index within that constraint.
         redundant_rows: indices of the rows that depend on others; None: unknown.
     """
 
     scales: Scales
     coordinates: int = eqx.field(static=True)
-    row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # of Psi: the constraint and the row within it
+    row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # for each row of Psi: its constraint, its index in it
     # Rows of Psi to leave out; None if unknown: the guess cannot be closed or moved, or all numbers are traced.
     redundant_rows: tuple[int, ...] | None = eqx.field(static=True)
 
@@ -69,7 +69,7 @@ class Analysis(PrintsTable):
 
     @property
     def redundant(self) -> tuple[tuple[str, int], ...]:
-        """The redundant rows by name: the constraint, and the row within it."""
+        """The redundant rows: the name of the constraint, and the index of the row within it."""
         return tuple(self.row_names[i] for i in self.redundant_rows or ())
 
     @property
@@ -107,10 +107,10 @@ class Analysis(PrintsTable):
 def analyse(mechanism: Mechanism) -> Analysis:
     """Find the rank, the redundant rows and the scales of a mechanism; results are cached by structure and numbers.
 
-    Redundancy depends on numbers (three equal cranks). A mechanism with traced numbers has the redundant rows of the concrete one
-    that it was made from by `with_parameters`, and the scales of its own numbers; a run checks the rows that are left out and
-    reports if one of them has become independent. A mechanism whose geometry is traced as an argument of a function under `jit`
-    has no such origin: its redundant rows are unknown here, and a run finds them when it begins.
+    Redundancy depends on numbers (three equal cranks). If `with_parameters` made a mechanism with traced numbers from a concrete
+    one, its redundant rows are those of the concrete mechanism, and its scales follow from its own numbers; a run checks the rows
+    that are left out and reports if one of them has become independent. A mechanism whose geometry is traced as an argument of a
+    function under `jit` has no such origin: its redundant rows are unknown here, and a run finds them when it begins.
 
     Args:
         mechanism: The scene; its numbers may be traced.
@@ -138,7 +138,7 @@ Stored = TypeVar("Stored")
 
 
 class _Cache(Generic[Stored]):
-    """The `ANALYSIS_CACHE_SIZE` most recently used values, by their keys."""
+    """A cache of the `ANALYSIS_CACHE_SIZE` most recently used values."""
 
     def __init__(self):
         self._found: OrderedDict[Hashable, Stored] = OrderedDict()

@@ -178,7 +178,7 @@ class BlockElimination:
 
     def _off_diagonal_blocks(self) -> list[KernelLoop]:
         """Return the loops over shared bodies that fill the blocks of pairs of constraints, one loop for each kind of pair."""
-        holders: dict[int, list[tuple[int, int]]] = {}  # for each body: blocks, and its index among their bodies
+        holders: dict[int, list[tuple[int, int]]] = {}  # for each body: its blocks, and its index among the bodies of each
         for block, (group, i) in enumerate(self._elements):
             for slot, body in enumerate(group.bodies[:, i].tolist()):
                 holders.setdefault(body, []).append((block, slot))
@@ -208,8 +208,9 @@ class BlockElimination:
     def _front_table(self, e: Fronts) -> np.ndarray:
         """Return the table of fronts of the same sizes.
 
-        Its columns: where the block's factors and its right-hand side begin; for each later block of the front, the off-diagonal
-        block of both and its right-hand side; then the lower triangle of the blocks of all later ones, row by row.
+        The columns are start indices: first of the block's factors and of its right-hand side; then, for each later block, of the
+        off-diagonal block that couples the two and of the later block's right-hand side; last, of the blocks that couple the
+        later blocks with each other, as a lower triangle, row by row.
         """
         table = []
         for k, later in zip(e.blocks, e.later, strict=True):
@@ -227,7 +228,7 @@ def _scaled(w: KernelWriter, row: list[Scalar], base: Callable[[int], int]) -> l
     return [s * compliance(w, k % 3, base(k // 3)) for k, s in enumerate(row)]
 
 
-# Kernels of a front: a block of p rows, and its later blocks with their numbers of rows.
+# Kernels of a front: `p` is the number of rows of its block; `later` holds the numbers of rows of its later blocks.
 
 
 def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool, first_mark: int | None) -> None:

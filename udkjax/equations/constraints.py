@@ -3,9 +3,9 @@
 Each joint and driver defines only its residual; JAX takes all derivatives. The functions are written as in the paper, on dense
 arrays; elements of the same structure are evaluated together (structure.py). The tests compare the faster forms with these.
 
-In all of them t is the time (s), and q and v are the coordinates and velocities of the n / 3 bodies, x, y (m) and angle (rad) of
-each in turn, as (n,) or (bodies, 3). The m rows are those of the joints in their order, then those of the drivers (`row_names`);
-a row is in m or in rad.
+In all functions t is the time (s), and q and v are coordinates and velocities: x, y (m) and angle (rad) of each body in turn, as
+(n,) or (bodies, 3), n = 3 bodies. The m rows are those of the joints in their order, then those of the drivers (`row_names`); a
+row is in m or in rad.
 """
 
 from collections.abc import Callable, Sequence
@@ -76,7 +76,7 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> F
 def gamma(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
     """Return gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
 
-    It is minus the rate of Psi_dot along the motion of constant v.
+    -gamma is the rate of Psi_dot along a motion with constant v.
 
     Args:
         mechanism: The scene.

@@ -1,6 +1,6 @@
 """Psi and D of a small mechanism with concrete numbers, by NumPy on the scene's programs, without compilation.
 
-They serve to close a mechanism and to find its redundant rows (redundancy.py).
+This module serves to close a mechanism and to find its redundant rows (redundancy.py).
 """
 
 from typing import Any, NamedTuple
@@ -17,11 +17,11 @@ from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
 
-# Thresholds for the singular values of D with unit rows at a closed position, relative to the largest. Up to the first one they
-# count as zero: redundant rows leave rounding errors in half of the digits. Above the second they are nonzero. In between, close
-# to a singular configuration, the rank is in doubt.
+# Thresholds for the singular values of D with unit rows at a closed position, relative to the largest. Values up to the first
+# threshold count as zero, because rounding errors of redundant rows reach half of the digits. Values above the second are
+# nonzero. In between, near a singular configuration, the rank is uncertain.
 DEPENDENT_TOL, CLEAR_TOL = float(np.sqrt(np.finfo(float).eps)), 1e-4
-NEGLIGIBLE_SHARE = 1e-6  # coefficient in a combination of unit rows that counts as rounding
+NEGLIGIBLE_SHARE = 1e-6  # coefficients of unit rows up to this size are rounding errors
 
 
 class TruncatedPseudoinverse(NamedTuple):
@@ -35,7 +35,7 @@ class TruncatedPseudoinverse(NamedTuple):
     @classmethod
     def of(cls, D: np.ndarray, tol: float) -> "TruncatedPseudoinverse":
         """Return the pseudoinverse of a matrix; NaN if the matrix is not finite."""
-        if not np.all(np.isfinite(D)):  # NumPy raises for it
+        if not np.all(np.isfinite(D)):  # for which NumPy raises an error
             D, tol = np.zeros_like(D), np.nan
         u, sigma, vt = np.linalg.svd(D, full_matrices=False)
         counts = ~(sigma <= tol * sigma[0])
@@ -57,10 +57,10 @@ class RowTerms:
         self.count, self.size, self.names = programs.row_count, programs.coordinate_count, programs.row_names
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self._arrays_at = arrays_in_time(mechanism)
-        self._latest: tuple[Any, bytes, Any] = ((), b"", None)  # position, velocity and the result for them
+        self._latest: tuple[Any, bytes, Any] = ((), b"", None)  # the programs' inputs and results at the last state
 
     def geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi (m,), Psi_dot (m,) and the entries of Psi_q; the result for the latest state is kept."""
+        """Return Psi (m,), Psi_dot (m,) and the entries of Psi_q; the result at the last state is cached."""
         position, velocity = _key(t, q), v.tobytes()
         latest = self._latest
         if latest[:2] != (position, velocity):
@@ -84,7 +84,7 @@ class DenseTerms(RowTerms):
         return found, rate
 
     def gamma(self, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return gamma (m,), of Psi_q a = gamma."""
+        """Return gamma (m,), the right-hand side of Psi_q a = gamma."""
         free, b = self._arrays_at(t).loads(t, q, v)
         return b + self.slopes(t, q)[0] @ free
 
@@ -141,7 +141,7 @@ class DensePosition(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """True if the rank is certain: near a singular configuration, small residuals leave large errors of position."""
+        """True if the rank is certain: near a singular configuration, small residuals allow large errors of position."""
         return bool(np.all((self.sigma <= DEPENDENT_TOL * self.sigma[0]) | (self.sigma > CLEAR_TOL * self.sigma[0])))
 
     @property
@@ -161,7 +161,7 @@ class DensePosition(NamedTuple):
 
 
 class KinematicRows(DenseRows):
-    """The rows of a mechanism with concrete numbers in a metric without masses: (A, A, 1) for each body, A the longest arm."""
+    """The rows of a mechanism with concrete numbers in the metric (A, A, 1) for each body, with A the longest lever arm."""
 
     def __init__(self, mechanism: Mechanism):
         super().__init__(mechanism, concrete_scales(mechanism))
@@ -172,7 +172,7 @@ class KinematicRows(DenseRows):
         """Return Psi, the lengths of the rows of D, and D with unit rows; scaling rows leaves consistent solutions unchanged."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
-        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rows of rounding errors stay small
+        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rounding errors are not scaled up
         return self.psi(t, q), length, D / length[:, None]
 
     def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:

@@ -4,8 +4,8 @@ If N spans the null space of Psi_q^T, lambda + N y satisfies M a + Psi_q^T lambd
 unique if and only if c^T N = 0, and a single multiplier if its row of N is zero.
 
 Rank and null space are those of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (`Scales`), with lengths in units
-of the characteristic length, angles in radians, and each row over its scale; masses do not enter. All functions are pure and may
-be mapped over states (`jax.vmap`); without an `analysis` the scales are those of the mechanism.
+of the characteristic length, angles in radians, and each row divided by its scale; masses do not enter. All functions are pure
+and may be mapped over states (`jax.vmap`); without an `analysis` the scales are those of the mechanism.
 """
 
 from typing import NamedTuple
@@ -22,15 +22,15 @@ from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
 # Rank tolerance of statics, relative to the largest singular value. The tolerance of motion, `RANK_TOL`, is larger because runs
-# have to cross singular configurations. There, a residual of rounding, 1e-16, is a displacement of its root, 1e-8, and the
-# singular value that should vanish is as large: the tolerance is a hundred times that.
+# have to cross singular configurations. There, a rounding error of 1e-16 in Psi allows a displacement of its square root, 1e-8,
+# and the singular value that should vanish has that size; the tolerance of statics is a hundred times larger.
 STATIC_RANK_TOL = 1e-6
-# Length up to which a row of N, whose columns are orthonormal, counts as zero: rounding leaves 1e-15 / STATIC_RANK_TOL at most.
+# A row of N, whose columns are orthonormal, counts as zero up to this length; rounding errors reach 1e-15 / STATIC_RANK_TOL.
 UNIQUE_TOL = 1e-6
 
 
 class Uniqueness(NamedTuple):
-    """Marks of unique multipliers, the degree of indeterminacy of each, and the rank."""
+    """Which multipliers are unique, how indeterminate each one is, and the rank."""
 
     unique: Bool[Array, "m"]
     share: Float[Array, "m"]  # the length of each row of N, 0 (unique) to 1 (arbitrary)
@@ -51,7 +51,7 @@ def scaled_jacobian(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
         mechanism: The scene.
         t: Time (s).
         q: Coordinates (m, rad), (n,) or (bodies, 3).
-        analysis: The mechanism's `Analysis`, for its scales; by default made here.
+        analysis: The mechanism's `Analysis`, for its scales; by default computed here.
 
     Returns:
         J (m, n).
@@ -67,7 +67,7 @@ def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
         mechanism: The scene.
         t: Time (s).
         q: Coordinates (m, rad), (n,) or (bodies, 3).
-        analysis: The mechanism's `Analysis`, for its scales; by default made here.
+        analysis: The mechanism's `Analysis`, for its scales; by default computed here.
 
     Returns:
         min(m, n) singular values, dimensionless.
@@ -92,13 +92,13 @@ def left_null_space(
 def uniqueness(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> Uniqueness:
-    """Find for each row of Psi whether its multiplier is unique, that is, whether its row of N is zero.
+    """Determine for each row of Psi whether its multiplier is unique, that is, whether its row of N is zero.
 
     Args:
         mechanism: its numbers may be traced.
         t: time (s).
         q: coordinates of a closed position, (bodies, 3) or flat.
-        analysis: the mechanism's `Analysis`, for its scales; by default made here.
+        analysis: the mechanism's `Analysis`, for its scales; by default computed here.
         rank_tol: singular values of J up to this fraction of the largest count as zero.
 
     Returns:
@@ -113,9 +113,9 @@ def uniqueness(
 
 
 def unique_direction(null_rows: np.ndarray) -> float | None:
-    """Return the only direction (rad, 0 to pi) in which a planar force is unique; None if all directions are, or none.
+    """Return the only direction (rad, 0 to pi) in which a planar force is unique; None if all directions are or none is.
 
-    `null_rows` are the rows of N of its components (2, k), in the same unit.
+    `null_rows` (2, k) are the rows of N that belong to the components of the force, in the same unit.
     """
     u, sigma, _ = np.linalg.svd(np.pad(null_rows, ((0, 0), (0, 2))))
     loose = int(np.sum(sigma > UNIQUE_TOL))

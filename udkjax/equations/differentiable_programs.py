@@ -14,7 +14,7 @@ from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, LoopP
 # Arrays that are held fixed in derivatives. Kernels that read sines and cosines differentiate them as functions of q.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
 
-# Arrays of the second correction of a solution, whose first-order changes vanish after the first.
+# Arrays of the second correction of a solution; their first-order changes vanish after the first correction.
 SETTLED = ("right2", "sum2", "y2", "x2")
 
 
@@ -41,11 +41,11 @@ class DifferentiableProgram(NamedTuple):
     second_parts: Sequence[KernelLoop | Reset]
 
     def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
-        """Return the derivative, with further arrays fixed."""
+        """Return the derivative, with additional arrays fixed."""
         return LoopDerivative(self.parts, {*NOT_DIFFERENTIATED, *fixed})
 
     def in_mode(self, mode: str, fixed: Collection[str] = ()) -> LoopProgram:
-        """Return the program of a mode of differentiation, with further arrays fixed."""
+        """Return the program of a mode of differentiation, with additional arrays fixed."""
         if mode == TWICE:
             twice = LoopDerivative(self.second_parts, {*NOT_DIFFERENTIATED, *fixed} - {"x0"})
             return twice.second(SETTLED)
@@ -64,27 +64,27 @@ class DifferentiablePrograms:
 
     @cached_property
     def accelerations(self) -> DifferentiableProgram:
-        """a; safe."""
+        """Compute a; set safe."""
         return self._implicit(list(self._solver.terms.free_accelerations("v")), "b", "free", "a", 1)
 
     @cached_property
     def newton_q(self) -> DifferentiableProgram:
-        """q1."""
+        """Compute q1."""
         return self._implicit([], "psi", "q", "q1", -1)
 
     @cached_property
     def newton_v(self) -> DifferentiableProgram:
-        """v1."""
+        """Compute v1."""
         return self._implicit([], "psi_dot", "v", "v1", -1)
 
     @cached_property
     def projection(self) -> DifferentiableProgram:
-        """q1 and v1 of a state on the manifold, where they equal q and v."""
+        """Compute q1 and v1 of a state on the manifold, where they equal q and v."""
         solver, terms = self._solver, self._solver.terms
         copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
         position = [*terms.element_terms(("psi",), "v", 1), *solver.solve(1), self._correction("q", 1)]
         at_q1 = terms.element_terms(("psi_dot",), "v", 2, q="q1", sines="sines1")
-        at_rest = [Reset(x, 0, terms.layout.sizes[x]) for x in ("x0", "jt_x0", "z")]  # no correction is left
+        at_rest = [Reset(x, 0, terms.layout.sizes[x]) for x in ("x0", "jt_x0", "z")]  # no correction remains
         second = [*self._corrected("psi"), terms.add("q1", start="q", solution=0, sign=-1)]
         second += [*self._corrected("psi_dot", q="q1", sines="sines1"), terms.add("v1", start="v", solution=0, sign=-1)]
         return DifferentiableProgram(

@@ -1,4 +1,4 @@
-"""Elements of the same structure as one program over scalars, which loops run for each of them (scene_programs.py)."""
+"""Programs over scalars: one for all elements of the same structure, which loops run for each element (scene_programs.py)."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -93,7 +93,7 @@ force_programs = lru_cache(maxsize=256)(ForcePrograms)
 
 
 def has_rheonomic_joints(mechanism: Mechanism) -> bool:
-    """Return whether a joint, not only drivers, depends on time."""
+    """Return whether a joint depends on time, as drivers do."""
     kinds, loaded = element_kinds(mechanism, list(mechanism.joints.values())), bool(mechanism.forces)
     residuals = (constraint_programs(kind.structure, False, loaded).outputs["psi"] for kind in kinds)
     return any("time" in s.node.depends for rows in residuals for s in rows)

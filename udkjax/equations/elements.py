@@ -4,8 +4,9 @@ For a constraint with residual Psi(t, q), forward differentiation of the residua
 
     Psi_dot = Psi_q v + Psi_t        gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt
 
-(or, if that is shorter, gamma from derivatives of the entries of Psi_q, which often are other entries of Psi_q), and along unit
-vectors, whose zeros the graph folds away, the columns of Psi_q: a row is {column: scalar}.
+If it needs fewer operations, gamma is computed from derivatives of the entries of Psi_q, which often are other entries of Psi_q.
+Differentiation along unit vectors, whose zeros the graph removes, gives the columns of Psi_q; a row is stored as {column:
+scalar}.
 """
 
 from collections.abc import Callable, Sequence
@@ -86,7 +87,7 @@ def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: l
 
 
 def _choose_shorter(graph: Graph, known: list[SparseRow], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
-    """Return the one of two equal lists of expressions that takes fewer operations once the entries of the rows are computed."""
+    """Return whichever of two equal lists of expressions needs fewer operations once the entries of the rows are computed."""
     if other is None:
         return one
     given = [entry for row in known for entry in row.values()]

@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 
 def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Compile a function of a mechanism and of numbers once for all mechanisms of a structure.
+    """Compile a function of a mechanism and of numbers, once for all mechanisms of the same structure.
 
     The result can be transformed like the function itself. An `analysis` argument is computed before the numbers are traced.
 
@@ -43,7 +43,7 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
             found["analysis"] = analyse(mechanism)
         for name, value in found.items():
             if not isinstance(value, Mechanism | Analysis):
-                found[name] = jnp.asarray(value, jnp.result_type(float))  # a Python number would be static
+                found[name] = jnp.asarray(value, jnp.result_type(float))  # Python numbers would be static
         found["mechanism"] = mechanism.without_origin
         return program(*given.args, **given.kwargs)
 

@@ -4,7 +4,7 @@ All of them solve, with A = Psi_q and c = gamma - 2 alpha Psi_dot - beta^2 Psi,
 
     M a + A^T lambda = F,        A a = c,
 
-and find the same a if the rows of A are independent. With redundant rows, and in singular configurations, they need different
+and return the same a if the rows of A are independent. With redundant rows, and in singular configurations, they make different
 assumptions, and some of them fail.
 """
 
@@ -50,13 +50,14 @@ class Augmented(PointwiseFormulation):
         [ M  A^T ] [   a    ]   [ F ]
         [ A   0  ] [ lambda ] = [ c ].
 
-    By default solved by LU with partial pivoting, as is usual, which requires independent rows. With redundant rows the matrix is
+    The default is LU with partial pivoting, the usual method, which requires independent rows. With redundant rows the matrix is
     singular, and LU divides by a pivot that is a rounding error. If the pivot is exactly zero, as for a duplicated joint, the
-    result is NaN and a run ends at once with `Result.not_finite`; in the paper's linkage (rank 11 of 12) rounding decides this.
-    If it is not, the inconsistency of the rows at a stage is divided by the pivot, and steps become ever smaller. With a
-    pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm: redundant
-    multipliers are shared, and the accelerations are right, also in singular configurations with a consistent right-hand side.
-    Its default `rank_tol` is the square of the usual one: a singular value sigma of D = A M^(-1/2) is about sigma^2 here.
+    result is NaN and a run ends at once with `Result.not_finite`; in the paper's linkage (rank 11 of 12) this depends on
+    rounding. If the pivot is not zero, the inconsistency of the rows at a stage is divided by it, and steps become ever smaller.
+    With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm:
+    redundant constraints share their forces, and the accelerations are right, also in singular configurations with a consistent
+    right-hand side. Its default `rank_tol` is the square of the usual one: a singular value sigma of D = A M^(-1/2) is about
+    sigma^2 here.
 
     Args:
         method: a pseudoinverse, such as `SVD()`; None: LU with partial pivoting.
@@ -79,11 +80,11 @@ class NullSpaceQR(PointwiseFormulation):
 
         a_p = Q_1 R_1^(-T) c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
 
-    Q_1 has as many columns as A has independent rows: pivoting stops when the remainders fall to `rank_tol` of the longest row.
-    Redundant rows are left out; the choice may change with the position, which has no effect while they are satisfied. So drift
-    is not amplified: the paper's linkage is right to 5e-9 after 20 s at 1e-9 without any stabilization. In a singular
-    configuration the rank falls and N gains a column. With `Projection` the run crosses, but if the choice of rows changes near
-    it, in up to nine times the steps of `NullSpaceSVD`.
+    Q_1 has as many columns as A has independent rows: pivoting stops when the remainders fall to `rank_tol` times the longest
+    row. Redundant rows are left out; which rows these are may change with the position, without effect while they are satisfied.
+    So drift is not amplified: without any stabilization, the error of the paper's linkage is 5e-9 after 20 s at a tolerance of
+    1e-9. In a singular configuration the rank falls and N gains a column. With `Projection` the run crosses the configuration,
+    but takes up to nine times as many steps as with `NullSpaceSVD` if the choice of rows changes nearby.
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
@@ -109,10 +110,11 @@ class NullSpaceSVD(PointwiseFormulation):
 
         a_p = V_1 S_1^(-1) U_1^T c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
 
-    Singular values up to `rank_tol` of the largest count as zero. Inconsistent redundant rows are satisfied in the sense of least
-    squares, so without stabilization their drift grows as it does with a truncated pseudoinverse: the paper's linkage is lost
-    after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses. It differs from the
-    Udwadia-Kalaba equation by singular values in the metric of rank and least squares: A is not weighted by the masses.
+    Singular values up to `rank_tol` times the largest count as zero. Inconsistent redundant rows are satisfied in the sense of
+    least squares, so without stabilization their drift grows as it does with a truncated pseudoinverse: the paper's linkage is
+    lost after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses it. The difference from
+    the Udwadia-Kalaba equation by singular values is the metric in which rank and least squares are computed: A is not weighted
+    by the masses.
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value.
@@ -188,7 +190,7 @@ class FormulatedSystem(WrappedSystem):
 
 @eqx.filter_custom_jvp
 def _accelerations(formulated: FormulatedSystem, t: Time, q: Vector, v: Vector) -> Vector:
-    """Solve in the scene's own units, in which coordinates, rows and masses are of order one: rank tolerances are relative."""
+    """Solve in the scene's units, in which coordinates, rows and masses are of order one: rank tolerances are relative."""
     M, F, A, c = formulated.matrices(t, q, v)
     scales = getattr(formulated.equations, "scales", None)
     if scales is None:

@@ -1,4 +1,4 @@
-"""User-defined constrained systems by the same equation: any coordinates and masses, also nonholonomic rows."""
+"""User-defined constrained systems by the same equation, with any coordinates and masses and with nonholonomic constraints."""
 
 from collections.abc import Callable
 
@@ -59,7 +59,7 @@ class GeneralEquations(AbstractSystem):
         return jnp.zeros(0) if plus is None else -(plus.T @ (plus @ b))
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take two Newton steps in position and two in velocity, as phi need not be linear."""
+        """Take two Newton steps in position and two in velocity, because phi may be nonlinear."""
         for _ in range(2 if self.system.constraint is not None else 0):
             plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
             q = q - weight(plus @ self._psi(t, q))

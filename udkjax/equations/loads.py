@@ -1,7 +1,7 @@
 """Masses, loads and energies of a mechanism: M, F, T and V (de Falco, Pennestri, Vita 2005, section 3).
 
 The functions are written as in the paper, on arrays; JAX differentiates the potential energies of the force elements.
-t, q and v are those of constraints.py.
+t, q and v are defined as in constraints.py.
 """
 
 from collections.abc import Callable

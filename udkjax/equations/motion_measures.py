@@ -1,13 +1,14 @@
 """Measures of the motion of a driven mechanism, such as torques, as expressions, with derivatives by adjoint equations.
 
-With the value s of the driver, from Psi(x, s, q) = 0,
+With s the value of the driver, differentiating Psi(x, s, q) = 0 gives
 
     F_1 = Psi_q u + Psi_s = 0,      u = dq/ds,
     F_2 = Psi_q w + D^2 Psi = 0,    w = d^2q/ds^2, D the derivative along (s, q) = (1, u),
     F_3 = Psi_q^T y - b = 0,        b(x, s, q, u, w), such as M a - F, for which y are the joint forces.
 
-The derivatives of a measure g(x, s, q, u, w, y, d) are those of L = g - z_0 Psi - z_1 F_1 - z_2 F_2 - z_3 F_3 by x and s, with
-multipliers that make L stationary in y, w, u and q, in this order: each by one solution with Psi_q or its transpose.
+The derivatives of a measure g(x, s, q, u, w, y, d) with respect to x and s are those of L = g - z_0 Psi - z_1 F_1 - z_2 F_2 - z_3
+F_3, with multipliers that make L stationary in y, w, u and q, in this order: each follows from one linear solve with Psi_q or its
+transpose.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,7 +40,7 @@ class MotionModel(NamedTuple):
 
 
 class MotionMeasures:
-    """The measures of a model in a graph: their `values`, and their derivatives by s and x, `slopes()`.
+    """The measures of a model in a graph: their `values`, and their derivatives with respect to s and x, `slopes()`.
 
     Everything is first written in a separate graph, with x, s, q, u, w, y and the multipliers as inputs, so that it can be
     differentiated by each; then the expressions of these inputs are substituted.
@@ -83,7 +84,7 @@ class MotionMeasures:
         self._by = (*S, *X), Q, u, w, y
 
     def slopes(self) -> list[list[Scalar]]:
-        """Return the derivatives of each measure by s and x."""
+        """Return the derivatives of each measure with respect to s and x."""
         g, psi, first, second, left = self._parts
         moved, Q, u, w, y = self._by
         z = [self._inputs(f"z{k}", len(psi)) for k in range(3)]
@@ -122,7 +123,7 @@ class MotionMeasures:
         self._known |= {v.index: value for v, value in zip(variables, values, strict=True)}
 
     def _solved(self, rows: Sequence[Scalar], variables: np.ndarray) -> list[Scalar]:
-        """Return the values of variables for which rows, linear in them with coefficients Psi_q, vanish."""
+        """Return the values of `variables` at which `rows` vanish; the rows are linear in them, with coefficients Psi_q."""
         self._set(variables, [self._graph.constant(0.0)] * len(variables))
         return [-v for v in self._factors.solve(self._copy(rows))]
 
@@ -142,5 +143,5 @@ def _along(row: SparseRow, variables: Scalars, tangents: Scalars, zero: Scalar) 
 
 
 def _column(moved: Differential, rows: Scalars, y: Scalars, variable: Scalar, zero: Scalar) -> Scalar:
-    """Return the derivative of y^T rows by one variable."""
+    """Return the derivative of y^T rows with respect to one variable."""
     return sum((moved.row(r)[variable.index] * k for r, k in zip(rows, y, strict=True) if variable.index in moved.row(r)), zero)

@@ -1,7 +1,7 @@
 """Coordinate partitioning (Wehage and Haug, ASME J. Mech. Des. 104 (1982) 247): only independent coordinates are integrated.
 
-Pivoting splits the coordinates into dependent ones, as many as D has independent columns, and the independent rest. With the
-independent q_i and v_i as they are, the dependent ones follow from the constraints,
+Pivoting splits the coordinates into dependent ones, as many as D has independent columns, and the independent rest. Given the
+independent q_i and v_i, the dependent ones follow from the constraints,
 
     Psi(t, q_d, q_i) = 0 by Newton's method,        Psi_dot(t, q, v_d, v_i) = 0, which is linear in v_d,
 
@@ -22,7 +22,7 @@ from udkjax.equations.position_closure import LONGEST_STEP
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 
-PARTITION_NEWTON_STEPS = 10  # maximum, from the predicted state; three or four are usual
+PARTITION_NEWTON_STEPS = 10  # maximum number of steps from the predicted state; three or four are usual
 
 
 class CoordinatePartitioning(Formulation):
@@ -30,14 +30,15 @@ class CoordinatePartitioning(Formulation):
 
     The partition is chosen at the start of every step, by QR of D with column pivoting, and held for that step: it is never
     worse conditioned than the mechanism. Dependent coordinates serve only as the initial guess of Newton's method and do not
-    enter the error estimate. If Newton's method does not converge at a stage, or ends farther than 0.3 rad, or 0.3 of the
-    characteristic length, from that guess, the stage is NaN and a shorter step is taken. So the constraints hold wherever the
-    equations are evaluated: `Baumgarte` is refused, and `Projection` changes nothing.
+    enter the error estimate. If Newton's method does not converge at a stage, or ends farther than 0.3 rad, or 0.3 characteristic
+    lengths, from that guess, the stage is NaN and a shorter step is taken. So the constraints hold wherever the equations are
+    evaluated: `Baumgarte` is refused, and `Projection` changes nothing.
 
     Redundant rows are satisfied in the sense of least squares. In a singular configuration, where the remaining columns of D are
-    shorter than `rank_tol` times the longest, there are more independent coordinates for a step, which later steps constrain
-    again: the paper's linkage crosses (20 s at 1e-9 from each of the starts in tests/integrate/test_accuracy.py: errors up to
-    9e-7). Only for mechanisms, since the rows of a `ConstrainedSystem` may be nonholonomic.
+    shorter than `rank_tol` times the longest, a step has more independent coordinates, which later steps constrain again: runs of
+    the paper's linkage cross such configurations (20 s at a tolerance of 1e-9 from each of the initial states in
+    tests/integrate/test_accuracy.py: errors up to 9e-7). Only for mechanisms, since the rows of a `ConstrainedSystem` may be
+    nonholonomic.
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: `Scales.rank_tol`.
@@ -74,7 +75,7 @@ class PartitionedSystem(WrappedSystem):
         """Return v and a at the state that the independent coordinates and velocities determine."""
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
-        # Farther from the predicted state, the solution might be another assembly mode: NaN makes the step shorter.
+        # A solution farther from the predicted state might be another assembly mode; NaN makes the integrator shorten the step.
         near = self.equations.size(closed - q) <= LONGEST_STEP
         return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
@@ -115,7 +116,7 @@ class PartitionedSystem(WrappedSystem):
 
 
 # Derivatives. For a fixed partition, Psi(t, q_d, q_i) = 0 defines q_d as a function of t and q_i. One Newton step from a closed
-# state leaves the values and has the tangents of that function.
+# state does not change the values and has the tangents of that function.
 
 
 @jax.custom_jvp
@@ -153,7 +154,7 @@ def _(primals, tangents):
 
 def _newton(fixed: PartitionedSystem, t: Time, q: Vector) -> Vector:
     D, psi, root = fixed.equations.weighted_rows(t, q)
-    return jnp.where(fixed.dependent_columns, q - root * (fixed._plus(D) @ psi), q)  # independent coordinates stay bit for bit
+    return jnp.where(fixed.dependent_columns, q - root * (fixed._plus(D) @ psi), q)  # independent coordinates stay exact
 
 
 def _velocity(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> Vector:

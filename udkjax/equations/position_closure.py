@@ -2,9 +2,9 @@
 
     q <- q - s W D^+ Psi,        D = Psi_q W,
 
-with W the metric (M^(-1/2) in assembly) and D^+ truncated for small scenes, damped for large, sparse ones. s limits the length
-of a step, so that the branch of the guess is kept, and is halved until the residual falls: no step makes a state worse. Concrete
-numbers are closed by NumPy, without compilation; traced numbers take the same steps in JAX.
+with W the metric (M^(-1/2) in assembly) and D^+ truncated for small scenes, damped for large, sparse ones. s limits the length of
+a step, to stay on the branch of the guess, and is halved until the residual falls: no step makes a state worse. Concrete numbers
+are closed by NumPy, without compilation; traced numbers take the same steps in JAX.
 """
 
 from collections.abc import Callable
@@ -21,12 +21,12 @@ from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.scales import Scales
 from udkjax.programs.control_flow import control_flow
 
-# Largest Psi, in units of the scene's scales, at which a position counts as closed. Rounding leaves 1e-15; a scene that cannot be
-# closed leaves the error of its lengths.
+# Largest Psi, in units of the scene's scales, at which a position counts as closed. Rounding errors are about 1e-15; in a scene
+# that cannot be closed, Psi is as large as the errors of its lengths.
 CLOSED_TOL = 1e-9
-ROUNDING_UNITS = 32.0  # multiple of eps and the largest coordinate; a smaller residual is rounding and takes no step
+ROUNDING_UNITS = 32.0  # times eps and the largest coordinate: smaller residuals are rounding errors
 LONGEST_STEP = 0.3  # largest change of a coordinate in one step, in rad or characteristic lengths, to stay on the branch
-CLOSURE_ITERATIONS = 40  # maximum of Gauss-Newton steps; five or six are usual, as convergence is quadratic near a solution
+CLOSURE_ITERATIONS = 40  # maximum number of Gauss-Newton steps; five or six are usual: convergence is quadratic
 PACE_STEPS = 4  # steps over which the rate of convergence is measured: see `try_to_close`
 VELOCITIES = 2  # corrections of v: the second removes the rounding errors of the first
 STEP_HALVINGS = 12  # maximum for one step: if 2^-12 of it does not lower the residual, the position cannot be closed
@@ -43,7 +43,7 @@ class Rows(Protocol[AnyArray]):
         ...
 
     def residual(self, t: Time, q: AnyArray) -> AnyArray:
-        """Return Psi, each row over its scale."""
+        """Return Psi, each row divided by its scale."""
         ...
 
     def correction(self, t: Time, q: AnyArray) -> AnyArray:
@@ -71,7 +71,7 @@ def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -
 
 
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
-    """Take one step, halved until the residual falls; return whether it does. A residual at rounding level takes no step."""
+    """Take one step, halved until the residual falls; return whether it does. At rounding level no step is taken."""
     step = limited_step(rows, t, q, xp)
     fixed, current, fixed_step = (rows, q, step) if xp is np else jax.lax.stop_gradient((rows, q, step))
     size = xp.linalg.norm(fixed.residual(t, current))
@@ -101,10 +101,10 @@ def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary 
 
 
 def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
-    """Close a position that may not exist, by NumPy: give up when the remaining steps do not suffice at the present rate.
+    """Close a position that may not exist, by NumPy: give up when the remaining steps would not suffice at the current rate.
 
-    A successful closure converges fastest in its last steps. If the position does not exist, the residual falls ever more slowly,
-    but up to the last step.
+    A successful closure converges fastest in its last steps. If the position does not exist, the residual keeps falling, but ever
+    more slowly.
     """
     sizes, improves = [float(np.linalg.norm(rows.residual(t, q)))], True
     while improves and len(sizes) <= CLOSURE_ITERATIONS:

@@ -35,7 +35,7 @@ class Sizes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The indices of a measure, its derivative by s and its derivatives by x among the outputs."""
+    """The indices among the outputs of a measure, of its derivative with respect to s and of those with respect to x."""
 
     value: int
     by_value: int
@@ -61,7 +61,7 @@ class PositionPrograms:
         motion: Measures of the motion, appended to those of the position.
 
     Raises:
-        ValueError: The positions do not follow from the driver's value.
+        ValueError: The driver's value does not determine the positions.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class PositionPrograms:
         return [x for value, slope in zip(values, slopes, strict=True) for x in (value, *slope)]
 
     def _slopes(self) -> list[list[Scalar]]:
-        """Return the derivatives of measures by s and x, by one solution for each measure or, if fewer, each number."""
+        """Return dg/ds and dg/dx, with a linear solve for each measure or, if there are fewer, for each number."""
         graph, moved = self._graph, [self._s, *self._x]
         differential = Differential(graph, self._measures, [*moved, *self._q])
         zero = graph.constant(0.0)
@@ -147,7 +147,7 @@ class PositionPrograms:
         return [*found[:place], *(self._motion.slopes() if self._motion else []), *found[place:]]
 
     def _column(self, variable: Scalar) -> list[Scalar]:
-        """Return the derivatives of Psi by one variable."""
+        """Return the derivatives of Psi with respect to one variable."""
         zero = self._graph.constant(0.0)
         return [self._differential.row(r).get(variable.index, zero) for r in self._psi]
 
@@ -156,7 +156,7 @@ class PositionPrograms:
         return len(self._factors.block) == len(self._factors.open_columns)
 
     def _violation(self) -> Scalar:
-        """Return the sum of squares of Psi, each row over its scale; zero without redundant rows: Newton steps then suffice."""
+        """Return the sum of squares of Psi, each row divided by its scale; zero without redundant rows."""
         zero = self._graph.constant(0.0)
         if self._is_square:
             return zero
@@ -173,7 +173,7 @@ class PositionPrograms:
         return found
 
     def _find_transmission(self) -> tuple[Scalar, list[Scalar]]:
-        """Return the transmission tau and its derivatives by s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
+        """Return the transmission tau and its derivatives for s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
         graph, factors = self._graph, self._factors
         B, R, count = factors.block, factors.triangle, len(factors.open_columns)
         zero, tau = graph.constant(0.0), graph.constant(1.0)

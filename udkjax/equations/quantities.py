@@ -49,9 +49,9 @@ def equations_of(
     Args:
         system: The mechanism, or the `ConstrainedSystem`.
         method: The pseudoinverse; by default `Auto`.
-        baumgarte: Gains to feed violations back; None: no stabilization.
+        baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
         formulation: Another formulation; None: the Udwadia-Kalaba equation.
-        analysis: The mechanism's `Analysis`; by default made here.
+        analysis: The mechanism's `Analysis`; by default computed here.
 
     Returns:
         The equations, ready to be evaluated at states (n,).
@@ -114,8 +114,8 @@ def accelerations(
         method: The pseudoinverse; by default `Auto`, which is `SVD` here.
         stabilization: `Baumgarte`, or None.
         multipliers: Whether to return lambda as well.
-        formulation: Another formulation, which gives a but not lambda; None: the Udwadia-Kalaba equation.
-        analysis: The mechanism's `Analysis`; by default made here.
+        formulation: Another formulation, which computes a but not lambda; None: the Udwadia-Kalaba equation.
+        analysis: The mechanism's `Analysis`; by default computed here.
 
     Returns:
         a (m/s^2, rad/s^2) in the shape of q; with `multipliers` also lambda (m,) in N and N m, in the order of the rows, with
@@ -159,16 +159,16 @@ def energy(mechanism: Mechanism, solution: HistoryLike) -> Energy:
 def efforts(
     mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
 ) -> dict[str, Float[Array, "T"]]:
-    """Return the effort of each driver along its coordinate on its second body: -lambda of its row.
+    """Return the effort of each driver, which acts on the driver's second body along the driven coordinate: -lambda of its row.
 
     Args:
         mechanism: The scene.
         solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
-        method: The pseudoinverse; by default `SVD`. A redundant driver gets its part of the minimum-norm multipliers.
+        method: The pseudoinverse; by default `SVD`. A redundant driver gets its share of the minimum-norm multipliers.
         stabilization: The run's `Baumgarte`, to include its terms.
 
     Returns:
-        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are.
+        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are NaN.
     """
     if not mechanism.driver_names:
         return {}
@@ -193,7 +193,7 @@ def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation,
 def _multipliers(mechanism, analysis, ts, q, v, method, baumgarte):
     equations, finite = equations_of(mechanism, method, baumgarte, analysis=analysis), jnp.isfinite(q) & jnp.isfinite(v)
     reached = jnp.all(finite, axis=(1, 2))
-    # After a run has failed its states are replaced by the guess, as NaN would spoil the derivatives of the others.
+    # States after a failure are replaced by the guess, because NaN would also make the derivatives of the other states NaN.
     q, v = (jnp.where(reached[:, None, None], x, x0).reshape(len(ts), -1) for x, x0 in ((q, mechanism.q0), (v, mechanism.v0)))
     return jnp.where(reached[:, None], jax.vmap(equations.multipliers)(ts, q, v), jnp.nan)
 

@@ -1,6 +1,6 @@
 """Loads of joints on their bodies, -Psi_q^T lambda: in chosen axes, about a chosen point, with a chosen rule for sharing.
 
-With redundant constraints, equilibrium determines only some components (determinacy.py). The others take an assumption: by
+With redundant constraints, equilibrium determines only some components (determinacy.py). The others require an assumption: by
 default the least norm, each row in units of its scale; or, with the compliances c of joints (m/N, rad/(N m)), the least elastic
 energy,
 
@@ -41,7 +41,7 @@ Axes = Literal["ground", "body", "joint"]
 About = Literal["centre", "joint"]
 ByBody = dict[str, dict[str, Array]]  # by joint or driver, then by body
 
-# Threshold for eigenvalues of P K P, relative to the largest: joints that are stiffer than the softest by more count as rigid.
+# Threshold for eigenvalues of P K P, relative to the largest: joints with a smaller relative compliance count as rigid.
 COMPLIANCE_TOL = 1e-10
 
 
@@ -75,7 +75,7 @@ def reactions(
         constraints only the components marked by `unique_reactions` are determined; the accelerations are always unique.
 
     Raises:
-        ValueError: a compliance is negative, is for an unknown joint, or the number of compliances of a joint is wrong.
+        ValueError: a compliance is negative or belongs to an unknown joint, or a joint has the wrong number of compliances.
     """
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
@@ -111,7 +111,7 @@ def unique_reactions(
 
 
 def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:
-    """Return values by the names of their constraints and bodies, in order, which dictionaries lose under `jit`."""
+    """Return values by the names of their constraints and bodies, in order; dictionaries would lose the order under `jit`."""
     bodies = {name: dict.fromkeys(mechanism.frames_of(element)) for name, element in mechanism.constraints.items()}
     return {
         name: dict(zip([body for body in bodies[name] if body != GROUND], own, strict=True))

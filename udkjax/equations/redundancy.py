@@ -1,11 +1,11 @@
 """Redundant rows of Psi, which `analyse` finds once for all runs.
 
-Redundancy depends on numbers (three equal cranks) as well as on topology, and a single position does not show it: in a singular
-configuration more rows are dependent than elsewhere. So the mechanism is closed and moved along a random motion, and rows are
-chosen without which the others stay independent. For a left null space N of D (N^T D = 0), the rows outside S are independent
-exactly where N[S] is invertible: if an x row and a y row depend on each other with coefficients cos and sin of an angle, one is
-the right choice where the other coefficient vanishes, and the motion shows which. Everything is NumPy on the scene's programs,
-without compilation.
+Redundancy depends on numbers (three equal cranks) as well as on topology, and a single position does not suffice to find it: in a
+singular configuration more rows are dependent than elsewhere. So the mechanism is closed and moved along a random motion, and the
+rows to leave out are chosen such that the others stay independent. For a left null space N of D (N^T D = 0), the rows outside S
+are independent exactly where N[S] is invertible: if an x row and a y row depend on each other with coefficients cos and sin of an
+angle, only a row whose coefficient does not vanish can be left out, and the motion shows which one. Everything is NumPy on the
+scene's programs, without compilation.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
 
 POSITION_SAMPLES = 24  # positions of the random motion, if the first one has dependent rows
-MANY_ROWS = 300  # rows of Psi above which a third of the positions is used, as each takes long
-FAILURES = 3  # successive positions that cannot be closed, after which the drivers are taken to be contradictory
-CREEP = 1e-3  # fraction of the drivers' time step for another try if already the first positions cannot be closed
+MANY_ROWS = 300  # rows of Psi above which only a third of the positions is used, to save time
+FAILURES = 3  # after this many positions in succession that cannot be closed, the drivers are contradictory
+CREEP = 1e-3  # fraction of the drivers' time step to try next if the first positions cannot be closed
 HEADING_NOISE = 0.3  # fraction of the direction of the random motion that is new at each position
 GENERIC_TOL = 0.05  # smallest singular value, relative to the largest, of positions that are used to choose rows
 
@@ -34,7 +34,7 @@ def dense(matrix: Any) -> np.ndarray:
 
 
 class ClosedPosition(Protocol):
-    """A closed position and its rank of D: a `DensePosition` or a `SparsePosition`."""
+    """A closed position and the rank of D at it: a `DensePosition` or a `SparsePosition`."""
 
     @property
     def q(self) -> np.ndarray:
@@ -74,7 +74,7 @@ class PositionRows(Protocol[Position]):
         ...
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Return Psi, each row over its scale."""
+        """Return Psi, each row divided by its scale."""
         ...
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
 
 
 def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position]) -> tuple[int, ...]:
-    """Return the rows without which the others stay independent at all positions of full rank."""
+    """Return the rows to leave out, such that the others stay independent at all positions of full rank."""
     if positions[0].rank == rows.count:
         return ()
     chosen = []

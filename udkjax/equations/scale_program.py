@@ -1,4 +1,4 @@
-"""The scales of a scene (scales.py) as loops over its bodies, its rows of Psi, and the pairs of a row and a body in it.
+"""The scales of a scene (scales.py) as loops over its bodies, its rows of Psi, and the pairs of a row and one of its bodies.
 
     scales    length, arm, rate, mass, rank_tol, and then the scale of each row, computed from the array `numbers`
 
@@ -21,8 +21,8 @@ from udkjax.expressions.loop_program import MAXIMUM, Kernel, KernelLoop, KernelW
 from udkjax.expressions.selection import absolute, greater, maximum, where
 from udkjax.scene.mechanism import Mechanism
 
-# Rank tolerance relative to the largest singular value of D: far above rounding and drift, far below the singular values in
-# generic configurations. With projection, values from 1e-2 to 1e-5 cross the same singular configurations.
+# Rank tolerance relative to the largest singular value of D: well above rounding errors and drift, well below the singular values
+# in generic configurations. With projection, runs with any value from 1e-2 to 1e-5 cross the same singular configurations.
 RANK_TOL = 1e-4
 MAX_MASS_RATIO = 100.0  # for larger ratios the tolerance is lowered: see `Scales`
 
@@ -39,7 +39,7 @@ class ScaleProgram(NamedTuple):
 
 
 def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prologue: LoopProgram) -> ScaleProgram:
-    """Write the program.
+    """Write the program that computes the scales.
 
     Args:
         terms: The terms of the scene.
@@ -120,7 +120,7 @@ def _psi_t(group: ConstraintGroup) -> list[Scalar]:
     return graph.copy(rate, known)
 
 
-# --- kernels; numbers may be non-finite
+# --- kernels; numbers may be NaN or infinite
 
 
 @lru_cache(maxsize=64)
@@ -163,7 +163,7 @@ def _write_guess(w: KernelWriter) -> None:
 
 
 def _write_arm(w: KernelWriter) -> None:
-    """Compute the longest lever arm of all pairs, 0 if there is none."""
+    """Compute the longest lever arm of all pairs; 0 without pairs."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
     by_place = greater(moved, w.read("largest", None, MOVED) * ROUNDING)
     arm = where(by_place, turned / where(by_place, moved, w.graph.constant(1.0)), w.graph.constant(0.0))

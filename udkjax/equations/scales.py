@@ -1,7 +1,7 @@
 """The characteristic length, rate and mass of a mechanism, the units of every threshold.
 
-analysis.py defines them. They are one program (scale_program.py), run by NumPy if all numbers are concrete, by machine code in a
-trace, and by JAX on other devices.
+analysis.py defines them. One program (scale_program.py) computes them: NumPy runs it if all numbers are concrete, machine code in
+a trace, and JAX on other devices.
 """
 
 from functools import lru_cache
@@ -26,7 +26,7 @@ from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 from udkjax.scene.mechanism import Mechanism
 
-NO_THRESHOLDS = 0.0, 0.0  # thresholds of pivots, which the prologue takes after the numbers of a scene
+NO_THRESHOLDS = 0.0, 0.0  # thresholds of pivots, inputs of the prologue after the scene's numbers
 
 
 @prints_table
@@ -39,11 +39,11 @@ class Scales(NamedTuple):
     of a rod: its effective mass in a row with an arm r is 1 / (1 / m + r^2 / I).
     """
 
-    length: Float[Array, ""]  # m
-    arm: Float[Array, ""]  # m; the longest lever arm of a constraint; `length` if there is none
-    rate: Float[Array, ""]  # 1/s; 0 without velocities and loads
-    mass: Float[Array, ""]  # kg; NaN if any number of the mechanism is not finite
-    rows: Float[Array, "m"]  # m, rad or whatever the row is in
+    length: Float[Array, ""]  # the characteristic length (m)
+    arm: Float[Array, ""]  # the longest lever arm of a constraint (m); `length` if there is none
+    rate: Float[Array, ""]  # one over the characteristic time (1/s); 0 without velocities and loads
+    mass: Float[Array, ""]  # the characteristic mass (kg); NaN if any number of the mechanism is not finite
+    rows: Float[Array, "m"]  # the scale of each row, in the unit of the row
     rank_tol: Float[Array, ""]  # rank tolerance of the weighted D, relative to its largest singular value
 
     _units = units(length="m", arm="m", rate="1/s", mass="kg")
@@ -62,12 +62,12 @@ class Scales(NamedTuple):
         return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)
 
     def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        """Return the largest component of a change of coordinates (n,): lengths over L, angles in rad."""
+        """Return the largest component of a change of coordinates (n,): lengths divided by L, angles in rad."""
         x = xp.abs(q.reshape(-1, 3))
         return xp.maximum(xp.max(x[:, :2], initial=0.0) / self.length, xp.max(x[:, 2], initial=0.0))
 
     def violation(self, psi: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        """Return the largest component of a violation (m,) of Psi, each row over its scale."""
+        """Return the largest component of a violation (m,) of Psi, each row divided by its scale."""
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
 
@@ -104,17 +104,17 @@ def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
     return ArrayLoops(programs.scales.program, xp)
 
 
-# --- as one JAX operation on vectors of numbers (..., numbers), which native lowers to machine code
+# --- the scales as one JAX operation on vectors of numbers (..., numbers), which native lowers to machine code
 
 
 def evaluate_scales(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
-    """Return the array `scales` for each of some vectors of numbers, by NumPy."""
+    """Return the array `scales` for each vector of `numbers`, by NumPy."""
     found = [_evaluate(programs, x, np) for x in numbers.reshape(-1, numbers.shape[-1])]
     return np.array(found, numbers.dtype).reshape(*numbers.shape[:-1], -1)
 
 
 def scales_by_jax(numbers: Array, programs: ScenePrograms) -> Array:
-    """Return the array `scales` for each of some vectors of numbers, by JAX."""
+    """Return the array `scales` for each vector of `numbers`, by JAX."""
     return jnp.vectorize(lambda x: _evaluate(programs, x, jnp), signature="(n)->(m)")(numbers)
 
 

@@ -20,7 +20,7 @@ class SceneArrays(Generic[AnyArray]):
     """Psi, Psi_dot, Psi_q and loads of a mechanism.
 
     Args:
-        programs: The programs of its scene.
+        programs: The programs of the mechanism's scene.
         numbers: All numbers of the scene and the gains.
         xp: NumPy or jax.numpy.
     """

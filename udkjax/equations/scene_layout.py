@@ -25,12 +25,12 @@ from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import KernelWriter
 from udkjax.scene.mechanism import Mechanism
 
-# Columns of the table of bodies: where the coordinates of each, its sine and cosine, and its constants begin.
+# Columns of the table of bodies: start indices of a body's coordinates, of its sine and cosine, and of its constants.
 BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
-# Columns of the table of a group, before three for each of its bodies as above: where the constants of each element, its entries
-# of Psi_q, its eliminated rows and all of its rows begin.
+# Columns of the table of a group: start indices of an element's constants, of its entries of Psi_q, of its eliminated rows, and
+# of all its rows; then the three columns above for each of its bodies.
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
-# Constants of the scene, then of each body: its entries of M^(-1) for x and y, and for the angle.
+# Indices of constants of the scene. The constants of each body follow: its entries of M^(-1) for x and y, and for the angle.
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
 PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # number of entries of a body; indices for x, y and the angle
 
@@ -42,7 +42,7 @@ SOLVE_ARRAYS = ("right", "sum", "y", "x", "jt_x")
 
 
 def arrays_of_solve(solve: int) -> dict[str, str]:
-    """Return the names in a program of the arrays of one linear system."""
+    """Return the names that the arrays of one linear system have in a program."""
     return {name: f"{name}{solve}" for name in SOLVE_ARRAYS}
 
 
@@ -102,7 +102,7 @@ class SceneLayout:
         n = self.coordinate_count
         self.sizes = {
             "sines": 2 * self.body_count,
-            "sines1": 2 * self.body_count,  # of corrected positions
+            "sines1": 2 * self.body_count,  # at corrected positions
             "free": n,
             "load": n,
             "z": n,
@@ -112,10 +112,10 @@ class SceneLayout:
             "psi_q": 0,
             "gram": 0,
         }
-        self._eliminated = 0  # rows so far
+        self._eliminated = 0  # number of eliminated rows so far
         self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
         rows = self._find_rows(redundant_rows or ())
-        # If numbers mark redundant rows: the marks of independent rows, in the order of elimination.
+        # Marks of independent rows, in the order of elimination, if numbers mark redundant rows.
         self.marks, self.first_mark = self.row_count if redundant_rows is None else 0, self.constant_count
         self.constant_count += self.marks
         self.leaves_out_marked = bool(self.marks) and not every_row
@@ -212,5 +212,5 @@ class SceneLayout:
 
 
 def abstract_mechanism(tree: TreeDef, shapes: LeafShapes) -> Mechanism:
-    """Return the mechanism of a structure, with shapes in place of its numbers."""
+    """Return the mechanism of a structure, with shapes instead of numbers."""
     return jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*s) for s in shapes])

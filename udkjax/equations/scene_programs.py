@@ -23,8 +23,8 @@ from udkjax.expressions.loop_program import Kernel, KernelLoop, KernelWriter, Lo
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
-# Operations of the accelerations up to which programs are unrolled. Unrolled programs evaluate faster up to several times this
-# size, but tracing and compiling them takes longer the larger the scene is (python -m benchmarks scaling).
+# Programs are unrolled if the accelerations need at most this many operations. Up to several times this number unrolled programs
+# run faster, but tracing and compiling them takes longer the larger the scene is (python -m benchmarks scaling).
 UNROLLED_SCENE_OPERATIONS = 2800
 
 # The arrays that programs return; all others are scratch.
@@ -34,10 +34,10 @@ RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces roo
 class ScenePrograms:
     """Programs over arrays of numbers: they compute `RESULTS` from constants, t, q, v, dq and dv.
 
-    Intermediate results are kept in arrays of the sizes `scratch`; no number is overwritten after it has been read. `safe` is
-    one if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is the
-    distance from dependence. The `policy` for small pivots concerns the accelerations; corrections leave out the rows whose
-    pivots do not exceed `drop_tol`.
+    Intermediate results are kept in arrays of the sizes `scratch`; no number is overwritten after it has been read. `safe` is one
+    if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is the distance
+    from dependence. The docstring of each program names its results. The `policy` for small pivots concerns the accelerations;
+    corrections leave out the rows whose pivots do not exceed `drop_tol`.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class ScenePrograms:
 
     @property
     def number_count(self) -> int:
-        """The number of values that `prologue` takes: all numbers of the scene, gains, marks of rows, `drop_tol`, `safe_tol`."""
+        """The number of inputs of `prologue`: all numbers of the scene, gains, marks of rows, `drop_tol`, `safe_tol`."""
         return self._number_count + self._layout.gains + self._layout.marks + 2
 
     @property
@@ -108,43 +108,43 @@ class ScenePrograms:
 
     @cached_property
     def for_derivatives(self) -> "ScenePrograms":
-        """The programs whose derivatives are taken: these if the policy drops rows, else those that fall back."""
+        """The programs that are differentiated: these if the policy drops rows, else those with the policy `FALL_BACK`."""
         if self.policy.drops:
             return self
         return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, kernels=self._kernels)
 
     @cached_property
     def with_all_rows(self) -> "ScenePrograms":
-        """The same programs with the same constants on all rows: redundant ones may be independent in singular configurations."""
+        """The same programs and constants with all rows: redundant rows may be independent in singular configurations."""
         return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, every_row=True, kernels=self._kernels)
 
     # --- programs
 
     @cached_property
     def accelerations(self) -> LoopProgram:
-        """a; safe."""
+        """Compute a; set safe."""
         solver = self._solver
         solve = [*solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0), solver.safe]
         return program(solver.acceleration_system, solve)
 
     @cached_property
     def multipliers(self) -> LoopProgram:
-        """multipliers: lambda of all rows; a; safe."""
+        """Compute multipliers, the lambda of all rows, and a; set safe."""
         return program(self.accelerations.parts, self._terms.multipliers(0))
 
     @cached_property
     def newton_q(self) -> LoopProgram:
-        """q1, q after a Newton step to Psi = 0; safe."""
+        """Compute q1, q after a Newton step to Psi = 0; set safe."""
         return program(self._solver.newton("psi", "q"), [self._solver.safe])
 
     @cached_property
     def newton_v_and_psi(self) -> LoopProgram:
-        """v1, v after the Newton step to Psi_dot = 0; psi of all rows."""
+        """Compute v1, v after the Newton step to Psi_dot = 0, and psi of all rows."""
         return program(self._solver.newton("psi_dot", "v"), self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def corrections_and_accelerations(self) -> LoopProgram:
-        """q1 and v1, each after a Newton step, and a, all from one factorization."""
+        """Compute q1 and v1, each after a Newton step, and a, all from one factorization."""
         terms, solver, right = self._terms, self._solver, ("b", "psi", "psi_dot")
         system = [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("psi_q", *right))]
         solves = [part for k in range(3) for part in solver.refined_solve(k, 3)]
@@ -153,47 +153,47 @@ class ScenePrograms:
 
     @cached_property
     def project(self) -> LoopProgram:
-        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0, both with the factors of Psi_q at q; psi at q1.
+        """Compute q1 and v1 after Newton steps to Psi = 0 and Psi_dot = 0, both with the factors of Psi_q at q, and psi at q1.
 
-        If the step in q is small, the change of Psi_q by it is negligible in the step in v, which is small as well.
+        If the step in q is small, so is the step in v, and the change of Psi_q along the step in q is negligible.
         """
         return program(self._solver.project, self._terms.row_terms("psi", "psi", q="q1", sines="sines1"))
 
     @cached_property
     def project_and_accelerate(self) -> LoopProgram:
-        """v1, and a at v1; safe."""
+        """Compute v1, and a at v1; set safe."""
         return program(self._solver.project_and_accelerate)
 
     @cached_property
     def tangent_part(self) -> LoopProgram:
-        """dq1 and dv1: the parts of the changes dq and dv within the manifold; distance."""
+        """Compute dq1 and dv1, the tangent parts of the changes dq and dv, and distance."""
         return program(self._solver.position_terms("psi_q"), self._solver.factorize_dropping, self._solver.tangent_parts(0))
 
     @cached_property
     def end_of_step(self) -> LoopProgram:
-        """The results of `project_and_accelerate` and `tangent_part`, from one factorization."""
+        """Compute the results of `project_and_accelerate` and `tangent_part`, from one factorization."""
         return program(self._solver.project_and_accelerate, self._solver.tangent_parts(2))
 
     @cached_property
     def psi(self) -> LoopProgram:
-        """psi: Psi of all rows."""
+        """Compute psi, the Psi of all rows."""
         return program([self._terms.sincos()], self._terms.row_terms("psi", "psi"))
 
     @cached_property
     def psi_dot(self) -> LoopProgram:
-        """psi: Psi_dot of all rows."""
+        """Compute Psi_dot of all rows, stored as psi."""
         return program([self._terms.sincos()], self._terms.row_terms("psi_dot", "psi"))
 
     @cached_property
     def equation_terms(self) -> LoopProgram:
-        """terms: a_F, and b of all rows."""
+        """Compute terms: a_F, followed by b of all rows."""
         terms = self._terms
         free = [terms.sincos(), *terms.free_accelerations("v"), terms.add("terms", start="free")]
         return program(free, terms.row_terms("b", "terms", self.coordinate_count))
 
     @cached_property
     def geometry(self) -> LoopProgram:
-        """psi, psi_dot and psi_q, of all rows."""
+        """Compute psi, psi_dot and psi_q of all rows."""
         terms = self._terms
         rows = [*terms.row_terms("psi", "psi"), *terms.row_terms("psi_dot", "psi_dot")]
         return program([terms.sincos(), *terms.every_entry()], rows)
@@ -219,37 +219,37 @@ class ScenePrograms:
 
     @cached_property
     def rows_and_loads(self) -> LoopProgram:
-        """Inputs of rank-revealing methods: psi_q, psi, psi_dot and terms of all rows, and root, M^(-1/2)."""
+        """Compute the inputs of rank-revealing methods: psi_q, psi, psi_dot and terms of all rows, and root, M^(-1/2)."""
         psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
         return program(self.equation_terms.parts, self.rows("psi"), psi_dot)
 
     @cached_property
     def dense_accelerations(self) -> LoopProgram:
-        """The terms of accelerations by a dense pseudoinverse: psi_q of all rows, terms and root."""
+        """Compute the inputs of accelerations by a dense pseudoinverse: psi_q of all rows, terms and root."""
         return program(self.equation_terms.parts, self._terms.every_entry(), [self._root])
 
     @cached_property
     def dense_newton_q(self) -> LoopProgram:
-        """The terms of a Newton step to Psi = 0: psi_q and psi of all rows, and root."""
+        """Compute the inputs of a Newton step to Psi = 0: psi_q and psi of all rows, and root."""
         return program([self.sincos], self.rows("psi"))
 
     @cached_property
     def dense_newton_v(self) -> LoopProgram:
-        """The terms of a Newton step to Psi_dot = 0: psi_q of all rows, Psi_dot as psi, and root."""
+        """Compute the inputs of a Newton step to Psi_dot = 0: psi_q of all rows, Psi_dot as psi, and root."""
         return program([self.sincos], self.rows("psi_dot"))
 
     @property
     def sincos(self) -> KernelLoop:
-        """The sines and cosines of a state."""
+        """Compute the sines and cosines of the bodies' angles."""
         return self._terms.sincos()
 
     def rows(self, residual: str) -> list[KernelLoop | Reset]:
-        """Return Psi_q and, as psi, Psi or Psi_dot of all rows, and root, M^(-1/2), after the sines have been computed."""
+        """Compute, after `sincos`, Psi_q of all rows, their Psi or Psi_dot as psi, and root, M^(-1/2)."""
         return [*self._terms.every_entry(), *self._terms.row_terms(residual, "psi"), self._root]
 
     @property
     def _root(self) -> KernelLoop:
-        """M^(-1/2)."""
+        """Compute root, the diagonal of M^(-1/2)."""
 
         def write(w: KernelWriter):
             for k in range(3):
@@ -259,28 +259,28 @@ class ScenePrograms:
 
     @cached_property
     def pieces(self) -> LoopProgram:
-        """pieces: the index of the smooth piece of each piecewise smooth element."""
+        """Compute pieces, the index of the smooth piece of each piecewise smooth element."""
         return program([self._terms.sincos()], self._terms.pieces())
 
     @cached_property
     def energy(self) -> LoopProgram:
-        """energy: kinetic and potential energy (J); the potential of gravity is zero at the origin."""
+        """Compute energy, the kinetic and potential energy (J); the potential of gravity is zero at the origin."""
         return program([self._terms.sincos()], self._terms.energy())
 
     @cached_property
     def rank(self) -> LoopProgram:
-        """rank: the number of rows that the last factorization retained."""
+        """Compute rank, the number of rows that the last factorization retained."""
         return program(self._solver.elimination.rank())
 
     @cached_property
     def independent_rows(self) -> LoopProgram:
-        """independent: one for each row of Psi that elimination retains, zero for dependent ones."""
+        """Compute independent: one for each row of Psi that elimination retains, zero for dependent rows."""
         solver = self._solver
         return program(solver.position_terms("psi_q"), solver.factorize_dropping, solver.elimination.independent())
 
     @cached_property
     def value_derivatives(self) -> LoopProgram:
-        """dq1 = q' and dv1 = q'', derivatives by a driver's value that takes the place of time; psi of all rows; distance.
+        """Compute dq1 = q' and dv1 = q'', derivatives for a driver's value that replaces time, psi of all rows, and distance.
 
         They solve Psi_q q' = -Psi_t and Psi_q q'' = gamma, with gamma at the velocities q'.
         """
@@ -292,17 +292,17 @@ class ScenePrograms:
 
     @cached_property
     def prologue(self) -> LoopProgram:
-        """constants, from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
+        """Compute constants from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
         return write_prologue(self._layout, self._places, self._number_count)
 
     @cached_property
     def scales(self) -> ScaleProgram:
-        """scales: the characteristic scales of the guess, from `numbers`, those of the scene and the two thresholds."""
+        """Compute scales, the characteristic scales at the guess, from `numbers`: those of the scene and the two thresholds."""
         return write_scales(self._terms, self._places, self._number_count, self.prologue)
 
     @cached_property
     def differentiable(self) -> DifferentiablePrograms:
-        """The programs whose derivatives are taken."""
+        """The programs that are differentiated."""
         return DifferentiablePrograms(self._solver)
 
 
@@ -325,7 +325,7 @@ def scene_programs(
     Args:
         mechanism: The scene; its numbers may be traced.
         redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`); None: chosen by marks among the numbers.
-        baumgarte: Whether the gains alpha and beta are fed back.
+        baumgarte: Whether Baumgarte stabilization is included.
         policy: Policy for small pivots.
         in_pieces: Whether sampled numbers are given by `Mechanism.at` for each time, or as all samples and knots.
 

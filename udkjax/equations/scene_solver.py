@@ -25,12 +25,12 @@ class SceneSolver:
 
     @property
     def factorize(self) -> ProgramParts:
-        """The factorization of accelerations, under the policy."""
+        """The factorization for accelerations, under the policy."""
         return self.elimination.factorize(self.policy.drops)
 
     @property
     def factorize_dropping(self) -> ProgramParts:
-        """The factorization of corrections, without rows that depend on others."""
+        """The factorization for corrections, without rows that depend on others."""
         return self.elimination.factorize(True)
 
     @property
@@ -44,7 +44,7 @@ class SceneSolver:
 
     @property
     def acceleration_system(self) -> list[KernelLoop | Reset]:
-        """Psi_q, a_F, and b as the right-hand side."""
+        """Compute Psi_q, a_F, and b as the right-hand side."""
         return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
 
     def newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
@@ -63,7 +63,7 @@ class SceneSolver:
 
     @property
     def project(self) -> list[KernelLoop | Reset]:
-        """q1 and v1 after a Newton step to Psi = 0 and Psi_dot = 0, from one factorization."""
+        """Compute q1 and v1 after Newton steps to Psi = 0 and Psi_dot = 0, from one factorization."""
         terms = self.terms
         at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
         velocity = [*at_q1, *self.solve(1), terms.add("v1", start="v", solution=1, sign=-1)]
@@ -71,14 +71,14 @@ class SceneSolver:
 
     @property
     def project_and_accelerate(self) -> list[KernelLoop | Reset]:
-        """v1 after a Newton step to Psi_dot = 0, and a at v1, from one factorization."""
+        """Compute v1 after a Newton step to Psi_dot = 0, and a at v1, from one factorization."""
         terms = self.terms
         system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
         solve = [*self.solve(1), terms.add("a", start="free", solution=1), self.safe]
         return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
 
     def tangent_parts(self, solve: int) -> ProgramParts:
-        """Compute dq1 and dv1, the tangent parts of dq and dv, by the systems `solve` and `solve` + 1; distance."""
+        """Compute dq1 and dv1, the tangent parts of dq and dv, by the systems `solve` and `solve` + 1, and distance."""
         for k, change in enumerate(("dq", "dv"), solve):
             yield from self.terms.rates(change, k)
             yield from self.solve(k)

@@ -197,7 +197,7 @@ class SceneTerms:
     # --- products with the eliminated rows of Psi_q and their transpose
 
     def rates(self, change: str, solve: int, subtract: bool = False) -> ProgramParts:
-        """Set the right-hand side of a linear system to Psi_q times a change of coordinates, or subtract that from it."""
+        """Set the right-hand side of a linear system to Psi_q times a change of coordinates, or subtract the product from it."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -245,7 +245,8 @@ class SceneTerms:
     ) -> KernelLoop:
         """Set `to` to start + sign * change for each body; the default of both is zero.
 
-        `start` is an array, or `free`; `change` an array, or M^(-1) Psi_q^T y with the solution y of a linear system.
+        `start` is the name of an array, or `free`. The change is the array `change`, or M^(-1) Psi_q^T y, with y the solution of
+        the linear system `solution`.
         """
         base, size = (SINE, 2) if start == "sines" else (BODY_COORDINATES, 3)
 

@@ -1,9 +1,9 @@
-"""Dependent rows of a large scene by sparse elimination, in place of the singular values of dense_rows.py.
+"""Dependent rows of a large scene, by sparse elimination instead of the singular values of dense_rows.py.
 
 D has unit rows here, and D D^T is eliminated in an order of least fill. A pivot is the square of the distance of its row from the
-span of the rows before it. A row with zero pivot depends on those before it, is left out of the elimination, and gives one vector
-of the left null space: the row minus the combination of others that equals it. These vectors are sparse. Rows connected by them
-form sets, of a few dozen rows in most scenes; each set is decided separately, by singular values.
+span of the rows before it. A row with zero pivot depends on those before it, is left out of the elimination, and yields one
+vector of the left null space: the row minus the combination of others that equals it. These vectors are sparse. Rows connected by
+them form sets, of a few dozen rows in most scenes; each set is decided separately, by singular values.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from udkjax.scene.mechanism import Mechanism
 # Largest pivot of a unit row, the square of a length, that counts as zero.
 DEPENDENT_PIVOT = default_rank_tol(np.dtype(float)) ** 2
 DAMPING = RANK_TOL**2  # added to D D^T in closing; counterpart of the truncation at `RANK_TOL` for small scenes
-NULL_SPACE_BATCH = 64  # columns of a null space that are solved for at a time, to bound the memory of their dense form
+NULL_SPACE_BATCH = 64  # number of columns of a null space solved for at a time, to limit the memory of the dense columns
 
 
 SparseMatrix: TypeAlias = Any  # SciPy's type stubs lack the shape
@@ -42,9 +42,9 @@ class SparsePosition(NamedTuple):
     t: Time
     q: np.ndarray
     D: SparseMatrix
-    pivots: np.ndarray  # of the rows, in their own order
+    pivots: np.ndarray  # of all rows, in the order of Psi
     independent: np.ndarray  # rows with a pivot
-    dependent: np.ndarray  # rows without one
+    dependent: np.ndarray  # rows without a pivot
 
     @property
     def rank(self) -> int:
@@ -128,7 +128,7 @@ class SparseRows(RowTerms):
     def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
         D = csr_array((values * self.metric[self.entries[1]], self.entries), shape=(self.count, self.size))
         length = np.sqrt(D.multiply(D).sum(axis=1))
-        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rows of rounding errors stay small
+        length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rounding errors are not scaled up
         return csr_array(D.multiply(1 / length[:, None])), length
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:

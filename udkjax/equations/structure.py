@@ -1,6 +1,7 @@
 """The structure of a scene and of its elements: everything except the values of numbers.
 
-Elements of the same structure, such as all revolute joints, are traced once and evaluated together, for any bodies.
+Elements of the same structure, such as all revolute joints, are traced once and evaluated together, whichever bodies they
+connect.
 """
 
 import dataclasses
@@ -106,7 +107,7 @@ def element_kinds(
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     found: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
-        frames = attached_bodies(element, joints)  # once: a method call on a large module visits all of its leaves
+        frames = attached_bodies(element, joints)  # called once: a method call on a large module visits all of its leaves
         key = element_structure(element, frames), labels[i] if labels else None
         found.setdefault(key, []).append((i, [body_index[name] for name in frames if name in body_index]))
     result = []
@@ -124,7 +125,7 @@ def evaluate_by_kind(
     Args:
         function: Its result may be None.
         mechanism: The scene.
-        elements: Some of its constraints or force elements.
+        elements: Constraints or force elements of the mechanism.
         states: q and, where the elements depend on velocities, v, each (bodies, 3).
 
     Returns:

@@ -53,7 +53,7 @@ class TextbookEquations(MechanismSystem):
         return TangentPart(*of(jnp.stack([dq, dv])))
 
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
-        """Return Psi and Psi_dot, of all rows."""
+        """Return Psi and Psi_dot of all rows."""
         return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
@@ -61,7 +61,7 @@ class TextbookEquations(MechanismSystem):
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in self.matrices(t, q, v)]))
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
-        """Return M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, of all rows."""
+        """Return M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, for all rows."""
         mechanism, A = self.mechanism, constraints.psi_q(self.mechanism, t, q)
         c = uk.b(mechanism, t, q, v, self.baumgarte) + A @ uk.a_F(mechanism, t, q, v)
         return jnp.diag(loads.mass(mechanism)), loads.force(mechanism, t, q, v), A, c
@@ -94,7 +94,7 @@ class TextbookEquations(MechanismSystem):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """The weights of the rows; with elimination, which cannot tell small pivots from rounding, zero for redundant rows."""
+        """The weights of the rows. Elimination cannot tell small pivots from rounding: its redundant rows have weight zero."""
         if not isinstance(self.method, Elimination) or not self.redundant:
             return self.scales.weights
         return self.scales.weights.at[np.array(self.redundant)].set(0.0)
@@ -123,8 +123,8 @@ def prepare(
     Args:
         mechanism: The scene; its numbers may be traced.
         method: The pseudoinverse, by default `Auto`; the default of its `rank_tol` is that of the scales.
-        baumgarte: Gains to feed violations back; None: no stabilization.
-        analysis: The mechanism's `Analysis`; by default made here.
+        baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
+        analysis: The mechanism's `Analysis`; by default computed here.
 
     Returns:
         The equations, ready to be evaluated at states (n,).

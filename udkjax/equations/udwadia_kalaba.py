@@ -6,9 +6,9 @@ A mechanism's constraints Psi(t, q) = 0, masses M and loads F give, with
 
     a = a_F + M^(-1/2) D^+ b,        lambda = -(D^+)^T D^+ b,        M a + Psi_q^T lambda = F,
 
-for any rank of D. Of all accelerations that satisfy the constraints, or violate them least, these are nearest to a_F in the
-metric of M (Gauss's principle); the multipliers are those of least norm. Each symbol is a function on arrays, differentiable to
-any order, and the tests compare every faster form with it; `method` is any pseudoinverse.
+for any rank of D. Of all accelerations that satisfy the constraints, or violate them least, a is nearest to a_F in the metric of
+M (Gauss's principle); lambda has the least norm. Each symbol is a function on arrays, differentiable to any order, and the tests
+compare every faster form with it; `method` is any pseudoinverse.
 
 Rows of Psi in metres and in radians have singular values of different units. Weights w (m,) of the rows make them comparable, so
 that one rank tolerance suffices (`Scales.weights`: 1 for metres, a length for radians): D and b stand for diag(w) D and
@@ -38,7 +38,8 @@ Weights = Float[ArrayLike, "m"] | None
 class Baumgarte(PrintsLine):
     """Baumgarte stabilization: Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0.
 
-    Gains of 2 to 5 bound the drift caused by redundancy and rounding; the hundreds of the literature make the problem stiff.
+    Gains of 2 to 5 bound the drift caused by redundancy and rounding; gains of several hundred, as in the literature, make the
+    problem stiff.
 
     Args:
         alpha: the gain on Psi_dot (1/s).
@@ -106,7 +107,7 @@ def project(
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Project a state onto the manifold Psi = 0, Psi_dot = 0 by the smallest change in the metric of M.
 
-    Newton steps q - M^(-1/2) D^+ Psi are followed by one step v - M^(-1/2) D^+ Psi_dot, as Psi_dot is linear in v.
+    Newton steps q - M^(-1/2) D^+ Psi are followed by a single step v - M^(-1/2) D^+ Psi_dot, because Psi_dot is linear in v.
     """
 
     def newton(_: Array, q: Array) -> Array:

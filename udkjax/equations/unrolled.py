@@ -41,7 +41,7 @@ class Unrolled:
         programs: The programs as loops.
         names: Names of the programs to unroll.
         differentiated: Names of the programs of `ScenePrograms.differentiable` to differentiate.
-        active: For each number that the prologue takes, whether derivatives by it are needed.
+        active: For each input of the prologue, whether derivatives with respect to it are needed.
         mode: Mode of differentiation: `FORWARD`, `TWICE`, or `REVERSE`, from cotangents of the results to those of q, v and the
             constants.
     """
@@ -56,7 +56,7 @@ class Unrolled:
     ):
         graph = self.graph = Graph()
         n, count = programs.coordinate_count, programs.number_count
-        # Thresholds of pivots differ between programs, so the prologue does not use them.
+        # The prologue does not use thresholds of pivots, because they differ between programs.
         groups = ["parameter"] * (count - 2) + ["threshold", "parameter"]
         self.numbers = [graph.input(("numbers", k), group) for k, group in enumerate(groups)]
         sizes = {"t": (1, "time"), "q": (n, "position"), "v": (n, "velocity"), "dq": (n, "change"), "dv": (n, "change")}
@@ -97,7 +97,7 @@ class Unrolled:
         return UnrolledDerivative(evaluation, self._program(outputs, at | self._seeds))
 
     def evaluations(self, names: Sequence[str]) -> UnrolledProgram:
-        """Return the program of the numbers that derivatives need at one state, as "stored" and the name of each program."""
+        """Return the program of the numbers that derivatives need at one state, in arrays "stored" plus the name of a program."""
         found: dict[ArrayPlace, Scalar] = {}
         for name in names:
             evaluation = self.derivative(name).evaluation
@@ -172,7 +172,7 @@ def _entries(arrays: Arrays, names: Sequence[str]) -> dict[ArrayPlace, Scalar]:
 
 
 def _depending(graph: Graph, scalars: Sequence[Scalar]) -> set[int]:
-    """Return the nodes that depend on any of some scalars."""
+    """Return the nodes that depend on any of the scalars."""
     found = {s.index for s in scalars}
     for index, node in enumerate(graph.nodes):
         if any(a.index in found for a in node.arguments):
