@@ -48,7 +48,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
 
 
 def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
-    """Return the engine of a small simulation here, "native", "diffrax" or "none", and the reason."""
+    """Run a small simulation; return its engine, "native", "diffrax" or "none", and the reason."""
     try:
         solution = run(double_pendulum(), np.array([0.0, 0.1]))
     except Exception as error:
@@ -89,5 +89,5 @@ def _advice(engine: str, reason: str) -> Iterator[str]:
         yield f"machine code is not used here ({reason}): simulations take up to a hundred times as long"
     folder = cache_folder()
     if os.environ.get("UDKJAX_CACHE") != "0" and (folder is None or not is_writable(folder)):
-        place = "without a home folder" if folder is None else f"in {folder}"
-        yield f"machine code cannot be stored {place}, and is compiled in each process: set UDKJAX_CACHE to a folder"
+        location = "without a home folder" if folder is None else f"in {folder}"
+        yield f"machine code cannot be stored {location}, and is compiled in each process: set UDKJAX_CACHE to a folder"

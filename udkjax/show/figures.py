@@ -45,7 +45,7 @@ def channels_figure(
     figure = Figure(figsize=(8, 1.2 + 2.2 * len(kinds)), layout="constrained")
     panels = np.ravel(figure.subplots(len(kinds), 1, sharex=True))
     for axes, unit in zip(panels, kinds, strict=True):
-        draw_channels(axes, x, {name: values for name, (values, own) in channels.items() if own == unit}, unit)
+        draw_channels(axes, x, {name: values for name, (values, of_unit) in channels.items() if of_unit == unit}, unit)
     panels[-1].set_xlabel(label)
     figure.suptitle(title)
     return figure

@@ -17,14 +17,14 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-MOST_PANELS = 24  # panels of the picture of the fit, one for each channel of each record; further ones are only in the dataset
+MOST_PANELS = 24  # panels of the picture of the fit, one for each channel of each record; others are only in the dataset
 MOST_COLUMNS = 3  # panels side by side
-MOST_CHANNELS = 8  # channels in the picture of residuals: those that look least like noise
-MOST_COLOURS = 7  # records with a colour of their own
+MOST_CHANNELS = 8  # channels in the picture of residuals; those least like noise are chosen
+MOST_COLOURS = 7  # records with different colours
 MOST_BINS = 40  # bins of a histogram
 MOST_LAGS = 30  # lags of an autocorrelation
 NOISE_RANGE = 4.0  # range of a distribution, in standard deviations of the noise
-SAMPLES_PER_LAG = 4  # least number of samples per lag
+SAMPLES_PER_LAG = 4  # smallest number of samples per lag
 
 
 class Series(NamedTuple):
@@ -41,73 +41,81 @@ class Series(NamedTuple):
 
 
 def series(data: "xarray.Dataset") -> list[Series]:
-    """Return all channels of all records, channel by channel, without those that a record lacks."""
-    found = []
+    """Return the series of all records, channel by channel; channels that a record lacks are left out."""
+    all_series = []
     for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
-        one = data.isel(record=r, channel=c)
-        present = np.isfinite(one["measured"].values)
+        channel_of_record = data.isel(record=r, channel=c)
+        present = np.isfinite(channel_of_record["measured"].values)
         if present.any():
-            columns = (one[name].values[present] for name in ("time", "measured", "predicted", "residual", "noise"))
-            found.append(Series(str(one["record"].values), str(one["channel"].values), _unit(one), *columns))
-    return found
+            columns = (channel_of_record[name].values[present] for name in ("time", "measured", "predicted", "residual", "noise"))
+            all_series.append(
+                Series(
+                    str(channel_of_record["record"].values),
+                    str(channel_of_record["channel"].values),
+                    _unit(channel_of_record),
+                    *columns,
+                )
+            )
+    return all_series
 
 
 def fit(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> Figure:
     """Draw measurements as points, and predictions as lines."""
-    every, records = series(data), data.sizes["record"]
-    columns, panels = _panels(data, every, most_panels)
+    all_series, records = series(data), data.sizes["record"]
+    columns, panels = _panels(data, all_series, most_panels)
     rows = 1 + max(panels) // columns
     figure = Figure(figsize=(1.0 + (6.5 if columns == 1 else 4.2) * columns, 1.1 + 1.9 * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for place, axes in enumerate(grid):
-        if place not in panels:
+    for index, axes in enumerate(grid):
+        if index not in panels:
             axes.set_axis_off()
             continue
-        one = panels[place]
-        draw_series(axes, one)
-        axes.set_title(one.channel if records == 1 else f"{one.channel}, {one.record}", fontsize="small", loc="left")
-        axes.set_ylabel(one.units)
-        axes.set_xlabel("time (s)" if not any(place + columns * k in panels for k in range(1, rows)) else "")
+        shown = panels[index]
+        draw_series(axes, shown)
+        axes.set_title(shown.channel if records == 1 else f"{shown.channel}, {shown.record}", fontsize="small", loc="left")
+        axes.set_ylabel(shown.units)
+        axes.set_xlabel("time (s)" if not any(index + columns * k in panels for k in range(1, rows)) else "")
     _key(figure, grid[min(panels)])
-    remark = f"{len(panels)} of {len(every)} panels; the dataset has all of them" if len(panels) < len(every) else ""
+    remark = f"{len(panels)} of {len(all_series)} panels; the dataset has all of them" if len(panels) < len(all_series) else ""
     title(figure, data, "measured and predicted", remark)
     return figure
 
 
-def draw_series(axes: Axes, one: Series) -> None:
+def draw_series(axes: Axes, item: Series) -> None:
     """Draw measurements as points, and the prediction as a line."""
-    axes.plot(one.time, one.measured, "o", ms=4, mew=0, alpha=0.5, color=COLOURS[5], label="measured")
-    axes.plot(one.time, one.predicted, color=COLOURS[0], lw=1.1, label="predicted")
+    axes.plot(item.time, item.measured, "o", ms=4, mew=0, alpha=0.5, color=COLOURS[5], label="measured")
+    axes.plot(item.time, item.predicted, color=COLOURS[0], lw=1.1, label="predicted")
     axes.margins(x=0.01)
     plain(axes)
 
 
-def _panels(data: "xarray.Dataset", every: list[Series], most_panels: int) -> tuple[int, dict[int, Series]]:
-    """Return the number of columns of panels, and the series by panel; up to three records are side by side."""
+def _panels(data: "xarray.Dataset", all_series: list[Series], most_panels: int) -> tuple[int, dict[int, Series]]:
+    """Return the number of columns, and the series by index of the panel; up to three records are side by side."""
     records, channels = list(data["record"].values), list(data["channel"].values)
-    columns, places = min(MOST_COLUMNS, -(-len(every) // 4)), list(range(len(every)))
+    columns, places = min(MOST_COLUMNS, -(-len(all_series) // 4)), list(range(len(all_series)))
     if 1 < len(records) <= MOST_COLUMNS:
-        columns, places = len(records), [channels.index(one.channel) * len(records) + records.index(one.record) for one in every]
-    return columns, {place: one for place, one in zip(places, every, strict=True) if place < most_panels}
+        columns = len(records)
+        places = [channels.index(s.channel) * columns + records.index(s.record) for s in all_series]
+    return columns, {index: s for index, s in zip(places, all_series, strict=True) if index < most_panels}
 
 
 def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Figure:
-    """Draw the residuals of each channel over time, their distribution with that of the noise, and their autocorrelation."""
-    every = series(data)
+    """Draw the residuals of each channel over time, their distribution and that of the noise, and their autocorrelation."""
+    all_series = series(data)
     channels = _least_white(data, most_channels)
     shown = channels[:most_channels]
     records = {str(name): k for k, name in enumerate(data["record"].values)}
     figure = Figure(figsize=(11, 1.1 + 2.0 * len(shown)), layout="constrained")
     grid = figure.subplots(len(shown), 3, squeeze=False, width_ratios=(3, 1, 1.2))
     for (over_time, spread, correlated), channel in zip(grid, shown, strict=True):
-        own = [one for one in every if one.channel == channel]
-        for one in own:
-            colour = COLOURS[records[one.record] % len(COLOURS)] if len(own) <= MOST_COLOURS else COLOURS[0]
-            _over_time(over_time, one, colour)
-        _distribution(spread, own)
-        _autocorrelation(correlated, own)
+        of_channel = [item for item in all_series if item.channel == channel]
+        for item in of_channel:
+            colour = COLOURS[records[item.record] % len(COLOURS)] if len(of_channel) <= MOST_COLOURS else COLOURS[0]
+            _over_time(over_time, item, colour)
+        _distribution(spread, of_channel)
+        _autocorrelation(correlated, of_channel)
         over_time.set_title(channel, fontsize="small", loc="left")
-        over_time.set_ylabel(own[0].units)
+        over_time.set_ylabel(of_channel[0].units)
         spread.sharey(over_time)
         spread.tick_params(labelleft=False)
     for axes, words in zip(grid[-1], ("time (s)", "density", "lag (samples)"), strict=True):
@@ -123,7 +131,7 @@ def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Fig
 
 
 def _least_white(data: "xarray.Dataset", most_channels: int) -> list[str]:
-    """Return the channels; if there are too many, those that look least like noise come first."""
+    """Return the channels to draw; if there are too many, those whose residuals look least like noise."""
     names = [str(name) for name in data["channel"].values]
     if len(names) <= most_channels:
         return names
@@ -132,18 +140,18 @@ def _least_white(data: "xarray.Dataset", most_channels: int) -> list[str]:
     return [name for k, name in enumerate(names) if k in first] + [name for k, name in enumerate(names) if k not in first]
 
 
-def _over_time(axes: Axes, one: Series, colour: str) -> None:
-    axes.fill_between(one.time, -2 * one.noise, 2 * one.noise, color="0.9", lw=0, zorder=0)
-    axes.plot(one.time, one.residual, "o-", ms=2, lw=0.5, color=colour, label=one.record)
+def _over_time(axes: Axes, item: Series, colour: str) -> None:
+    axes.fill_between(item.time, -2 * item.noise, 2 * item.noise, color="0.9", lw=0, zorder=0)
+    axes.plot(item.time, item.residual, "o-", ms=2, lw=0.5, color=colour, label=item.record)
     axes.axhline(0, color="0.6", lw=0.6, zorder=1)
     axes.margins(x=0.01)
     plain(axes)
 
 
-def _distribution(axes: Axes, own: list[Series]) -> None:
+def _distribution(axes: Axes, of_channel: list[Series]) -> None:
     """Draw a histogram of all records, and the density of Gaussian noise with the assumed standard deviations."""
-    left = np.concatenate([one.residual for one in own])
-    noise = np.concatenate([one.noise for one in own])
+    left = np.concatenate([item.residual for item in of_channel])
+    noise = np.concatenate([item.noise for item in of_channel])
     if np.ptp(left) > 0:
         count = int(np.clip(np.sqrt(len(left)), 5, MOST_BINS))
         axes.hist(left, count, density=True, orientation="horizontal", color=COLOURS[4], alpha=0.7, lw=0)
@@ -158,16 +166,16 @@ def _distribution(axes: Axes, own: list[Series]) -> None:
     plain(axes)
 
 
-def _autocorrelation(axes: Axes, own: list[Series]) -> None:
-    """Draw the autocorrelation of the residuals divided by the noise, and the band of 95 % of the values of white noise."""
-    parts = [one.residual / np.where(one.noise > 0, one.noise, 1.0) for one in own]
-    parts = [part for part in parts if np.isfinite(part).all()]
-    count = min(MOST_LAGS, max((len(part) for part in parts), default=0) // SAMPLES_PER_LAG)
-    power = sum(float(part @ part) for part in parts)
+def _autocorrelation(axes: Axes, of_channel: list[Series]) -> None:
+    """Draw the autocorrelation of the residuals divided by the noise, and the band with 95 % of the values of white noise."""
+    whitened = [item.residual / np.where(item.noise > 0, item.noise, 1.0) for item in of_channel]
+    whitened = [record for record in whitened if np.isfinite(record).all()]
+    count = min(MOST_LAGS, max((len(record) for record in whitened), default=0) // SAMPLES_PER_LAG)
+    power = sum(float(record @ record) for record in whitened)
     if count and power > 0:
         lags = np.arange(1, count + 1)
-        values = [sum(float(part[lag:] @ part[:-lag]) for part in parts if len(part) > lag) / power for lag in lags]
-        band = 1.96 / np.sqrt(sum(map(len, parts)))
+        values = [sum(float(record[lag:] @ record[:-lag]) for record in whitened if len(record) > lag) / power for lag in lags]
+        band = 1.96 / np.sqrt(sum(map(len, whitened)))
         axes.axhspan(-band, band, color="0.9", lw=0, zorder=0)
         axes.vlines(lags, 0, values, color=COLOURS[0], lw=1.4)
         axes.axhline(0, color="0.6", lw=0.6)
@@ -177,14 +185,14 @@ def _autocorrelation(axes: Axes, own: list[Series]) -> None:
 
 
 def _key(figure: Figure, axes: Axes) -> None:
-    """Draw a legend of all panels from the curves of one."""
+    """Draw a legend for all panels from the curves of one panel."""
     figure.legend(
         *axes.get_legend_handles_labels(), loc="outside lower center", ncols=MOST_COLOURS, fontsize="small", frameon=False
     )
 
 
-def _unit(one: "xarray.Dataset") -> str:
-    units = str(one["channel_units"].values)
+def _unit(item: "xarray.Dataset") -> str:
+    units = str(item["channel_units"].values)
     return "" if units == "1" else units
 
 

@@ -18,21 +18,21 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-MOST_WRITTEN = 14  # parameters: with more, correlations are not written as numbers
-LARGEST_ERROR = 1e3  # percent: larger standard errors are drawn as this
+MOST_WRITTEN = 14  # largest number of parameters for which correlations are written as numbers
+LARGEST_ERROR = 1e3  # largest standard error that is drawn, in percent
 HIGHEST_COST = 3.0  # upper end of a profile's axis, in multiples of the limit of the cost
-ZERO_DRAWN = 1e-18  # zero is drawn as this on a logarithmic axis
+ZERO_DRAWN = 1e-18  # drawn instead of zero on a logarithmic axis
 
 
 def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
-    """Draw a result of `Estimate.to_xarray`, with or without profile likelihoods."""
-    found = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
-    found |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
-    return found | ({"profiles": profiles(data)} if "profile" in data else {})
+    """Draw the dataset of `Estimate.to_xarray`, with or without profile likelihoods."""
+    figures = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
+    figures |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
+    return figures | ({"profiles": profiles(data)} if "profile" in data else {})
 
 
 def save_fit_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
-    """Write each picture to the folder, and iterate over the names of the files."""
+    """Write each picture to the folder, and yield its file name."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         yield f"{name}.png"
@@ -51,9 +51,9 @@ def correlation(data: "xarray.Dataset") -> Figure:
         for i, j in np.argwhere(np.isfinite(values)):
             colour = "white" if abs(values[i, j]) > 0.6 else "black"
             matrix.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=6.5, color=colour)
-    place = np.arange(count)
-    matrix.set_xticks(place, [str(k + 1) for k in place], fontsize="small")
-    matrix.set_yticks(place, [f"{name}  {k + 1}" for k, name in enumerate(names)], fontsize="small")
+    positions = np.arange(count)
+    matrix.set_xticks(positions, [str(k + 1) for k in positions], fontsize="small")
+    matrix.set_yticks(positions, [f"{name}  {k + 1}" for k, name in enumerate(names)], fontsize="small")
     matrix.set_title("correlation of errors", fontsize="small", loc="left")
     _errors(errors, data)
     errors.set_ylim(matrix.get_ylim())
@@ -63,16 +63,16 @@ def correlation(data: "xarray.Dataset") -> Figure:
 
 
 def _errors(axes: Axes, data: "xarray.Dataset") -> None:
-    """Draw standard errors in percent of the values; unknown ones get a label."""
+    """Draw standard errors in percent of the values; infinite ones get a label."""
     error, value = data["standard_error"].values, np.abs(data["value"].values)
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = np.where(np.isfinite(error), np.clip(100 * error / value, ZERO_DRAWN, LARGEST_ERROR), np.nan)
-    place, known = np.arange(len(error)), np.isfinite(percent)
+    positions, known = np.arange(len(error)), np.isfinite(percent)
     low = np.nanmin(percent, initial=LARGEST_ERROR) / 10 if known.any() else 1.0
-    axes.barh(place[known], percent[known] - low, left=low, height=0.6, color=COLOURS[0])
+    axes.barh(positions[known], percent[known] - low, left=low, height=0.6, color=COLOURS[0])
     axes.set_xscale("log")
     axes.set_xlim(low, max(10 * low, 3 * np.nanmax(percent, initial=low)))
-    for k in place[~known]:
+    for k in positions[~known]:
         axes.text(0.04, k, "unknown", transform=axes.get_yaxis_transform(), va="center", fontsize="small", color=COLOURS[1])
     axes.set_yticks([])
     axes.set_title("standard error (% of value)", fontsize="small", loc="left")
@@ -80,9 +80,9 @@ def _errors(axes: Axes, data: "xarray.Dataset") -> None:
 
 
 def convergence(data: "xarray.Dataset") -> Figure:
-    """Draw the cost of each trial, and the largest change of an unknown by the next step.
+    """Draw the cost of each trial, and the largest change of an unknown in the next step.
 
-    Within a fit the cost never rises. Where it rises another fit begins: with a longer part of the records, another guess, or
+    Within a fit the cost never rises. Where it rises, another fit begins, with a longer part of the records, another guess, or
     other weights.
     """
     figure = Figure(figsize=(7, 5.4), layout="constrained")
@@ -92,8 +92,8 @@ def convergence(data: "xarray.Dataset") -> Figure:
     words = {"cost": "cost (half of the sum of squares)", "change": "largest change of an unknown"}
     for axes, name in zip(panels, words, strict=True):
         values = data[name].values
-        for one in fits:
-            axes.semilogy(one, np.maximum(values[one - 1], ZERO_DRAWN), "o-", ms=3, lw=1, color=COLOURS[0])
+        for trials_of_fit in fits:
+            axes.semilogy(trials_of_fit, np.maximum(values[trials_of_fit - 1], ZERO_DRAWN), "o-", ms=3, lw=1, color=COLOURS[0])
         axes.set_ylabel(words[name])
         plain(axes)
     panels[-1].set_xlabel("trial")
@@ -104,7 +104,7 @@ def convergence(data: "xarray.Dataset") -> Figure:
 
 
 def _short(name: str) -> str:
-    """Return the name of a parameter; for tied parameters the first name and their number."""
+    """Return the name of a parameter; for tied parameters, the first name and how many there are."""
     first, *others = name.split(" = ")
     return f"{first} = ... ({len(others) + 1} tied)" if others else first
 
@@ -112,7 +112,7 @@ def _short(name: str) -> str:
 def profiles(data: "xarray.Dataset") -> Figure:
     """Draw profile likelihoods, their approximations from the standard errors, and the confidence intervals.
 
-    The rise of the cost C is 2 (C - C_min) / s^2, for a linear model the square of the distance in standard errors.
+    The rise of the cost C is 2 (C - C_min) / s^2; for a linear model, it is the square of the distance in standard errors.
     """
     names = [str(name) for name in data["profile"].values]
     columns = min(MOST_COLUMNS, len(names))
@@ -131,12 +131,12 @@ def profiles(data: "xarray.Dataset") -> Figure:
 
 
 def _profile(axes: Axes, data: "xarray.Dataset", name: str) -> None:
-    one, known, limit = data.sel(profile=name), data.sel(parameter=name), data["interval"].attrs["limit"]
-    x, rise = (part[np.isfinite(part)] for part in (one["profile_value"].values, one["rise"].values))
+    curve, known, limit = data.sel(profile=name), data.sel(parameter=name), data["interval"].attrs["limit"]
+    x, rise = (values[np.isfinite(values)] for values in (curve["profile_value"].values, curve["rise"].values))
     value, error = float(known["value"]), float(known["standard_error"])
     axes.plot(x, rise, "o-", ms=3, lw=1.2, color=COLOURS[0], label="other parameters refitted")
     left, right = x.min(), x.max()
-    axes.axvspan(*(np.clip(one["interval"].values, left, right)), color="0.9", lw=0, zorder=0)
+    axes.axvspan(*(np.clip(curve["interval"].values, left, right)), color="0.9", lw=0, zorder=0)
     if np.isfinite(error) and error > 0:
         line = np.linspace(left, right, 101)
         axes.plot(line, ((line - value) / error) ** 2, "--", lw=1, color=COLOURS[1], label="approximated by the standard error")

@@ -5,8 +5,8 @@
 
     plots.draw_energy(pyplot.gca(), sol.ts, udk.energy(mech, sol))
 
-Every axis has its unit. Colour-blind readers can distinguish the colours, too, and curves also differ by markers or dashes.
-Only `trajectory` makes a figure of its own.
+Every axis is labelled with its unit. Colour-blind readers can distinguish the colours, and curves also differ by markers or
+dashes. Only `trajectory` creates a new figure.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,10 +35,10 @@ with OptionalImport():
 if TYPE_CHECKING:
     import xarray
 
-WIDE_SCENE_RATIO = 1.5  # width over height: wider scenes are drawn above the curves, others to their left
-SMALLEST_VIOLATION = 1e-17  # m, rad: smaller violations are drawn as this, since zero has no logarithm
-SAME_ANGLE = 1e-6  # rad: closer curves are indistinguishable, and drawn as one
-MOST_TICKS = 6  # along an axis of the plane: more labels would touch
+WIDE_SCENE_RATIO = 1.5  # scenes with a larger ratio of width to height are drawn above the curves, others to the left of them
+SMALLEST_VIOLATION = 1e-17  # smallest violation that is drawn (m, rad), since zero has no logarithm
+SAME_ANGLE = 1e-6  # curves that differ by less (rad) are drawn as one
+MOST_TICKS = 6  # number of labels along an axis of the plane; more would touch
 _CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 73)[:-1]) for f in (np.cos, np.sin)])
 
 
@@ -48,7 +48,7 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
     Links look as in the player; the fine lines are the paths of moving pins.
     """
     ts, q = np.asarray(sol.ts), np.asarray(sol.q)
-    alive = q[np.isfinite(q).all((1, 2))]  # a failed run has NaN from its failure on
+    alive = q[np.isfinite(q).all((1, 2))]  # a failed run is NaN after its failure
     if np.ptp(alive[..., 0]) > WIDE_SCENE_RATIO * np.ptp(alive[..., 1]):
         figure = Figure(figsize=(10, 6.2), layout="constrained")
         panels = figure.subplot_mosaic([["scene"] * 3, ["angles", "constraints", "energy"]], height_ratios=(1.5, 1))
@@ -72,22 +72,22 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
 def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int = 5) -> Axes:
     """Draw the mechanism in the first of the poses `q`, more faintly in `ghosts` others, and the paths of its pins."""
     attachments, drawn = body_points(mech), list(_outlines(mech, q))
-    for place, *point in trace_anchors(mech, q, None, float(analyse(mech).length)):
-        path = to_ground(point, q[:, int(place)])
-        axes.plot(*path.T, color=COLOURS[int(place) % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
+    for index, *point in trace_anchors(mech, q, None, float(analyse(mech).length)):
+        path = to_ground(point, q[:, int(index)])
+        axes.plot(*path.T, color=COLOURS[int(index) % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
     for instant in reversed(farthest_instants(q, ghosts + 1)):
         strength = 1.0 if instant == 0 else 0.22
-        for place, points, closed in drawn:
-            colour = COLOURS[place % len(COLOURS)]
-            x, y = to_ground(np.append(points, points[:1], axis=0) if closed else points, q[instant, place, None]).T
+        for index, points, closed in drawn:
+            colour = COLOURS[index % len(COLOURS)]
+            x, y = to_ground(np.append(points, points[:1], axis=0) if closed else points, q[instant, index, None]).T
             if closed:
                 axes.fill(x, y, facecolor=colour, alpha=0.25 * strength, lw=0, zorder=2)
             axes.plot(x, y, color=colour, alpha=strength, lw=2.6, solid_capstyle="round", solid_joinstyle="round", zorder=3)
-    for place, body in enumerate(mech.bodies):
-        colour = COLOURS[place % len(COLOURS)]
+    for index, body in enumerate(mech.bodies):
+        colour = COLOURS[index % len(COLOURS)]
         if len(attachments[body]):
-            axes.plot(*to_ground(attachments[body], q[0, place, None]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
-        axes.plot(*q[0, place, :2], "o", ms=3, color=colour, zorder=4)
+            axes.plot(*to_ground(attachments[body], q[0, index, None]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
+        axes.plot(*q[0, index, :2], "o", ms=3, color=colour, zorder=4)
     axes.plot(*attachments[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
     return _plane(axes)
 
@@ -95,14 +95,14 @@ def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"],
 def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray, "T bodies 3"]) -> Axes:
     """Draw the angle of each body over time; bodies with the same angle share a curve."""
     groups: list[tuple[np.ndarray, list[str], str]] = []
-    for place, body in enumerate(mech.bodies):
-        angle = q[:, place, 2]
+    for index, body in enumerate(mech.bodies):
+        angle = q[:, index, 2]
         for curve, names, _ in groups:
             if np.allclose(curve, angle, rtol=0, atol=SAME_ANGLE, equal_nan=True):
                 names.append(body)
                 break
         else:
-            groups.append((angle, [body], COLOURS[place % len(COLOURS)]))
+            groups.append((angle, [body], COLOURS[index % len(COLOURS)]))
     for angle, names, colour in groups:
         axes.plot(ts, angle, color=colour, lw=1.2, label=", ".join(names) if len(names) < 5 else f"{names[0]} ... {names[-1]}")
     axes.set(xlabel="time (s)", ylabel="angle (rad)")
@@ -121,7 +121,7 @@ def draw_violation(axes: Axes, ts: ArrayLike, violated: ArrayLike) -> Axes:
 
 
 def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
-    """Draw the kinetic, potential and total energy over time, the latter two relative to the total energy at the start."""
+    """Draw the kinetic, potential and total energy over time; the latter two minus the total energy at the start."""
     start = np.asarray(parts.total)[0]
     axes.plot(ts, np.asarray(parts.kinetic), color=COLOURS[0], lw=1, label="kinetic")
     axes.plot(ts, np.asarray(parts.potential) - start, "--", color=COLOURS[2], lw=1, label="potential")
@@ -132,7 +132,7 @@ def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
 
 
 def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
-    """Draw a number of each member of a sweep: a heat map over two axes or a line over one; missing values are grey.
+    """Draw a number of each member of a sweep, as a heat map over two axes or a line over one; missing values are grey.
 
     Raises:
         ValueError: the sweep has more than two axes; select values of the others by `data.sel` or `data.isel`.
@@ -193,21 +193,23 @@ def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | Non
     Raises:
         ValueError: no record has the channel.
     """
-    every = fit_figures.series(data)
-    found = [one for one in every if one.channel == channel and record in (None, one.record)]
-    if not found:
-        raise ValueError(f"no record has a channel {channel!r}: there are {', '.join(sorted({one.channel for one in every}))}")
-    fit_figures.draw_series(axes, found[0])
-    axes.set(xlabel="time (s)", ylabel=f"{channel} ({found[0].units})" if found[0].units else channel)
+    all_series = fit_figures.series(data)
+    matching = [item for item in all_series if item.channel == channel and record in (None, item.record)]
+    if not matching:
+        raise ValueError(
+            f"no record has a channel {channel!r}: there are {', '.join(sorted({item.channel for item in all_series}))}"
+        )
+    fit_figures.draw_series(axes, matching[0])
+    axes.set(xlabel="time (s)", ylabel=f"{channel} ({matching[0].units})" if matching[0].units else channel)
     legend(axes)
     return axes
 
 
-# --- the shapes of a mechanism
+# --- drawing of mechanisms
 
 
 def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
-    """Return up to `count` instants whose poses differ most: the first instant, then always the farthest from those chosen."""
+    """Return up to `count` instants whose poses differ most: the first instant, then always the farthest from the chosen ones."""
     poses = np.concatenate([q[..., :2], np.cos(q[..., 2:]), np.sin(q[..., 2:])], axis=-1).reshape(len(q), -1)
     chosen, distance = [0], np.linalg.norm(poses - poses[0], axis=1)
     while len(chosen) < count and distance.max() > 0:

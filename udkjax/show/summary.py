@@ -27,7 +27,7 @@ def check_summary(mech: Mechanism, found: Check) -> str:
 def run_summary(
     mech: Mechanism, sol: Solution, accuracy: Accuracy, seconds: float, compiling: float, moved: Sequence[str] = ()
 ) -> str:
-    """Describe the result, work, accuracy and time of a run, and how far assembly `moved` bodies before it."""
+    """Describe the result, work, accuracy and time of a run, and the distance by which assembly `moved` bodies."""
     lines = {
         "result": sol.cause if sol.result else sol.result.name,
         **numbered("assembly", [text.removeprefix("assembly ") for text in moved]),
@@ -68,7 +68,7 @@ def format_peak(ts: ArrayLike, effort: ArrayLike, unit: str) -> str:
 
 
 def format_error(error: float, scale: float) -> str:
-    """Return an error with three digits; 0 if it is rounding compared with a scale."""
+    """Return an error with three digits; 0 if it is a rounding error relative to a scale."""
     return "0" if format_number(error, scale=scale) == "0" else f"{error:.2e}"
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a sweep, drawn from its dataset: a map of the members' results, and one of each number saved per member."""
+"""Pictures of a sweep, drawn from its dataset: a map of the members' results, and a map of each number saved per member."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice, product
@@ -24,20 +24,21 @@ if TYPE_CHECKING:
 
 Colours = tuple[Colormap | str, Normalize]
 
-RESULT_VARIABLE, MEMBER_DIMENSION = "result", "member"  # the variable of the result codes, and the dimension of a design
+RESULT_VARIABLE, MEMBER_DIMENSION = "result", "member"  # names of the variable of result codes, and of the dimension of a design
 OTHER_RESULT = "not computed"  # label of codes outside `Result`
-RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")  # of the members of `Result` in order, success in grey; then of other codes
-MISSING_COLOUR = "0.75"  # of missing values
-LOGARITHMIC_RATIO = 1e2  # largest over smallest value: for larger ratios colours and axes are logarithmic
-COLUMNS = 4  # of panels
-MOST_PANELS = 12  # in one picture; of the other dimensions only the first values are drawn
+# Colours of the members of `Result` in order, success in grey; then the colour of other codes.
+RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")
+MISSING_COLOUR = "0.75"  # grey level of missing values
+LOGARITHMIC_RATIO = 1e2  # colours and axes are logarithmic if the ratio of the largest to the smallest value exceeds this
+COLUMNS = 4  # number of columns of panels
+MOST_PANELS = 12  # number of panels in one picture; of other dimensions only the first values are drawn
 
 
 def pictures(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> dict[str, Figure]:
-    """Draw the dataset of a sweep: `result`, and every variable with one number per member that differs between members.
+    """Draw the dataset of a sweep: `result`, and each variable that has one number per member and differs between members.
 
-    The two dimensions with most values are the axes of a map; each combination of the others has a panel. A single dimension
-    gives a line. Members of a design, which has no grid, are points over its first two axes.
+    The two dimensions with the most values are the axes of a map; each combination of the others has a panel. A single dimension
+    is drawn as a line. Members of a design, which has no grid, are points over its first two axes.
     """
     differing = [name for name in scalars(data) if len(np.unique(data[name])) > 1]
     return {name: _picture(data, name, most_panels) for name in (RESULT_VARIABLE, *differing)}
@@ -101,7 +102,7 @@ def _panel(axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str],
 
 
 def _layout(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
-    """Return the dimensions of the axes, and for each panel its indices into the other dimensions, and its title."""
+    """Return the dimensions of the axes, and for each panel its indices in the other dimensions and its title."""
     dims = _dims(data)
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
     across = (MEMBER_DIMENSION,) if MEMBER_DIMENSION in dims else tuple(d for d in dims if d in longest)
@@ -115,7 +116,7 @@ def _layout(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> tuple[tup
 def _map(
     axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str], cmap: Colormap | str, norm: Normalize
 ) -> ScalarMappable:
-    """Draw a heat map: the first dimension upwards, the second to the right."""
+    """Draw a heat map with the first dimension upwards and the second to the right."""
     up, right = across
     values = np.ma.masked_invalid(_drawable(part[name], name).transpose(up, right).values)
     axes.set_facecolor(MISSING_COLOUR)
@@ -192,25 +193,25 @@ def name_results(bar: Colorbar) -> None:
 
 
 def _codes() -> Colours:
-    """Return a colour for each result, and one for other codes."""
+    """Return a colour for each result, and a colour for other codes."""
     count = len(Result) + 1
     return ListedColormap(RESULT_COLOURS[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
 
 
 def _scale(values: np.ndarray) -> Colours:
-    """Return colours from the smallest to the largest value, logarithmic if these are far apart."""
+    """Return a scale of colours from the smallest to the largest value, logarithmic if their ratio is large."""
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
     return "viridis", LogNorm(low, high) if _decades(finite) else Normalize(low, high)
 
 
 def _drawable(values: "xarray.DataArray", name: str) -> "xarray.DataArray":
-    """Return values to draw: all codes outside `Result` are replaced by one."""
+    """Return values to draw: all codes outside `Result` are replaced by the same code."""
     return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT_VARIABLE else values
 
 
 def _edges(part: "xarray.Dataset", dim: str, scale: Callable[[str], object]) -> np.ndarray:
-    """Return the edges of a map's cells: half way between values, or between the places of labels."""
+    """Return the edges of a map's cells: halfway between values, or between the positions of labels."""
     if not _numeric(part, dim):
         return np.arange(part.sizes[dim] + 1) - 0.5
     values = part[dim].values.astype(float)
@@ -262,7 +263,7 @@ def _result(code: int) -> str:
 
 
 def save_sweep_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
-    """Write each picture to the folder, and iterate over the names of the files."""
+    """Write each picture to the folder, and yield its file name."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         yield f"{name}.png"

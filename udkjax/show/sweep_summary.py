@@ -51,13 +51,13 @@ def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
 
 def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:
     """Describe the results of the members of a sweep, and the range of each number saved per member."""
-    found = sweep_results(data)
-    ended = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in found["results"].items())
-    lines = {"members": f"{found['members']}: {ended}"}
-    for name, values in found["ranges"].items():
+    results = sweep_results(data)
+    ended = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in results["results"].items())
+    lines = {"members": f"{results['members']}: {ended}"}
+    for name, values in results["ranges"].items():
         unit = "" if values["units"] in ("", "1") else f" {values['units']}"
-        least, largest, median = (f"{values[key]:.4g}" for key in ("least", "largest", "median"))
-        lines[name.replace("_", " ")] = f"{least} to {largest}{unit}, median {median}"
+        smallest, largest, median = (f"{values[key]:.4g}" for key in ("least", "largest", "median"))
+        lines[name.replace("_", " ")] = f"{smallest} to {largest}{unit}, median {median}"
     lines["time"] = duration(seconds)
     return table(f"{data.attrs.get('title') or 'mechanism'}: a sweep", lines)
 

@@ -13,9 +13,8 @@ from udkjax.synthesis.search import ROUNDING, SearchState, harden, merit_of, mus
 from udkjax.synthesis.steps import ACTIVE_SETS
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
-DIFFERENCE = (
-    1e-7  # relative to the scales; small enough for mechanisms that barely turn. Rounding errors of the Hessian are about 1e-8.
-)
+# Relative to the scales; small enough for mechanisms that barely turn. Rounding errors of the Hessian are about 1e-8.
+DIFFERENCE = 1e-7
 FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, relative to the largest eigenvalue
 CONVERGED = 1e-13  # predicted relative decrease of the merit
 

@@ -1,8 +1,8 @@
-"""The player: motions of mechanisms in a page or a notebook, or written as a picture or a film.
+"""The player: shows motions of mechanisms in a page or a notebook, or writes them as a picture or a film.
 
-`animate` and `animate_modes` make an `Animation`. The player's plain data (player_data.py) consist of marks (marks.py), symbols
-(symbols.py) and packed tables (packing.py). mount.js and the modules that it imports show them; pictures.py and films.py draw
-them.
+`animate` and `animate_modes` make an `Animation`. Its plain data (player_data.py) consist of marks (marks.py), symbols
+(symbols.py) and packed tables (packing.py). The browser shows these by mount.js and its imports; pictures.py and films.py write
+them to files.
 """
 
 from udkjax.show.player.animation import Animation, animate, animate_modes

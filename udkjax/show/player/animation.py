@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
 
 LIVE_SECONDS, LIVE_INSTANTS = 10.0, 501  # duration and output times of a live page without a given run
-FRAME_HEIGHT = 560  # px: height of the player inside another page
+FRAME_HEIGHT = 560  # height of the player inside another page (px)
 
 
 class FailedRunWarning(UserWarning):
@@ -46,7 +46,7 @@ class FailedRunWarning(UserWarning):
 
 
 class Animation:
-    """An animation, the result of `animate`. In a notebook it shows itself as a page in a frame.
+    """An animation, the result of `animate`. A notebook displays it as a page in a frame.
 
     The page still works when the notebook is opened without Python, and in exports of nbconvert. `widget` returns a player that
     Python can control.
@@ -78,15 +78,15 @@ class Animation:
         Args:
             path: .html for the player; .gif (extra `plot`) or .mp4 (`video`) for the motion; .svg, .png (`plot`) or .dxf (`dxf`)
                 for a pose.
-            t: time of the pose (s); by default the start.
+            t: time of the pose (s); by default the start of the motion.
             options: for .html `theme` and `autoplay`; for .gif and .mp4 `fps` (1/s), `width` (px), `theme` and `speed` (seconds
-                of motion per second, by default that of the player); for .svg and .png `width` (px) and `theme`.
+                of motion per second, by default the player's speed); for .svg and .png `width` (px) and `theme`.
 
         Returns:
             The path.
 
         Raises:
-            ValueError: the path has another suffix.
+            ValueError: the suffix of the path is unknown.
             ImportError: a package is missing; the message names the extra that installs it.
         """
         path = Path(path)
@@ -147,35 +147,35 @@ def animate(
     live: Live = False,
     events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),
 ) -> Animation:
-    """Show the motion of a mechanism, or several motions side by side and in step.
+    """Show the motion of a mechanism, or several motions side by side and synchronized.
 
     Args:
         mechanism: the mechanism that moves; for runs of different mechanisms, a mechanism for each label.
         solution: a `Solution`, or any object with ts (T,), q and v (T, bodies, 3); for several runs a mapping by label, such as
-            {"projected": one, "not stabilized": other}. By default the mechanism is shown at rest, as in its scene.
+            {"projected": first, "not stabilized": second}. By default the mechanism is shown at rest, as in its scene.
         measures: curves over time below the motion: any of "violation" (constraint violation in m, with radians as arcs of the
             characteristic length), "energy", "rank" (of the constraint Jacobian) and "effort" (driving torques in N m and forces
             in N), or {"torque (N m)": array} for your own values, and {"torque (N m)": {label: array}} for several runs.
         reactions: True to draw joint forces as arrows, in pictures and films as well. Forces shared by redundant constraints are
-            not unique: those of least norm are drawn, dashed in the page and paler in pictures.
+            not unique; the forces of least norm are drawn, dashed in the page and paler in pictures.
         traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
             the moving pins, up to eight.
-        shapes: further points (n, 2) of bodies by name, in their own frames (m), that the drawn bodies go through.
+        shapes: further points (n, 2) of bodies by name, in the bodies' frames (m), that the drawn bodies pass through.
         title: title; by default the mechanism's name.
-        live: parameters (`parameters()`), or single entries of them, that get sliders in a live page, which closes and simulates
-            the motion again, and lets the reader pull at bodies. {"pin.B[0]": (0.5, 2.0)} sets the range of a slider; True takes
-            all numbers of the scene. A slider acts on all runs that have its parameter. Without `solution`, ten seconds are
-            simulated. A live page updates violation, energy and effort; your own measures are shown for the first motion only,
-            and "rank" is left out.
-        events: events of live runs, as given to `simulate`; the page locates them again. It supports the actions `Log`, `Stop`
-            and `Impact` (one contact at a time), and draws the lines of contacts.
+        live: parameters (`parameters()`), or single entries of them, that get sliders in a live page. Such a page simulates the
+            motion again when a number changes, and lets the reader pull bodies. {"pin.B[0]": (0.5, 2.0)} sets the range of a
+            slider; True adds sliders for all numbers of the scene. A slider acts on all runs that have its parameter. Without
+            `solution`, ten seconds are simulated. A live page updates violation, energy and effort; your own measures are shown
+            for the first motion only, and "rank" is left out.
+        events: events of live runs, as for `simulate`; the page locates them in each new motion. It supports the actions `Log`,
+            `Stop` and `Impact` (one contact at a time), and draws the lines of contacts.
 
     Returns:
-        An `Animation`, which shows itself in a notebook; `save("motion.html")` writes it, or a .gif, .mp4, .svg, .png or .dxf.
+        An `Animation`, which notebooks display; `save("motion.html")` writes it to a file: .html, .gif, .mp4, .svg, .png or .dxf.
         A failed run is shown up to its failure; a `FailedRunWarning` and the page give the cause.
 
     Raises:
-        ValueError: a batch, an unknown name, a run without any state, or one that cannot be live.
+        ValueError: the solution is a batch, a name is unknown, or a run has no states or cannot be live.
     """
     events = tuple(events) if isinstance(events, Sequence) else (events,)
     if events and not live:
@@ -185,20 +185,20 @@ def animate(
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
-    found, failures = [], {}
+    records, failures = [], {}
     for label, run in runs.items():
-        one = require_mechanism(mechanism[label] if isinstance(mechanism, Mapping) else mechanism)
-        run = _Still(one) if run is None else run
-        require_history(f"solution[{label!r}]" if label else "solution", run, {"mechanism": one})
-        conditions = [event.condition for event in (expand_events(events, one) if events else ())]
+        mech = require_mechanism(mechanism[label] if isinstance(mechanism, Mapping) else mechanism)
+        run = _Still(mech) if run is None else run
+        require_history(f"solution[{label!r}]" if label else "solution", run, {"mechanism": mech})
+        conditions = [event.condition for event in (expand_events(events, mech) if events else ())]
         gaps = [condition for condition in conditions if isinstance(condition, Gap)]
-        found.append((one, *run_record(one, run, label, measures, reactions, traces, shapes, gaps)))
+        records.append((mech, *run_record(mech, run, label, measures, reactions, traces, shapes, gaps)))
         if failure := failure_of(run):
             failures[label] = failure
             warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)
-    data = player_data(title or found[0][0].name or "mechanism", found)
+    data = player_data(title or records[0][0].name or "mechanism", records)
     if live:
-        shown: Any = [(one, run, record) for (one, *_), run, record in zip(found, runs.values(), data["runs"], strict=True)]
+        shown: Any = [(mech, run, record) for (mech, *_), run, record in zip(records, runs.values(), data["runs"], strict=True)]
         data["live"] = live_data(shown, live, events)
     return Animation(data, failures)
 
@@ -214,12 +214,12 @@ def _live_runs(
     runs: Any = solution
     if runs is None:
         ts = np.linspace(0.0, LIVE_SECONDS, LIVE_INSTANTS)
-        found = [simulate(one, ts, throw=False, events=events or None) for one in mechanisms]
-        runs = dict(zip(mechanism, found, strict=True)) if isinstance(mechanism, Mapping) else found[0]
-    given: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
-    efforts = ["effort"] if any(one.driver_names for one in mechanisms) else []
-    wanted = dict.fromkeys([*given, "violation", "energy", *efforts])  # the latter are updated by the page
-    return runs, {name: given.get(name) for name in wanted if name != "rank"}
+        solutions = [simulate(mech, ts, throw=False, events=events or None) for mech in mechanisms]
+        runs = dict(zip(mechanism, solutions, strict=True)) if isinstance(mechanism, Mapping) else solutions[0]
+    own_measures: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
+    efforts = ["effort"] if any(mech.driver_names for mech in mechanisms) else []
+    wanted = dict.fromkeys([*own_measures, "violation", "energy", *efforts])  # the page updates violation, energy and effort
+    return runs, {name: own_measures.get(name) for name in wanted if name != "rank"}
 
 
 @checked
@@ -250,15 +250,15 @@ def animate_modes(
     shapes = np.asarray(shapes, float)
     if shapes.shape[1:] != (len(mechanism.bodies), 3) or not len(shapes):
         raise ValueError(f"shapes has shape {shapes.shape}, not (modes, {len(mechanism.bodies)}, 3)")
-    found = []
+    records = []
     for k, shape in enumerate(shapes):
         frequency = None if frequencies is None else float(frequencies[k])
-        found.append((mechanism, *mode_record(mechanism, q, shape, frequency, labels[k] if labels else f"mode {k + 1}")))
-    return Animation(player_data(title or mechanism.name or "mechanism", found))
+        records.append((mechanism, *mode_record(mechanism, q, shape, frequency, labels[k] if labels else f"mode {k + 1}")))
+    return Animation(player_data(title or mechanism.name or "mechanism", records))
 
 
 class _Still:
-    """A run of one instant: a mechanism in the position of its scene."""
+    """A run with one instant: a mechanism in the position of its scene."""
 
     def __init__(self, mechanism: Mechanism):
         self.ts, self.q, self.v = np.zeros(1), np.asarray(mechanism.q0)[None], np.zeros((1, len(mechanism.bodies), 3))

@@ -13,24 +13,24 @@ from udkjax.show.player.sketch import THEMES, Circle, Line
 with OptionalImport():
     from PIL import Image, ImageDraw
 
-SMOOTH = 3  # factor by which pictures are drawn larger and then reduced, against jagged edges
-MOST_FRAMES = 1500  # of a film
-SAME_COLOUR = 8  # of 255: largest error of a palette's nearest colour
-GIF_TICK = 0.01  # s: unit of a GIF's frame times
+SMOOTH = 3  # factor by which pictures are drawn larger and then reduced, to smooth edges
+MOST_FRAMES = 1500  # largest number of frames of a film
+SAME_COLOUR = 8  # largest difference (of 255) of colours that count as the background
+GIF_TICK = 0.01  # unit of a GIF's frame times (s)
 
 
 def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> Image.Image:
     """Return one pose of each run, side by side, as a bitmap."""
-    view, found = sketches(animation, t, width, theme, SMOOTH)
-    whole = Image.new("RGB", (view.width * len(found), view.height), THEMES[theme]["back"])
-    for k, sketch in enumerate(found):
+    view, sketches_at_t = sketches(animation, t, width, theme, SMOOTH)
+    large = Image.new("RGB", (view.width * len(sketches_at_t), view.height), THEMES[theme]["back"])
+    for k, sketch in enumerate(sketches_at_t):
         panel = Image.new("RGB", (view.width, view.height), THEMES[theme]["back"])
         draw = ImageDraw.Draw(panel)
         for shape in sketch.shapes:
             _paint(draw, shape)
-        whole.paste(panel, (k * view.width, 0))
-    small = whole.width // SMOOTH // 2 * 2, whole.height // SMOOTH // 2 * 2  # MP4 needs even numbers
-    return whole.resize(small, Image.Resampling.LANCZOS)
+        large.paste(panel, (k * view.width, 0))
+    small = large.width // SMOOTH // 2 * 2, large.height // SMOOTH // 2 * 2  # MP4 needs even sizes
+    return large.resize(small, Image.Resampling.LANCZOS)
 
 
 def _paint(draw: ImageDraw.ImageDraw, shape: Line | Circle) -> None:
@@ -50,7 +50,7 @@ def _paint(draw: ImageDraw.ImageDraw, shape: Line | Circle) -> None:
 
 
 def film_times(animation: Posed, fps: float, speed: float | None) -> np.ndarray:
-    """Return the time of each frame; raises `ValueError` for a film that would be too long."""
+    """Return the time of each frame; raise `ValueError` if the film would be too long."""
     data = animation.data
     speed = float(data["speed"] if speed is None else speed)
     if not (0 < fps < np.inf and 0 < speed < np.inf):
@@ -66,21 +66,21 @@ def film_times(animation: Posed, fps: float, speed: float | None) -> np.ndarray:
 def save_gif(
     animation: Posed, path: Path, fps: float = 25.0, width: int = 480, theme: str = "light", speed: float | None = None
 ) -> None:
-    """Write the motion as a GIF that repeats for ever; `fps` is rounded to 100 divided by an integer, the resolution of GIFs."""
-    tick = max(2, round(1 / fps / GIF_TICK))  # browsers slow down faster GIFs
+    """Write the motion as a GIF that repeats forever; `fps` is rounded to 100 divided by an integer, the resolution of GIFs."""
+    tick = max(2, round(1 / fps / GIF_TICK))  # browsers play faster GIFs slowly
     times = film_times(animation, 1 / (tick * GIF_TICK), speed)
-    palette = _palette(image(animation, times[0], width, theme))  # one for all frames, so that nothing flickers
+    palette = _palette(image(animation, times[0], width, theme))  # the same for all frames, to avoid flicker
     frames = [image(animation, t, width, theme).quantize(palette=palette, dither=Image.Dither.NONE) for t in times]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=10 * tick, loop=0, optimize=True)
 
 
 def _palette(picture: Image.Image) -> Image.Image:
     """Return a picture in 64 colours; colours that look like its background become exactly the background."""
-    found = picture.quantize(64)
-    colours, back = np.reshape(found.getpalette(), (-1, 3)), np.array(picture.getpixel((0, 0)))
+    reduced = picture.quantize(64)
+    colours, back = np.reshape(reduced.getpalette(), (-1, 3)), np.array(picture.getpixel((0, 0)))
     colours[np.abs(colours - back).max(axis=1) <= SAME_COLOUR] = back
-    found.putpalette(colours.ravel().tolist())
-    return found
+    reduced.putpalette(colours.ravel().tolist())
+    return reduced
 
 
 def save_mp4(

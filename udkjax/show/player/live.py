@@ -3,7 +3,7 @@
 sliders  live_parameters.py
 engines  udkjax/integrate/portable; runs of one mechanism share an engine
 runs     for each run: the index of its engine; sliders: [index of a slider, this mechanism's value] for each parameter of the
-         engine; symbol_updates (symbol_updates.py); start: the state that closure starts from, or null for the scene's own guess;
+         engine; symbol_updates (symbol_updates.py); start: the state that closure starts from, or null for the scene's guess;
          times: all output times of a motion that failed or was stopped, or null
 """
 
@@ -25,8 +25,8 @@ from udkjax.show.player.measure_curves import ShownMotion
 from udkjax.show.player.player_data import MOST_INSTANTS
 from udkjax.show.player.symbol_updates import symbol_updates
 
-TOLERANCE = 1e-8  # rtol and atol of a run without its own: the defaults of `simulate`
-SAME_STATE = 1e-6  # characteristic lengths or rad, per characteristic time: a closer initial state is the scene's own
+TOLERANCE = 1e-8  # rtol and atol of a run that does not record its tolerances: the defaults of `simulate`
+SAME_STATE = 1e-6  # tolerance (characteristic lengths or rad, per characteristic time) for an initial state to be the scene's
 
 
 def live_data(
@@ -49,18 +49,20 @@ def live_data(
     unknown = [] if isinstance(live, bool) else [n for n in live if not any(names_in(m, [n]) for m, _, _ in runs)]
     for mechanism, solution, record in runs:
         _require_solvable(mechanism, solution, events)
-        own = sliders_of(mechanism, unknown or names_in(mechanism, live))
-        sliders = {slider.name: slider for slider in own} | sliders
+        run_sliders = sliders_of(mechanism, unknown or names_in(mechanism, live))
+        sliders = {slider.name: slider for slider in run_sliders} | sliders
         rtol, atol = (float(getattr(solution, name, TOLERANCE)) for name in ("rtol", "atol"))
         key = id(mechanism), rtol, atol
         if key not in engines:
             engines[key] = len(engines)
-            data["engines"].append(_engine(mechanism, own, rtol, atol, events))
+            data["engines"].append(_engine(mechanism, run_sliders, rtol, atol, events))
         engine = data["engines"][engines[key]]
         drawn = engine["count"] + engine["knots"] + engine["conditions"]
         updates = symbol_updates(mechanism, record, record["symbols"], drawn)
         start, times = _start(mechanism, solution), _times(solution)
-        data["runs"].append({"engine": engines[key], "sliders": own, "symbol_updates": updates, "start": start, "times": times})
+        data["runs"].append(
+            {"engine": engines[key], "sliders": run_sliders, "symbol_updates": updates, "start": start, "times": times}
+        )
     order = {slider.name: k for k, slider in enumerate(in_sections(sliders.values()))}
     for run in data["runs"]:
         run["sliders"] = [[order[slider.name], slider.value] for slider in run["sliders"]]
@@ -94,7 +96,7 @@ def _engine(
 
 
 def _times(solution: ShownMotion) -> list[float] | None:
-    """Return all output times of a run that ended early, since other numbers may complete it; None for a complete run."""
+    """Return all output times of a run that ended early, which other numbers may complete; None for a complete run."""
     ts = np.asarray(solution.ts, float)
     if len(ts) < 2:
         raise ArgumentError("live: the run has a single instant, and no motion to simulate")
@@ -104,7 +106,7 @@ def _times(solution: ShownMotion) -> list[float] | None:
 
 
 def _start(mechanism: Mechanism, solution: ShownMotion) -> JsonObject | None:
-    """Return the initial state of a run; None if it is the scene's own."""
+    """Return the initial state of a run; None if it equals the scene's."""
     t = float(np.asarray(solution.ts)[0])
     q, v = (np.asarray(x, float)[0] for x in (solution.q, solution.v))
     closed, scales = close(mechanism, t).state, analyse(mechanism).scales

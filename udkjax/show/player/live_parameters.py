@@ -29,14 +29,15 @@ SECTIONS = {
     "joint": "Joints",
     "body": "Bodies",
     "link": "Links",
-}  # in order; further sections follow
+}  # sections in order; further ones follow
 PLACES = ("points", "point", "position", "velocity", "vector", "gravity")  # fields whose two entries are x and y
 NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of quantities that are never negative
 INITIAL = "Initial state"
-INITIAL_FIELDS = ("velocity", "angular_velocity")  # also position and angle of bodies, from which assembly starts
+# Initial values; position and angle of bodies, from which assembly starts, are added to these.
+INITIAL_FIELDS = ("velocity", "angular_velocity")
 SIZES = ("length", "radius", "width", "thickness", "radii")  # lengths that are never negative; all others are places
-LEAST_VALUE = 1e-9  # relative to the scene's units: smaller values are zero
-LARGEST_GRAVITY = 20.0  # m/s2: twice that of the earth
+LEAST_VALUE = 1e-9  # values below this count as zero, relative to the scene's units
+LARGEST_GRAVITY = 20.0  # twice that of the earth (m/s2)
 
 
 class Slider(NamedTuple):
@@ -72,24 +73,24 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
     ranges = live if isinstance(live, Mapping) else {}
     scales = analyse(mechanism).scales
     length, rate = float(scales.length), float(scales.rate) or 1.0
-    found, bound = [], pins_in_line(mechanism)
+    sliders, bound = [], pins_in_line(mechanism)
     written = Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
     for name, value in scalar_parameters(mechanism, wanted).items():
         if wanted is None and (".profile." in name or _base(name) in bound):  # the drawn outline of a cam does not change
             continue
-        given = ranges.get(name) or ranges.get(_base(name))
+        limits = ranges.get(name) or ranges.get(_base(name))
         unit = units_of(mechanism, name)
-        low, high = given or usual_range(name, unit, value, length, rate)
+        low, high = limits or usual_range(name, unit, value, length, rate)
         if not low <= value <= high or not low < high:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not contain its value {value:g}")
         shown = written.shown(unit)
         per_unit = 1.0 / conversion_factor(shown, unit) if shown != unit else 1.0
-        found.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high), shown, per_unit))
-    return in_sections(found)
+        sliders.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high), shown, per_unit))
+    return in_sections(sliders)
 
 
 def pins_in_line(mechanism: Mechanism) -> set[str]:
-    """Return the parameters of pins of bars with more than two pins: moving one alone would take it out of line."""
+    """Return the parameters of pins of bars with more than two pins: moving a single pin would take it out of line."""
     links = mechanism.drawing.links.values() if isinstance(mechanism.drawing, Drawing) else []
     return {f"pin.{pin}" for link in links if link.kind == "bar" and len(link.pins) > 2 for pin in link.pins}
 
@@ -101,7 +102,7 @@ def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
 
 
 def names_in(mechanism: Mechanism, live: Live) -> Live:
-    """Return those of the wanted names that are parameters of a mechanism."""
+    """Return the wanted names that are parameters of a mechanism."""
     if isinstance(live, bool):
         return live
     known = mechanism.parameters()
@@ -120,7 +121,7 @@ def section_of(name: str) -> str:
 
 
 def label_of(name: str) -> str:
-    """Return the label of a parameter: that of `joint.A.points[1][0]` is "A point 2 x"."""
+    """Return the label of a parameter: for `joint.A.points[1][0]`, "A point 2 x"."""
     base, indices = _base(name), [int(k) for k in re.findall(r"\[(\d+)\]", name)]
     parts = base.split(".")
     words = parts[1:] if len(parts) > 1 else parts
@@ -129,12 +130,12 @@ def label_of(name: str) -> str:
         text = f"{text.removesuffix('s') if parts[-1] == 'points' else text} {indices.pop(0) + 1}"
     in_plane = parts[-1] in PLACES or parts[0] == "pin"
     text += "".join(f" {'xy'[k]}" if in_plane and k < 2 else f" {k + 1}" for k in indices)
-    given = text.split(" ")
-    return " ".join(word for k, word in enumerate(given) if k == 0 or word != given[k - 1])  # not "motor motor speed"
+    text_words = text.split(" ")
+    return " ".join(word for k, word in enumerate(text_words) if k == 0 or word != text_words[k - 1])  # not "motor motor speed"
 
 
 def usual_range(name: str, unit: str, value: float, length: float, rate: float) -> tuple[float, float]:
-    """Return the default range of a slider: the mechanism's size around a position, a few times the value of other numbers."""
+    """Return the default range of a slider: the mechanism's size around a coordinate, or a few times any other number."""
     by_unit = {"m/s": length * rate, "rad/s": rate, "m": length, "rad": 1.0}
     size = abs(value) if abs(value) > LEAST_VALUE * by_unit.get(unit, 0.0) else 0.0
     if unit == "m/s2":
@@ -150,5 +151,5 @@ def usual_range(name: str, unit: str, value: float, length: float, rate: float) 
 
 
 def _base(name: str) -> str:
-    """Return the name of the parameter of an entry."""
+    """Return the name of the parameter that an entry belongs to."""
     return re.sub(r"(\[\d+\])+$", "", name)

@@ -6,8 +6,8 @@ from enum import StrEnum
 class MarkKind(StrEnum):
     """The `kind` of a mark, with its further fields and its meaning."""
 
-    LINK = "link"  # body, points, closed: a bar through the points at which a body is attached, or a plate
-    DISC = "disc"  # body, at, radius: a body without another shape, as a disc of its radius of gyration
+    LINK = "link"  # body, points, closed: a bar through the points at which a body is attached, or a plate around them
+    DISC = "disc"  # body, at, radius: a body without any other mark, as a disc with its radius of gyration
     WHEEL = "wheel"  # body, at, radius, internal: the pitch circle of a gear or a pinion
     OUTLINE = "outline"  # body, at, points: the profile of a cam; its points are relative to `at`
     RAIL = "rail"  # body, at, axis, span, slot: the line of a prismatic joint or a slot, over its used range (m along `axis`)
@@ -19,10 +19,10 @@ class MarkKind(StrEnum):
     ROLLER = "roller"  # body, at: slides in a slot or follows a cam
     WELD = "weld"  # body, at: a joint without relative motion
     ROD = "rod"  # a, b: a distance joint between two anchors
-    SPRING = "spring"  # a, b, damper, length: a spring between two anchors, and its usual length (m)
+    SPRING = "spring"  # a, b, damper, length: a spring between two anchors, and its typical length (m)
     SPIRAL = "spiral"  # body, at: a torsion spring
     PISTON = "piston"  # a, b: a driver of a distance
     MOTOR = "motor"  # body, at: a driver of an angle
     FRICTION = "friction"  # body, at: friction in a revolute joint
-    FORCE = "force"  # body, at, vector, turns: a force at time 0, whose direction `turns` with the body or not
+    FORCE = "force"  # body, at, vector, turns: a force at time 0; `turns` is True if its direction turns with the body
     TORQUE = "torque"  # body, at, sign: a torque at time 0

@@ -34,10 +34,10 @@ from udkjax.show.player.mark_kinds import MarkKind
 Mark = JsonObject
 BodyPoints = Mapping[str, ArrayLike]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
-PROFILE_POINTS = 180  # of a cam's outline
-SAME_PLACE = 1e-9  # fraction of the largest coordinate: attachments that are closer are one point
+PROFILE_POINTS = 180  # number of points of a cam's outline
+SAME_PLACE = 1e-9  # attachments closer than this, relative to the largest coordinate, are one point
 ROD = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
-MARGIN = 0.08  # length of a rail beyond the used range, as a fraction of the mechanism's length
+MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechanism's length
 
 
 def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = None, gaps: Sequence[Gap] = ()) -> list[Mark]:
@@ -46,7 +46,7 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = No
     Args:
         mechanism: mechanism to draw.
         poses: all poses in which it will be drawn.
-        shapes: further points (n, 2) of bodies by name, in their own frames (m), that the drawn bodies go through.
+        shapes: further points (n, 2) of bodies by name, in the bodies' frames (m), that the drawn bodies pass through.
         gaps: conditions of contacts, whose lines are drawn.
 
     Raises:
@@ -67,7 +67,7 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = No
 
 
 def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
-    """Return the distinct points of each body (m, in its frame): attachments of joints, drivers and springs, and its own pins."""
+    """Return the distinct points of each body (m, in its frame): attachments of joints, drivers and springs, and free pins."""
     attached: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mechanism.bodies, GROUND)}
     springs = [force for force in mechanism.forces.values() if isinstance(force, Spring)]
     for element in (*mechanism.constraints.values(), *springs):
@@ -77,8 +77,8 @@ def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]
         for body, (x, y) in zip(element.bodies, np.asarray(points, float).tolist()):
             attached[body].append((x, y))
     if mechanism.drawing is not None:
-        for body, place in mechanism.drawing.free_pins().values():
-            attached[body].append(tuple(np.asarray(place, float).tolist()))
+        for body, point in mechanism.drawing.free_pins().values():
+            attached[body].append(tuple(np.asarray(point, float).tolist()))
     return {body: _distinct(points) for body, points in attached.items()}
 
 
@@ -92,7 +92,7 @@ def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"
 
 
 class _Drawing:
-    """The marks of one mechanism, collected by the order in which they cover one another."""
+    """The marks of one mechanism, collected in layers, since later marks cover earlier ones."""
 
     def __init__(self, mechanism: Mechanism, poses: Poses, shapes: BodyPoints):
         self.mechanism, self.poses = mechanism, poses
@@ -200,27 +200,27 @@ class _Drawing:
                 self.elements.append({"kind": MarkKind.TORQUE, **self._axle(force.bodies), "sign": sign})
 
     def _rail(self, joint: Prismatic | Slot) -> None:
-        one, two = joint.bodies
+        first, second = joint.bodies
         axis = float(joint.axis)
         slot = isinstance(joint, Slot)
-        start, end = self._travel(one, joint.points[0], axis, two, joint.points[1])
+        start, end = self._travel(first, joint.points[0], axis, second, joint.points[1])
         margin = MARGIN * self.size
-        rail = {**self._at(one, joint.points[0]), "axis": axis, "span": [start - margin, end + margin], "slot": slot}
+        rail = {**self._at(first, joint.points[0]), "axis": axis, "span": [start - margin, end + margin], "slot": slot}
         self.rails.append({"kind": MarkKind.RAIL, **rail})
         if slot:
-            self.pins.append({"kind": MarkKind.ROLLER, **self._at(two, joint.points[1])})
+            self.pins.append({"kind": MarkKind.ROLLER, **self._at(second, joint.points[1])})
         else:
-            block = {"kind": MarkKind.BLOCK, **self._at(two, joint.points[1]), "axis": axis - float(np.asarray(joint.angle))}
+            block = {"kind": MarkKind.BLOCK, **self._at(second, joint.points[1]), "axis": axis - float(np.asarray(joint.angle))}
             self.elements.append(block)
-            self.shaped.add(two)
+            self.shaped.add(second)
 
     def add_floor(self, gap: Gap) -> None:
         """Add the line of a contact, over the range in which its point comes close."""
         (body, on), margin = gap.bodies, MARGIN * self.size
         nx, ny = np.asarray(gap.normal, float)
         axis = float(np.arctan2(-nx, ny))
-        way, turned = self._path(body, gap.point) - self._path(on, gap.through), axis + self._frames(on)[:, 2]
-        along, gaps = (way[:, 0] * np.cos(a) + way[:, 1] * np.sin(a) for a in (turned, turned + np.pi / 2))
+        gap_vector, turned = self._path(body, gap.point) - self._path(on, gap.through), axis + self._frames(on)[:, 2]
+        along, gaps = (gap_vector[:, 0] * np.cos(a) + gap_vector[:, 1] * np.sin(a) for a in (turned, turned + np.pi / 2))
         near = along[gaps <= gaps.min() + margin]
         span = [float(near.min()) - margin, float(near.max()) + margin]
         self.rails.append({"kind": MarkKind.FLOOR, **self._at(on, gap.through), "axis": axis, "span": span})
@@ -235,18 +235,20 @@ class _Drawing:
             self.shaped.add(body)
 
     def _rack(self, joint: Rack) -> None:
-        one, two = joint.bodies
+        first, second = joint.bodies
         axis, radius = float(joint.axis), float(joint.radius)
-        frame, pinion = self._frames(one)[0], self._frames(two)[0, :2]
+        frame, pinion = self._frames(first)[0], self._frames(second)[0, :2]
         right = np.array([np.sin(axis), -np.cos(axis)])
-        at = _local(frame, pinion) + radius * right
-        start, end = self._travel(one, at, axis, two, (0.0, 0.0))
-        self.rails.append({"kind": MarkKind.RACK, **self._at(one, at), "axis": axis, "span": [start - radius, end + radius]})
-        self.wheels.append({"kind": MarkKind.WHEEL, **self._at(two, (0.0, 0.0)), "radius": radius, "internal": False})
-        self.shaped.add(two)
+        origin = _local(frame, pinion) + radius * right
+        start, end = self._travel(first, origin, axis, second, (0.0, 0.0))
+        self.rails.append(
+            {"kind": MarkKind.RACK, **self._at(first, origin), "axis": axis, "span": [start - radius, end + radius]}
+        )
+        self.wheels.append({"kind": MarkKind.WHEEL, **self._at(second, (0.0, 0.0)), "radius": radius, "internal": False})
+        self.shaped.add(second)
 
     def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
-        """Return the least and largest displacement (m) along an axis of body `one`, from its point `at`, of a point of `two`."""
+        """Return the range (m) of a point of body `two` along an axis of body `one`, measured from the point `at` of `one`."""
         gap = self._path(two, point) - self._path(one, at)
         direction = axis + self._frames(one)[:, 2]
         along = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)
@@ -262,7 +264,7 @@ class _Drawing:
         return {"body": self.number[body], "at": np.asarray(point, float).tolist()}
 
     def _held(self, bodies: Sequence[str], points: ArrayLike) -> Mark:
-        """Return the place of a joint: on the ground if that is one of its bodies, else on its first body."""
+        """Return the place of a joint: on the ground if the ground is one of its bodies, else on its first body."""
         side = 1 if bodies[1] == GROUND else 0
         return self._at(bodies[side], np.asarray(points)[side])
 
@@ -270,7 +272,7 @@ class _Drawing:
         return [[self.number[body], x, y] for body, (x, y) in zip(bodies, np.asarray(points, float).tolist(), strict=True)]
 
     def _held_by(self, body: str, other: str) -> Mark:
-        """Return the point of a revolute joint between `body` and `other` in the frame of `body`; without one, its origin."""
+        """Return the point of a revolute joint of two bodies in the frame of `body`, or the origin if there is no such joint."""
         for joint in self.mechanism.joints.values():
             if isinstance(joint, Revolute) and set(joint.bodies) == {body, other}:
                 return self._at(body, joint.points[joint.bodies.index(body)])
@@ -278,8 +280,8 @@ class _Drawing:
 
     def _axle(self, bodies: Sequence[str]) -> Mark:
         """Return the point about which two bodies turn: their revolute joint, or else the second body's centre of mass."""
-        one, two = bodies
-        return self._held_by(one if two == GROUND else two, two if two == GROUND else one)
+        first, second = bodies
+        return self._held_by(first if second == GROUND else second, second if second == GROUND else first)
 
 
 def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
@@ -292,9 +294,9 @@ def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.nd
 def corners_of(
     points: Float[np.ndarray, "points 2"], polygon: Float[np.ndarray, "corners 2"] | None = None
 ) -> tuple[Float[np.ndarray, "corners 2"], bool]:
-    """Return the ordered points of a bar, and False, if they are in line; else the corners of a plate around them, and True.
+    """If the points are in line, return them in order, and False (a bar); else the corners of a plate around them, and True.
 
-    The plate is `polygon`, if that contains all corners of the convex hull of the points; else the convex hull.
+    The plate is `polygon` if it contains all corners of the convex hull of the points; else the convex hull.
     """
     from scipy.spatial import ConvexHull  # importing SciPy takes longer than the call
 
@@ -308,7 +310,7 @@ def corners_of(
 
 
 def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Return a place in ground coordinates in a body's frame."""
+    """Return a place, given in ground coordinates, in a body's frame."""
     cos, sin = np.cos(frame[2]), np.sin(frame[2])
     return np.array([[cos, sin], [-sin, cos]]) @ (place - frame[:2])
 

@@ -19,14 +19,16 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import conserves_energy
 
-SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis: less than any nonzero violation or singular value
+SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis; less than any nonzero violation or singular value
 
 
-# Names of measures, or values over time by name; for several runs, by name and then by label.
+# Names of measures; or values over time by name, and for several runs also by label.
 Measures = Sequence[str] | Mapping[str, ArrayLike | Mapping[str, ArrayLike] | None]
 
 
-ReactionArrows = tuple[list[list[float]], Float[np.ndarray, "T joints 2"], list[bool]]  # anchors, forces (N), uniqueness
+ReactionArrows = tuple[
+    list[list[float]], Float[np.ndarray, "T joints 2"], list[bool]
+]  # anchors, forces (N), mask of unique forces
 
 
 class ShownMotion(Protocol):
@@ -43,7 +45,7 @@ class ShownMotion(Protocol):
 
 
 class MeasureCurve(NamedTuple):
-    """A number over time: its name, unit, values at the output times; `log` for a logarithmic axis."""
+    """A number over time: its name, unit, and values at the output times; `log` is True for a logarithmic axis."""
 
     name: str
     unit: str
@@ -52,7 +54,7 @@ class MeasureCurve(NamedTuple):
 
 
 def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, label: str) -> list[MeasureCurve]:
-    """Return the measures of a run: those of `MEASURES` by name, or others as {"name" or "name (unit)": values}.
+    """Return the measures of a run: names in `MEASURES`, or other measures as {"name" or "name (unit)": values}.
 
     Values may also be mappings by the label of a run.
 
@@ -60,8 +62,8 @@ def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, l
         ValueError: a name is unknown, or values are not one number per output time.
     """
     found: list[MeasureCurve] = []
-    given = wanted if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
-    for name, values in given.items():
+    by_name = wanted if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
+    for name, values in by_name.items():
         if values is None:
             if name not in MEASURES:
                 raise ValueError(f"measure {name!r} is unknown: use {', '.join(MEASURES)}, or give its values")
@@ -84,7 +86,7 @@ def singular_values_over_time(mechanism: Mechanism, solution: ShownMotion) -> Fl
 
 
 def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return the number of singular values in each row above `STATIC_RANK_TOL` times the largest; NaN for rows of NaN."""
+    """Return, for each row, the number of singular values above `STATIC_RANK_TOL` times the largest; NaN for rows of NaN."""
     if values.shape[1] == 0:
         return np.zeros(len(values))
     count = (values > determinacy.STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
@@ -116,17 +118,17 @@ def _energy(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     values = singular_values_over_time(mechanism, solution)
     count = rank_of(values)
-    found = [MeasureCurve("rank", "", count)]
+    curves = [MeasureCurve("rank", "", count)]
     full = int(np.nanmax(count, initial=0))
     if full:
-        found.append(MeasureCurve(f"singular value {full}", "", np.maximum(values[:, full - 1], SMALLEST_POSITIVE), log=True))
-    return found
+        curves.append(MeasureCurve(f"singular value {full}", "", np.maximum(values[:, full - 1], SMALLEST_POSITIVE), log=True))
+    return curves
 
 
 def _effort(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     units = {name: ("torque", "N m") if d.coordinate == "angle" else ("force", "N") for name, d in mechanism.drivers.items()}
-    found = efforts(mechanism, solution).items()
-    return [MeasureCurve(f"{units[name][0]} of {name}", units[name][1], np.asarray(values)) for name, values in found]
+    by_driver = efforts(mechanism, solution).items()
+    return [MeasureCurve(f"{units[name][0]} of {name}", units[name][1], np.asarray(values)) for name, values in by_driver]
 
 
 MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort": _effort}
@@ -136,8 +138,8 @@ def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArro
     """Return the arrows of reactions, for each joint and driver that exerts a force on a body.
 
     Returns:
-        Anchors [body, x, y]; forces (N, ground axes) on the second body, or on the first if the second is the ground, of least
-        norm where redundant constraints share them; and True for forces that are unique throughout the run.
+        Anchors [body, x, y]; forces (N, ground axes) on the second body, or on the first if the second is the ground, with least
+        norm where redundant constraints share them; and a mask of the forces that are unique throughout the run.
     """
     loads, uniqueness = reactions(mechanism, solution), unique_reactions(mechanism, solution)
     bodies = list(mechanism.bodies)

@@ -1,4 +1,4 @@
-"""Numbers as short texts, which the player's `unpack` and `floats` read.
+"""Numbers as short strings, which the player's `unpack` and `floats` read.
 
 A table of numbers is rounded to integer multiples of a given step. The second differences of each column, which are small for a
 smooth motion, are mapped to unsigned integers (zigzag: 0, -1, 1, -2 ... become 0, 1, 2, 3 ...), written as LEB128 (seven bits per
@@ -21,21 +21,21 @@ def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> JsonObject:
     """Return a table of finite numbers, rounded to the `step` of each column (or of all), as plain data."""
     table = np.asarray(table, float)
     steps = np.broadcast_to(np.asarray(step, float), table.shape[1:])
-    whole = np.rint(table / steps).astype(np.int64)
-    second = np.diff(whole, n=2, axis=0, prepend=np.zeros((2, table.shape[1]), np.int64)).T.ravel()
+    integers = np.rint(table / steps).astype(np.int64)
+    second = np.diff(integers, n=2, axis=0, prepend=np.zeros((2, table.shape[1]), np.int64)).T.ravel()
     unsigned = np.where(second < 0, -2 * second - 1, 2 * second).astype(np.uint64)
     return {"rows": len(table), "steps": steps.tolist(), "bytes": base64.b64encode(_leb128(unsigned)).decode()}
 
 
 def unpack(data: Mapping[str, Any]) -> Float[np.ndarray, "T n"]:
     """Return the table that `pack` has packed, as the player reads it."""
-    whole, value, shift = [], 0, 0
+    integers, value, shift = [], 0, 0
     for byte in base64.b64decode(data["bytes"]):
         value, shift = value | (byte & 127) << shift, shift + 7
         if byte < 128:
-            whole.append(-(value + 1) // 2 if value % 2 else value // 2)
+            integers.append(-(value + 1) // 2 if value % 2 else value // 2)
             value = shift = 0
-    columns = np.array(whole, np.int64).reshape(len(data["steps"]), data["rows"])
+    columns = np.array(integers, np.int64).reshape(len(data["steps"]), data["rows"])
     return columns.cumsum(axis=1).cumsum(axis=1).T * np.asarray(data["steps"])
 
 

@@ -11,7 +11,7 @@ from udkjax.annotations import JsonObject
 
 # Modules of the player; each follows those that it imports.
 SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
-SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "live_run", "live")  # only in a live page
+SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "live_run", "live")  # modules of live pages only
 LAST = ("player", "mount")
 # Characters that could end a <script>, begin markup, or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
@@ -36,7 +36,7 @@ def frame(data: JsonObject, height: int) -> str:
 
 
 def as_json(data: object) -> str:
-    """Return data as JSON for use inside <script>; raises `ValueError` for numbers that are not finite."""
+    """Return data as JSON for use inside <script>; raise `ValueError` for numbers that are not finite."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).translate(ESCAPES)
 
 
@@ -44,9 +44,9 @@ def as_json(data: object) -> str:
 def module(is_live: bool = True) -> str:
     """Return the source of the player: its modules joined into one, without comment lines.
 
-    The modules that only a live page needs are half of it.
+    Half of the source are modules that only a live page needs.
     """
     names = (*SHOWING, *(SOLVING if is_live else ()), *LAST)
-    *parts, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)
-    joined = "\n".join([*(re.sub(r"^export ", "", part, flags=re.M) for part in parts), last])
+    *sources, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)
+    joined = "\n".join([*(re.sub(r"^export ", "", source, flags=re.M) for source in sources), last])
     return re.sub(r"^(import .*| *//.*)?\n", "", joined, flags=re.M)

@@ -42,7 +42,7 @@ class Posed(Protocol):
 
 
 def sketches(animation: Posed, t: float | None, width: int, theme: str, times: int = 1) -> tuple[View, list[Sketch]]:
-    """Return the common view of panels that together are `width` px wide, enlarged by `times`, and the sketches at time t."""
+    """Return the common view of panels with a total width of `width` px, enlarged by `times`, and the sketches at time t."""
     if theme not in THEMES:
         raise ValueError(f"theme {theme!r} must be {' or '.join(THEMES)}")
     runs = animation.data["runs"]
@@ -52,16 +52,16 @@ def sketches(animation: Posed, t: float | None, width: int, theme: str, times: i
 
 
 def svg(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> str:
-    """Return one pose of each run, side by side, as the text of an SVG picture."""
-    view, found = sketches(animation, t, width, theme)
-    whole = view.width * len(found)
+    """Return one pose of each run, side by side, as an SVG picture."""
+    view, panels = sketches(animation, t, width, theme)
+    total = view.width * len(panels)
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {whole} {view.height}" width="{whole}" height="{view.height}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total} {view.height}" width="{total}" height="{view.height}" '
         'stroke-linecap="round" stroke-linejoin="round">',
         f"<title>{html.escape(animation.data['title'])}</title>",
-        f'<rect width="{whole}" height="{view.height}" fill="{THEMES[theme]["back"]}"/>',
+        f'<rect width="{total}" height="{view.height}" fill="{THEMES[theme]["back"]}"/>',
     ]
-    for k, sketch in enumerate(found):
+    for k, sketch in enumerate(panels):
         lines += [f'<g transform="translate({k * view.width} 0)">', *map(_svg, sketch.shapes), "</g>"]
     return "\n".join([*lines, "</svg>", ""])
 
@@ -79,20 +79,20 @@ def _svg(shape: Line | Circle) -> str:
 
 
 def save_dxf(animation: Posed, path: Path, t: float | None = None) -> None:
-    """Write one pose of the first run as a DXF drawing in metres, a layer for each kind of mark; needs ezdxf (extra `dxf`)."""
+    """Write a pose of the first run as a DXF drawing in metres, with a layer for each kind of mark; needs ezdxf (extra `dxf`)."""
     with OptionalImport():
         from ezdxf import units
         from ezdxf.filemanagement import new
-    view, found = sketches(animation, t, 1000, "light")
+    view, panels = sketches(animation, t, 1000, "light")
     drawing = new("R2010", units=units.M)
     space = drawing.modelspace()
-    for shape in found[0].shapes:
+    for shape in panels[0].shapes:
         layer = DXF_LAYERS.get(shape.layer, f"{shape.layer}s")
         if layer not in drawing.layers:
             drawing.layers.add(layer)
         if isinstance(shape, Circle):
             space.add_circle(_metres(view, shape.centre[None])[0], shape.radius / view.scale, dxfattribs={"layer": layer})
-        elif shape.layer != MarkKind.LINK or shape.fill != shape.stroke or not shape.closed:  # not the fill of a link
+        elif shape.layer != MarkKind.LINK or shape.fill != shape.stroke or not shape.closed:  # the fill of a link is left out
             space.add_lwpolyline(_metres(view, shape.points), close=shape.closed, dxfattribs={"layer": layer})
     drawing.saveas(path)
 

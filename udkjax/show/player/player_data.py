@@ -1,20 +1,20 @@
 """The data of the player: runs, modes, measures, arrows, and their bounds in the plane.
 
 format     1
-title      text
+title      string
 unit       of the timeline: "s", or "" for modes, which go through one cycle from 0 to 1
 start, end of the timeline
-speed      of playing: seconds of the timeline per second
+speed      default playback speed: seconds of the timeline per second
 length     the characteristic length of the mechanism (m)
 bounds     [left, bottom, right, top] of everything drawn (m)
 runs       a list of
-    label, note    texts
+    label, note    strings
     bodies         names
     marks          elements to draw (marks.py)
     symbols        their lines and circles (symbols.py)
     traces         a list of [body, x, y] whose paths are drawn
     time, q, v     packed (packing.py) tables of T rows: time; coordinates x, y, angle of each body; their rates times `frame`
-    frame          s, the typical time between two instants
+    frame          the typical time between two instants (s)
     mode           instead of time, q, v: {q: numbers, shape: numbers, frequency: Hz or null}
     measures       a list of {name, unit, log, values: single precision}
     events         a list of {t, name}
@@ -43,18 +43,18 @@ from udkjax.show.player.symbols import symbols_of
 
 Record = JsonObject
 Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
-PRECISION = 1e-5  # of positions in characteristic lengths, and of angles in rad: a hundredth of a pixel on 1000 pixels
-TIME_PRECISION = 1e-9  # as a fraction of the timeline
-FORCE_PRECISION = 1e-3  # as a fraction of the usual force
-USUAL_FORCE_QUANTILE = 0.95  # fraction of the instants at which no joint force exceeds the usual force, which scales the arrows
-MOST_INSTANTS = 2400  # per run; a longer run is thinned out evenly, and interpolated with its velocities
-MOST_TRACES = 8  # more would hide the mechanism
-COMFORTABLE_DURATIONS = (4.0, 40.0)  # s: range of the playing time at the default speed
+PRECISION = 1e-5  # resolution of positions (characteristic lengths) and angles (rad): a hundredth of a pixel in 1000 pixels
+TIME_PRECISION = 1e-9  # resolution of times, as a fraction of the timeline
+FORCE_PRECISION = 1e-3  # resolution of forces, as a fraction of the usual force
+USUAL_FORCE_QUANTILE = 0.95  # fraction of instants at which no joint force exceeds the usual force, to which arrows are scaled
+MOST_INSTANTS = 2400  # number per run; a longer run is thinned out evenly, and interpolated with its velocities
+MOST_TRACES = 8  # further traces would hide the mechanism
+COMFORTABLE_DURATIONS = (4.0, 40.0)  # range of the playing time (s) at the default speed
 SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-MODE_PERIOD = 2.0  # s: playing time of one cycle of a mode
+MODE_PERIOD = 2.0  # playing time of one cycle of a mode (s)
 MODE_AMPLITUDE = 0.12  # amplitude of a shown mode, in characteristic lengths or rad
-PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # points of a path per instant of its run, and at most
-SMALLEST_PATH = 1e-6  # characteristic lengths: points that move less have no path
+PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # points of a path per instant of its run, and their largest number
+SMALLEST_PATH = 1e-6  # points that move less, in characteristic lengths, have no path
 
 
 def run_record(
@@ -111,7 +111,7 @@ def run_record(
 def mode_record(
     mechanism: Mechanism, q: ArrayLike, shape: ArrayLike, frequency: float | None, label: str
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
-    """Return a mode q + amplitude shape sin(phase) as plain data, with its shape scaled to a visible amplitude, and its poses."""
+    """Return a mode q + amplitude shape sin(phase), scaled to a visible amplitude, as plain data, and its poses."""
     q, shape = np.asarray(q, float), np.asarray(shape, float).reshape(np.shape(q))
     length = float(analyse(mechanism).length)
     largest = np.max(np.abs(shape) / [length, length, 1.0])
@@ -144,7 +144,7 @@ def _events_of(solution: ShownMotion) -> list[JsonObject]:
 
 
 def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]]:
-    """Return the coordinates of a run as a function of time, as in the player: cubic between instants; for a mode a sine."""
+    """Return the coordinates of a run as a function of time, as in the player: cubic between instants; for a mode, a sine."""
     shape = len(record["bodies"]), 3
     if record["mode"]:
         q, swing = (np.reshape(record["mode"][name], shape) for name in ("q", "shape"))
@@ -161,7 +161,7 @@ def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]
 
 
 def _place_in(ts: Float[np.ndarray, "T"], t: float) -> tuple[int, int, float]:
-    """Return the indices of the instants around a time, and the fraction of the way from one to the other."""
+    """Return the indices of the instants before and after a time, and its fraction of the interval between them."""
     j = int(np.clip(np.searchsorted(ts, t, side="right"), 1, max(len(ts) - 1, 1)))
     i, j = j - 1, min(j, len(ts) - 1)
     h = ts[j] - ts[i]
@@ -274,7 +274,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
             hold(int(k), (x, y))
     for body, *at in [*record["traces"], *([k, 0.0, 0.0] for k in range(len(mechanism.bodies)))]:
         hold(int(body), at)
-    least = 0.1 * float(analyse(mechanism).length)  # a bar that moves along its own line has no height
+    least = 0.1 * float(analyse(mechanism).length)  # the box of a bar that moves along its line has no height
     grow = np.maximum(0.0, least - (high - low) / 2)
     return [*(low - grow).tolist(), *(high + grow).tolist()]
 
@@ -285,7 +285,7 @@ def _ends(record: Record) -> tuple[float, float]:
 
 
 def _speed(duration: float) -> float:
-    """Return speed 1 if its playing time is comfortable, else the nearest comfortable speed."""
+    """Return speed 1 if it leads to a comfortable playing time, else the nearest speed that does."""
     shortest, longest = COMFORTABLE_DURATIONS
     if duration <= 0 or shortest <= duration <= longest:
         return 1.0

@@ -1,4 +1,4 @@
-"""Runs written by `udkjax simulate` or `Solution.to_xarray`, read again to be shown."""
+"""Reads runs written by `udkjax simulate` or `Solution.to_xarray`, to show them."""
 
 import warnings
 from pathlib import Path
@@ -18,14 +18,14 @@ with OptionalImport():
 
 
 class RunFile(NamedTuple):
-    """A run from a file, with the mechanism whose text the file contains."""
+    """A run from a file, with the mechanism that the file contains as text."""
 
     mechanism: Mechanism
     ts: np.ndarray
     q: np.ndarray
     v: np.ndarray
-    result: Result | None  # None if the file has none
-    cause: str  # the reason of an early end
+    result: Result | None  # None if it is not in the file
+    cause: str  # reason for an early end
     others: dict[str, np.ndarray]  # further numbers over time, by "name (unit)", shown as measures
 
 
@@ -33,7 +33,7 @@ def read_run(path: Path) -> RunFile:
     """Read a run (NetCDF).
 
     Raises:
-        ValueError: the file contains no run, or not the text of its scene.
+        ValueError: the file does not contain a run, or does not contain the text of its scene.
         OSError: the file cannot be read.
     """
     with xarray.open_dataset(path, engine="h5netcdf") as data:
@@ -43,7 +43,7 @@ def read_run(path: Path) -> RunFile:
                 f"{path} has no {' and no '.join(missing or ['text of a scene'])}: it is not a run of `udkjax simulate`"
             )
         try:
-            with warnings.catch_warnings(action="ignore", category=MjcfWarning):  # the user was warned when the run was made
+            with warnings.catch_warnings(action="ignore", category=MjcfWarning):  # the user was warned when the run was simulated
                 mechanism = loads(data.attrs["scene"])
         except SceneError as error:  # classes defined by users are not in the format
             raise ValueError(f"{path}: its scene cannot be read, use `udkjax.animate` in Python: {error}") from error

@@ -1,6 +1,6 @@
-"""Marks at a pose as lines and circles in pixels, y downwards, for an SVG, a DXF or the frame of a film.
+"""Marks of a pose as lines and circles in pixels, with y downwards, for an SVG, a DXF or the frame of a film.
 
-They are the symbols (symbols.py) that the player moves, in the same colours and proportions.
+These are the same symbols (symbols.py) as in the player, with the same colours and proportions.
 """
 
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ THEMES: dict[str, dict[str, Any]] = {
         "bodies": ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
     },
 }  # fmt: skip
-POINT = 420.0  # px: shorter side of a picture in which the unit of symbols is one pixel
-MARGIN = 44.0  # px
-ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow in multiples of it
-HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # in units of symbols; the angle in rad
-NOT_UNIQUE_TINT = 0.5  # fraction of the background in the colour of a force
-PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background in the colour of a body
+POINT = 420.0  # shorter side (px) of a picture in which the unit of symbols is one pixel
+MARGIN = 44.0  # margin of a picture (px)
+ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow relative to this one
+HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # head and width in units of symbols; half of the head's angle (rad)
+NOT_UNIQUE_TINT = 0.5  # fraction of the background colour mixed into the colour of a force
+PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background colour mixed into the colour of a body
 
 
 class TracedPath(NamedTuple):
@@ -40,7 +40,7 @@ class TracedPath(NamedTuple):
 
 
 class ForceArrow(NamedTuple):
-    """A force on a point (m) of a body: x and y relative to the usual force, and True if it is unique."""
+    """A force on a point (m) of a body: x and y relative to the usual force, and whether it is unique."""
 
     body: int
     at: tuple[float, float]
@@ -49,7 +49,7 @@ class ForceArrow(NamedTuple):
 
 
 class View(NamedTuple):
-    """Metres to pixels, (x + scale X, y - scale Y), in a picture of width x height px; `pt` is the unit of symbols (px)."""
+    """Maps metres to pixels, (x + scale X, y - scale Y), in a picture of width x height px; `pt` is the unit of symbols (px)."""
 
     scale: float
     x: float
@@ -95,10 +95,10 @@ def view_of(bounds: Sequence[float], width: int, times: int = 1, has_arrows: boo
     return View(scale, wide / 2 - scale * (left + right) / 2, high / 2 + scale * (bottom + top) / 2, wide, high, pt)
 
 
-def mix(one: str, two: str, t: float) -> str:
-    """Return a colour on the way from one (t = 0) to another (t = 1)."""
-    parts = [[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in (one, two)]
-    return "#" + "".join(f"{round(a * (1 - t) + b * t):02x}" for a, b in zip(*parts, strict=True))
+def mix(first: str, second: str, t: float) -> str:
+    """Return a mixture of two colours, from the first (t = 0) to the second (t = 1)."""
+    channels = [[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in (first, second)]
+    return "#" + "".join(f"{round(a * (1 - t) + b * t):02x}" for a, b in zip(*channels, strict=True))
 
 
 class Sketch:
@@ -125,15 +125,15 @@ class Sketch:
         return Line("path", points, PATH_WIDTH * self.view.pt, colour)
 
     def _arrow(self, arrow: ForceArrow) -> list[Line]:
-        """Return the shaft and the head of an arrow; nothing if it is too short to be seen."""
+        """Return the shaft and the head of an arrow; empty if it is too short to be seen."""
         force, pt = np.array(arrow.force), self.view.pt
         size = float(np.hypot(*force))
         length = ARROW * pt * min(size, LONGEST_ARROW)
         if length <= HEAD * pt:
             return []
-        way, start = force / size * [1, -1], self._anchor(arrow.body, *arrow.at)
-        tip, side = start + length * way, np.array([-way[1], way[0]])
-        back = tip - HEAD * pt * np.cos(HEAD_ANGLE) * way
+        direction, start = force / size * [1, -1], self._anchor(arrow.body, *arrow.at)
+        tip, side = start + length * direction, np.array([-direction[1], direction[0]])
+        back = tip - HEAD * pt * np.cos(HEAD_ANGLE) * direction
         colour = mix(self.theme["force"], self.theme["back"], 0.0 if arrow.unique else NOT_UNIQUE_TINT)
         wing = HEAD * pt * np.sin(HEAD_ANGLE) * side
         shaft = Line("reaction", np.array([start, back]), ARROW_WIDTH * pt, colour)
@@ -141,22 +141,22 @@ class Sketch:
 
     def _shape(self, symbol: Symbol) -> Line | Circle:
         look = symbol["width"] * self.view.pt, self._colour(symbol["stroke"]), self._colour(symbol["fill"])
-        origin, way, scale = self._frame(symbol["frame"])
+        origin, axis, scale = self._frame(symbol["frame"])
         if "radius" in symbol:
             metres, units, least = symbol["radius"]
             radius = max(self.view.scale * metres + self.view.pt * units, self.view.pt * least)
             return Circle(symbol["layer"], origin, radius, *look)
         points = np.array(symbol["points"], float)
         local = scale * points[:, :2] + (self.view.pt * points[:, 2:] if points.shape[1] > 2 else 0.0)
-        return Line(symbol["layer"], origin + local @ np.array([way * [1, -1], -way[::-1]]), *look, symbol["closed"])
+        return Line(symbol["layer"], origin + local @ np.array([axis * [1, -1], -axis[::-1]]), *look, symbol["closed"])
 
     def _frame(self, frame: list) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the origin of a frame (px), the cosine and sine of the angle of its x axis, and its unit of length (px)."""
         if len(frame) == 2:
             start, end = (self._anchor(*anchor) for anchor in frame)
-            way = (end - start) * [1, -1]
-            length = float(np.hypot(*way))
-            return start, way / (length or 1.0), length
+            axis = (end - start) * [1, -1]
+            length = float(np.hypot(*axis))
+            return start, axis / (length or 1.0), length
         body, x, y, angle, turns = frame
         angle += self.pose[body][2] if turns and body >= 0 else 0.0
         return self._anchor(body, x, y), np.array([np.cos(angle), np.sin(angle)]), self.view.scale

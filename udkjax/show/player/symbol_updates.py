@@ -1,8 +1,8 @@
-"""Updates of a mechanism's symbols in a page where numbers of the scene change.
+"""Updates of a mechanism's symbols when numbers of the scene change in a page.
 
-Places of symbols in the frames of bodies are numbers of the scene: points of joints and springs, radii of wheels, directions of
-rails. A place of a symbol that equals such a number is updated with it. Each kind of update is a list of rows; an index is the
-position of a number in the vector of all numbers of the scene:
+Symbols depend on numbers of the scene: points of joints and springs, radii of wheels, directions of rails. A number of a symbol
+that equals one of the scene is updated with it. Each kind of update is a list of rows; an index is the position of a number in
+the vector of all numbers of the scene:
 
     frames                  [symbol; which of its two anchors, or -1; indices of x and y]
     traces, pins, arrows    [trace, mark, or arrow of a force; 0; indices of x and y]
@@ -24,13 +24,13 @@ from udkjax.scene.joints import Gear, Rack
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
 
-SAME_DIGITS = 7  # significant digits of the points of symbols
+SAME_DIGITS = 7  # significant digits to which points of symbols are compared
 
 BodyPoint = tuple[int, float, float]  # index of a body, and a place in its frame rounded to `SAME_DIGITS`
 
 
 def symbol_updates(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[JsonObject], drawn: int) -> JsonObject:
-    """Return the updates of the symbols, marks and traces of a run; the mechanism's drawn points begin at index `drawn`."""
+    """Return the updates of symbols, marks and traces of a run; points of drawn links begin at index `drawn` of the numbers."""
     indices: Mechanism = _indices(mechanism)
     points = _points(mechanism, indices)
     for body, more in drawn_points(mechanism):
@@ -98,7 +98,7 @@ def _points(mechanism: Mechanism, indices: Mechanism) -> dict[BodyPoint, tuple[i
 
 
 def _radii(mechanism: Mechanism, indices: Mechanism) -> dict[int, tuple[int, float]]:
-    """Return, by body, the index and the value of the radius of each wheel."""
+    """Return the index and the value of the radius of each wheel, by body."""
     number, found = {name: k for k, name in enumerate(mechanism.body_names)}, {}
     for name, joint in mechanism.joints.items():
         index = indices.joints[name]

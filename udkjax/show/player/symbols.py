@@ -1,12 +1,12 @@
-"""Symbols of marks as lines and circles in moving frames, painted alike by the player and the writers of pictures.
+"""Symbols of marks as lines and circles in moving frames; the player and the writers of pictures paint them in the same way.
 
     symbol   layer, frame, stroke, width, fill, and points (a line, `closed` or not) or a radius (a circle about its origin)
 
 A frame is [body, x, y, angle, turns]: its origin is a place (m) of a body, and its x axis is at an angle (rad) to the body's, or
-to the ground's if `turns` is 0. Or it is two anchors [[body, x, y], [body, x, y]], with its x axis from one to the other. A point
-is [x, y, px, py]: x and y in m, or in distances of the anchors; px and py, which may be left out, in the unit of symbols, which
-does not grow with the scene. A radius is [m, units, least units]. Colours are names of a theme, or "edge:3", "tint:3", "spoke:3"
-of a body.
+to the ground's if `turns` is 0. Or it is two anchors [[body, x, y], [body, x, y]], with its x axis from the first to the second.
+A point is [x, y, px, py]: x and y in m, or relative to the distance of the anchors; px and py, which may be left out, in the unit
+of symbols, which does not depend on the size of the scene. A radius is
+[m, units, smallest units]. Colours are names of a theme, or "edge:3", "tint:3", "spoke:3" of a body.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ from udkjax.show.player.marks import Mark
 Symbol = Mark
 ROUND = 48  # vertices of a circle drawn as a polyline
 COIL_LENGTH = 11.0  # units per coil of a spring of usual length
-STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # straight ends of a spring in units, and at most as a fraction of its length
+STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # straight ends of a spring in units; their largest fraction of its length
 
 
 def symbols_of(marks: Sequence[Mark], unit: float) -> list[Symbol]:
@@ -28,7 +28,7 @@ def symbols_of(marks: Sequence[Mark], unit: float) -> list[Symbol]:
 
     Args:
         marks: marks of one mechanism.
-        unit: the unit of symbols (m) when the view is not zoomed, which sets the spacing of teeth and of strokes along rails.
+        unit: the unit of symbols (m) without zoom; it determines the spacing of teeth and of strokes along rails.
     """
     return [{"layer": mark["kind"]} | symbol for mark in marks for symbol in SYMBOLS[mark["kind"]](mark, unit)]
 
@@ -79,7 +79,7 @@ def _link(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 def _disc(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _circle(_at(mark), (mark["radius"], 0, 7), _tint(mark["body"]), _edge(mark["body"]))
-    yield _circle(_at(mark), (0, 4.5), "back", "ink", 1)  # the symbol of a centre of mass, which shows the rotation of the body
+    yield _circle(_at(mark), (0, 4.5), "back", "ink", 1)  # symbol of a centre of mass; it shows the rotation of the body
     for start in (0, np.pi):
         yield _line(_at(mark), _offsets([(0, 0), *(4.5 * _round(start - np.linspace(0, np.pi / 2, 9)))]), "", 0, "ink", True)
 
@@ -87,9 +87,9 @@ def _disc(mark: Mark, unit: float) -> Iterator[Symbol]:
 def _wheel(mark: Mark, unit: float) -> Iterator[Symbol]:
     radius, body = mark["radius"], mark["body"]
     depth, teeth = min(4 * unit, 0.12 * radius), int(np.clip(round(2 * np.pi * radius / (9 * unit) / 4) * 4, 12, 96))
-    parts = np.array([(0, -1), (0.25, -1), (0.35, 1), (0.65, 1), (0.75, -1)])
-    turn = 2 * np.pi / teeth * (np.arange(teeth)[:, None] + parts[:, 0]).ravel()
-    rim = np.tile(radius + parts[:, 1] * depth / 2, teeth)[:, None] * _round(turn)
+    tooth = np.array([(0, -1), (0.25, -1), (0.35, 1), (0.65, 1), (0.75, -1)])
+    turn = 2 * np.pi / teeth * (np.arange(teeth)[:, None] + tooth[:, 0]).ravel()
+    rim = np.tile(radius + tooth[:, 1] * depth / 2, teeth)[:, None] * _round(turn)
     if mark["internal"]:
         yield _circle(_at(mark), (radius + depth, 5), _tint(body), _edge(body))
     yield _line(_at(mark), rim, _edge(body), 1.3, "back" if mark["internal"] else _tint(body), True)
@@ -123,7 +123,9 @@ def _floor(mark: Mark, unit: float) -> Iterator[Symbol]:
 def _rack(mark: Mark, unit: float) -> Iterator[Symbol]:
     (a, b), body, frame = mark["span"], mark["body"], _at(mark, mark["axis"])
     teeth = [
-        (x + part * 9 * unit, 0, 0, y) for x in np.arange(a, b, 9 * unit) for part, y in ((0, -2), (0.3, 2), (0.7, 2), (1, -2))
+        (x + x_in_tooth * 9 * unit, 0, 0, y)
+        for x in np.arange(a, b, 9 * unit)
+        for x_in_tooth, y in ((0, -2), (0.3, 2), (0.7, 2), (1, -2))
     ]
     yield _line(frame, teeth, _edge(body), 1.4)
     yield _line(frame, [(a, 0, 0, -7), (b, 0, 0, -7)], _edge(body), 1.4)
@@ -170,8 +172,8 @@ def _spring(mark: Mark, unit: float) -> Iterator[Symbol]:
     frame, damper, length = [mark["a"], mark["b"]], mark["damper"], max(mark["length"] / unit, STRAIGHT_END)
     end, turns = min(LARGEST_PART, STRAIGHT_END / length), 2 * int(np.clip(round(length / COIL_LENGTH), 6, 24))
     high, shift = (5, 5) if damper else (7, 0)
-    along = end + (1 - 2 * end) * (np.arange(turns) + 0.5) / turns
-    sides = [(x, 0, 0, shift + (-high if k % 2 else high)) for k, x in enumerate(along)]
+    xs = end + (1 - 2 * end) * (np.arange(turns) + 0.5) / turns
+    sides = [(x, 0, 0, shift + (-high if k % 2 else high)) for k, x in enumerate(xs)]
     line = [(0, 0, 0, 0), (end, 0, 0, 0), (end, 0, 0, shift), *sides, (1 - end, 0, 0, shift), (1 - end, 0, 0, 0), (1, 0, 0, 0)]
     yield _line(frame, line, "ink", 1.5)
     if damper:

@@ -107,8 +107,8 @@ class CompleteDesigns(PrintsTable):
     """All four-bars that meet a goal: a sequence of `CompleteDesign`, created on access.
 
     They are sorted by defect (designs without a defect first, and among these the confirmed ones), then by whether the driver
-    turns fully, then by transmission.
-    Each four-bar occurs twice, driven from either side; each class of four-bars through nine points has three cognates.
+    turns fully, then by transmission. Each four-bar occurs twice, driven from either side; each class of four-bars through nine
+    points has three cognates.
 
     Attributes:
         pins: the places of the pins in the first position, by name (M, 2), in m.
